@@ -12,20 +12,12 @@ BEGIN, END = "<!-- variables -->\n", "<!-- end of variables -->\n"
 
 def table() -> str:
     """Return the table: a row for each variable, in the order of the specs."""
-    rows: dict[str, dict] = {}
-    used: dict[str, list[str]] = {}
-    for entry, spec in yaml.safe_load(SPECS.read_text())["argument_specs"].items():
-        for name, option in spec["options"].items():
-            rows[name] = option
-            used.setdefault(name, []).append(entry)
-    entries = len(yaml.safe_load(SPECS.read_text())["argument_specs"])
-    lines = ["| variable | type | default | means | used by |", "|---|---|---|---|---|"]
-    for name, o in rows.items():
-        kind = o["type"] + (f" of {o['elements']}" if "elements" in o else "")
-        kind = ", ".join(map(str, o["choices"])) if "choices" in o else kind
+    entries = yaml.safe_load(SPECS.read_text())["argument_specs"].values()
+    lines = ["| variable | default | means |", "|---|---|---|"]
+    for name, o in {name: o for spec in entries for name, o in spec["options"].items()}.items():
         default = "must be given" if o.get("required") else f"`{_shown(o['default'])}`"
-        where = "all" if len(used[name]) > entries // 2 else ", ".join(used[name])
-        lines.append(f"| `{name}` | {kind} | {default} | {o['description']} | {where} |")
+        others = [choice for choice in o.get("choices", ()) if choice != o["default"]]
+        lines.append(f"| `{name}` | {default}{' or ' * bool(others)}{', '.join(others)} | {o['description']} |")
     return "\n".join(lines) + "\n"
 
 

@@ -29,6 +29,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from balloon_world.child_process import Child
 from balloon_world.record import JPEG_QUALITY
 from balloon_world.simulated_arduino import PinEvent
 from balloon_world.trial import Trajectory, wilson_interval
@@ -36,7 +37,6 @@ from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, World
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import WorldError
-from rover_lib.workshop.child_process import Child
 
 HOLD_S = 1.0
 STEPS_PER_S = 100  # steps of the physics a second, at least

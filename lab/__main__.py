@@ -293,7 +293,7 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
 @click.option(
     "--faults/--no-faults",
     default=True,
-    help="Leave out a deployment's faults and the fleet, which are met with torch only.",
+    help="Leave out a deployment's faults, which are met with torch only.",
 )
 @click.pass_context
 def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:

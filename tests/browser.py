@@ -14,6 +14,18 @@ import pytest
 CHROMIUM = shutil.which("chromium")
 chromium = pytest.mark.skipif(not CHROMIUM, reason="needs the Debian package chromium")
 START_S = 60.0
+PHONE_PX = 390
+# What leaves the window sideways: in no box that scrolls ("cut"), or in one ("scrolls").
+SIDEWAYS = """(within => {
+  const scrolls = e => ['auto', 'scroll'].includes(getComputedStyle(e).overflowX), found = {cut: [], scrolls: []};
+  const boxed = e => e.parentElement && (scrolls(e.parentElement) || boxed(e.parentElement));
+  for (const e of document.querySelectorAll(within + ' *')) {
+    const at = e.getBoundingClientRect(), seen = at.width > 1 && at.height > 1, text = e.tagName + ': ' + e.textContent;
+    if (seen && (at.right > innerWidth + 1 || at.left < -1) && !boxed(e)) found.cut.push(text.slice(0, 60));
+    if (seen && scrolls(e) && e.scrollWidth > e.clientWidth + 1) found.scrolls.push(text.slice(0, 60));
+  }
+  return found;
+})"""
 
 
 class Tab:
@@ -49,6 +61,16 @@ class Tab:
         while not await self.value(f"(() => {{ try {{ return {expression}; }} catch (error) {{ return false; }} }})()"):
             assert time.monotonic() < end, f"{expression}: {await self.value('document.body.innerText')}"
             await asyncio.sleep(0.1)
+
+    async def be_a_phone(self) -> None:
+        """Give the page the width of a phone, before it is loaded."""
+        size = {"width": PHONE_PX, "height": 844, "deviceScaleFactor": 2, "mobile": True}
+        await self.ask("Emulation.setDeviceMetricsOverride", **size)
+
+    async def sideways(self, within: str) -> dict[str, list[str]]:
+        """Return what of the elements within a selector is "cut", and what only "scrolls" to be seen whole."""
+        assert await self.value("document.documentElement.scrollWidth") <= PHONE_PX
+        return await self.value(f"{SIDEWAYS}({within!r})")
 
     async def click(self, name: str) -> None:
         """Click with the mouse on the middle of the element with this id."""

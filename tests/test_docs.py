@@ -144,7 +144,7 @@ def test_every_command_that_we_print_is_one():
             if wrong:
                 refused.append(f"{path.relative_to(ROOT)}: {program} {' '.join(words)}: {wrong}")
     assert not refused, "\n".join(refused)
-    assert seen["rover"] > 350 and seen["make"] > 40 and seen["ansible"] > 15 and seen["lab"] > 10, seen
+    assert seen["rover"] > 300 and seen["make"] > 40 and seen["ansible"] > 15 and seen["lab"] > 10, seen
 
 
 def test_readme_says_how_to_begin_in_few_words():
@@ -152,6 +152,11 @@ def test_readme_says_how_to_begin_in_few_words():
     first = [line.split("#")[0].split() for line in re.findall(r"^    (\S.*)$", text, re.M)[:3]]
     assert first == [["make", "demo"], ["make", "test"], ["make", "notebooks-open", "NAME=demo"]]
     assert len(text.split()) <= 700 and re.search(r"\[!\[.*\]\(pictures/\w+\.png\)\]\(notebooks/\w+\.ipynb\)", text)
+
+
+def test_the_pages_are_short():
+    """A page that grows must take something out of another."""
+    assert sum(len(page.read_text().split()) for page in (ROOT / "docs").glob("*.md")) <= 15_000
 
 
 def test_the_first_hour_is_eight_commands_at_most():

@@ -15,12 +15,12 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import BOOT_S, REST_US, PinEvent
 from lab import debian
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_folder, key_of
-from rover_lib.workshop.child_process import Child
 from rover_lib.workshop.run_program import run
 
 REPOSITORY = Path(__file__).parents[2]

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from balloon_world.car import CameraFeed
+from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import CC, NICE, EmulatedArduino, compile_c
 from lab.driving.cable import Cable
@@ -28,7 +29,6 @@ from lab.driving.priority import boost, boost_priority
 from lab.driving.rpicam_vid import install
 from rover_lib.onboard.drive.flight_log import LogError, read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.child_process import Child
 
 AT_SPEED_S = 0.6  # from the first throttle to the fault
 START_S = 90.0  # a drive imports torch twice, which takes a third of a minute while four other processes are busy

@@ -34,6 +34,7 @@ SIDE_US, LET_GO_US = 200, 100 + 24
 GLIMPSE_MS = 30  # a stick that is back sooner may not have been seen, if few pulses come
 NEUTRAL_US = {"steering": 1456, "throttle": 120}
 STOP_MS = 250  # from what ends a drive to throttle off; if lines are lost, the firmware's time limit
+FADE_MS = 500  # drive.fade_s of params.yml: by older pictures the host asks for less throttle
 PLANNED_MS = 400  # a plan blends in within 100, and its commands hold for 265
 PER_UNIT_US = {"steering": 555.7, "throttle": 591.2}
 LIMIT = 0.2  # params.yml's throttle_limit
@@ -273,6 +274,9 @@ def _as_planned(run: Run) -> str | None:
     fresh = np.zeros(n, bool)
     for p in good:
         fresh[p.at_ms : p.at_ms + 200] = True
+    for c in run.seen.commands:
+        if c.at_ms - c.content_ms > FADE_MS:
+            fresh[c.at_ms : c.at_ms + VALID_MS] = False
     well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
     most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
     if over := [c for c in run.seen.commands if c.throttle_us > most_us and not run.sick[c.at_ms]]:

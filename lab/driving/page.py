@@ -12,8 +12,8 @@ from typing import Any
 
 import aiohttp
 
+from balloon_world.child_process import Child
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.child_process import Child
 
 START_S = 60.0
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from balloon_world.child_process import Child
 from lab.driving.bench import Drive, DrivingBench, FaultError
 from lab.driving.page import Page, ViewServer
 from lab.driving.pins import STOPPED, Gates, Observation, judge
@@ -29,7 +30,6 @@ from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.service import Request, arm_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop.child_process import Child
 
 SPEED_S = 0.5  # how long the car drives at speed before a click
 WATCH_S = 0.5  # how long it is watched after the click

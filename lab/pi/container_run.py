@@ -25,7 +25,6 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
     view           [{row, wanted, found, holds}], see view_proofs.py
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
-    fleet          {cases: [{broken, results, models, healthy, ...}], good}, see fleet.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
 `wrong` has a sentence for everything that is not as it should be. The file pi-fast.log beside it has all that the
 playbooks printed.
@@ -52,7 +51,6 @@ from lab.pi.debian_image import debian_image
 from lab.pi.deployment_bench import DeploymentBench
 from lab.pi.deployment_faults import break_deployments, row_of, wrong_rows
 from lab.pi.emulation import EmulationError, emulation, free_port, interruptible, require, require_arduino, wait_for
-from lab.pi.fleet import fleet
 from lab.pi.playbooks import Play
 from lab.pi.pulses import Pins, moving
 from lab.pi.report import PiReport
@@ -92,7 +90,7 @@ def run_container(
 
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
     provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
-    the view's service, which other runs always include. faults: include the faults of deployments and the fleet, which
+    the view's service, which other runs always include. faults: include the faults of deployments, which
     run only with torch. say: called with a line for each step.
     Raises RoverError if it cannot begin: without root, without artifacts, or if packages cannot be installed.
     """
@@ -344,7 +342,7 @@ class _Run:
         self.report.gate("boot", "disabled by default; enabled it is disarmed", booted, ok)
 
     def deployment_faults(self, pi: Container, static: Path, mixed: Path) -> None:
-        """Run the faults of a deployment, and the fleet, on rovers that start from what this one has become."""
+        """Run the faults of a deployment on rovers that start from what this one has become."""
         pi.inside("systemctl", "disable", UNIT)  # the service of those rovers would only look for a camera
         pi.power_off()
         artifacts, least = {"static": static, "mixed": mixed}, self.report.gates["rows"]
@@ -358,10 +356,6 @@ class _Run:
             rows[:] = break_deployments(pi.layers, artifacts, done=done, say=self.report.say)
         wrong = wrong_rows(rows, least)
         self.report.gate("faults of a deployment", f"{least} rows, healthy and healed", wrong or len(rows), not wrong)
-        with self.report.step("fleet"):
-            fleet_row = self.metrics["fleet"] = fleet(pi.layers, artifacts, say=self.report.say)
-        cases = [case["results"] for case in fleet_row["cases"]]
-        self.report.gate("fleet of three, one broken", "the rest untouched, all reported", cases, fleet_row["good"])
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 """The bench for deployments: a rover that is deployed to while something goes wrong, and the network to it.
 
-The faults of a deployment and the fleet use it. It sees on the rover's disk how far a deployment has come, by looking
+It sees on the rover's disk how far a deployment has come, by looking
 at it from this machine every millisecond or so. So the code that is deployed needs no hook for tests.
 """
 
@@ -52,13 +52,15 @@ class Missed(EmulationError):
 class Disk:
     """How far a deployment has come, by what is on the rover's disk.
 
-    ready: whether there is a folder for what arrives. arrived: the names of the files that have arrived. complete:
-    whether these are all. staging: the files of a release that has no name yet, with their bytes. staged: whether its
-    policy is complete. released: whether the release has its name. switched: whether it is in use. remembered: whether
-    it was proven again since then.
+    ready: whether there is a folder for what arrives. sending: whether a part of the policy is where Ansible keeps it
+    until all of it is there. arrived: the names of the files that have arrived. complete: whether these are all.
+    staging: the files of a release that has no name yet, with their bytes. staged: whether its policy is complete.
+    released: whether the release has its name. switched: whether it is in use. remembered: whether it was proven again
+    since then.
     """
 
     ready: bool = False
+    sending: bool = False
     arrived: tuple[str, ...] = ()
     complete: bool = False
     staging: Mapping[str, int] = field(default_factory=dict)
@@ -85,8 +87,9 @@ class Disk:
         switched = current.startswith(name)
         return cls(
             ready=ready,
+            sending=any(p.stat().st_size for p in half_sent(state)),
             arrived=arrived,
-            complete=len(arrived) == about["parts"] + 2,  # the parts, the file that describes them, and its signature
+            complete=len(arrived) == 3,  # the policy, its signature, and what describes it
             staging=staging,
             staged=staging.get(POLICY) == about["bytes"],
             released=any(True for _ in (models / "releases").glob(f"{name}*/{POLICY}")),
@@ -100,7 +103,7 @@ class Disk:
         return self.ready and not self.arrived
 
     def arriving(self) -> bool:
-        return any(name.startswith("part-") for name in self.arrived) and not self.complete
+        return self.ready and self.sending and POLICY not in self.arrived
 
     def unopened(self) -> bool:
         return self.complete and not self.staging
@@ -116,6 +119,11 @@ class Disk:
 
     def just_switched(self) -> bool:
         return self.switched and not self.remembered
+
+
+def half_sent(state: Path) -> list[Path]:
+    """Return what Ansible has of a policy until all of it has arrived. state: the rover's folder that has models/."""
+    return list(state.parents[2].glob(f"home/*/.ansible/tmp/*/.source{Path(POLICY).suffix}"))
 
 
 class Line(NamedTuple):
@@ -238,6 +246,8 @@ class DeploymentBench:
         self.before = self._mode_of(self.releases.current or "", "")
         self.target = next(mode for mode in self.artifacts if mode != self.before)
         self.seconds, self.outputs, self.disk_is_small = {}, [], False
+        for file in half_sent(self.state):  # of a transfer that was cut off
+            file.unlink()
         if fresh:
             for release in (self.state / "models" / "releases").iterdir():
                 if release.name != self.releases.current:
@@ -341,12 +351,6 @@ class DeploymentBench:
         if self.disk_is_small:
             self.pi.inside("mount", "-o", "remount,size=1g", f"/{STATE}")
             (self.state / "ballast").unlink(missing_ok=True)
-
-    def make_read_only(self) -> None:
-        """Make the rover's disk read-only, like that of a dying card, until the row is over."""
-        self.pi.inside("mount", "--bind", f"/{STATE}", f"/{STATE}")
-        self.pi.inside("mount", "-o", "remount,bind,ro", f"/{STATE}")
-        self.undo.callback(self.pi.inside, "umount", "--lazy", f"/{STATE}", check=False)
 
     def clean(self) -> None:
         """Undo what the fault has left. If the rover went off, its mounts are gone anyway, so errors are ignored."""

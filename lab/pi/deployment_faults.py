@@ -39,7 +39,7 @@ from lab.pi.deployment_bench import (
     write_changed_artifact,
 )
 from lab.pi.emulation import EmulationError
-from rover_lib.onboard.care.release import ORIGIN, SPARE_BYTES
+from rover_lib.onboard.care.release import ORIGIN, POLICY, SPARE_BYTES
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
@@ -113,33 +113,6 @@ def _fill_while_staging(bench: DeploymentBench) -> None:
                 f.write(bytes(1 << 20))
 
     bench.deploy_until(lambda disk: disk.complete and bool(disk.staging), fill)
-
-
-def _lose_ssh_in_transfer(bench: DeploymentBench) -> dict[str, Any]:
-    def cut() -> None:
-        until = bench.network.sent + (1 << 20)
-        while bench.network.sent < until and not bench.disk.complete and not bench.stop.is_set():
-            time.sleep(0.001)
-        bench.network.cut()
-
-    sent = bench.network.sent
-    bench.deploy_until(Disk.arriving, cut)
-    first = bench.network.sent - sent
-    bench.network.mend()
-    arrived = {p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")}
-    kept: dict[str, int] = {}
-    sent = bench.network.sent
-
-    def look() -> None:
-        kept.update({p.name: p.stat().st_ino for p in bench.incoming.glob("part-*")})
-
-    bench.deploy_until(lambda disk: disk.complete, look)
-    travelled = [name for name, inode in kept.items() if arrived.get(name) != inode]
-    if not arrived or set(arrived) & set(travelled):
-        raise EmulationError(f"{bench.pi.name}: {sorted(arrived)} had arrived, and {travelled} travelled again")
-    # These megabytes include all that Ansible sends, its modules too.
-    sent_mb = [round(first / 1e6, 1), round((bench.network.sent - sent) / 1e6, 1)]
-    return {"had_arrived": sorted(arrived), "travelled_then": travelled, "sent_mb": sent_mb}
 
 
 def _name_another(bench: DeploymentBench) -> None:
@@ -248,7 +221,7 @@ def _power_cut(
 
 FAULTS = [
     _power_cut("before the transfer", Disk.awaiting, "once there is a folder for it, and nothing in it"),
-    _power_cut("in the transfer", Disk.arriving, "once a part of it is there"),
+    _power_cut("in the transfer", Disk.arriving, "once some of it is there"),
     _power_cut("after the transfer", Disk.unopened, "once all is there, and nothing made of it"),
     _power_cut("before fsync", Disk.writing, "while the new release's policy.pt is written"),
     _power_cut(
@@ -283,21 +256,21 @@ FAULTS = [
         "a byte flipped on the way",
         _strike(Disk.arriving, lambda bench: bench.network.flip(after=1 << 20)),
         f"transfer mechanism failed|{LOST}",
-        "in the network, once a part has come through: ssh notices and ends, and Ansible may send it again",
+        "in the network, once some of it has come through: ssh notices and ends, and Ansible may send it again",
         fresh=True,
     ),
     DeploymentFault(
         "a byte flipped in what has arrived",
-        _strike(lambda disk: disk.complete, lambda bench: flip(bench.incoming / "part-0000")),
+        _strike(lambda disk: disk.complete, lambda bench: flip(bench.incoming / POLICY)),
         "arrived damaged .* send it again",
-        "in a part on the rover's disk",
+        "on the rover's disk",
         fresh=True,
     ),
     DeploymentFault(
         "ssh lost in the transfer",
-        _lose_ssh_in_transfer,
+        _strike(Disk.arriving, lambda bench: bench.network.cut()),
         LOST,
-        "the network is cut a megabyte after the first part; the transfer goes on",
+        "the network is cut once some of it has come through; the next deployment sends all of it",
         fresh=True,
     ),
     DeploymentFault(
@@ -318,7 +291,7 @@ FAULTS = [
         "artifact with a wrong hash",
         _strike(lambda disk: disk.complete, _name_another),
         "contains [0-9a-f]{12}, not [0-9a-f]{12}; pack it again",
-        "what describes the parts names another artifact",
+        "what describes it names another artifact",
         fresh=True,
     ),
     DeploymentFault(

@@ -13,6 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import nbformat
+
 from rover_lib.onboard.care.pi5 import CORES, DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
@@ -197,17 +199,17 @@ def _faults(root: Path) -> list[Row]:
     return [
         ("what", "figure"),
         (
-            "faults that must stop a driving car: stopped; time from the fault to throttle off",
-            f"{right('stopped')}, at most {worst:.0f} ms",
+            "faults that must stop a driving car: throttle off",
+            f"{right('stopped')}, after at most {worst:.0f} ms",
         ),
-        ("faults that must not stop it before the plan is too old: handled", right("continues")),
-        ("faults before the start that must keep it from being armed: not armed", right("refused")),
-        ("human moves a stick: time until the pins follow the human", f"at most {takeover:.0f} ms; designed for 46"),
+        ("faults that must not stop it: it drove on while its plan was young enough", right("continues")),
+        ("faults that must keep it from being armed", right("refused")),
+        ("from a moved stick to the human's pulses", f"at most {takeover:.0f} ms"),
         (
-            "pulses that were recorded, replayed and measured again: difference",
+            "pulses, recorded, replayed and measured again",
             f"within {report['bytes']['worst_us']:.0f} us",
         ),
-        ("drives with random faults in virtual time that broke a safety rule", broken),
+        ("random drives in virtual time that broke a safety rule", broken),
         *_view(root),
     ]
 
@@ -216,16 +218,16 @@ def _view(root: Path) -> list[Row]:
     """What a view does to a drive; `python -m lab view`."""
     report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
-    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without a view, measured in turns"
+    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without"
     picture = f"{report['pictures_hz']:.0f} a second, {report['delay_ms']['p95']:.0f} ms old at p95"
     return [
         (
-            "stop button of the view: drives stopped; time from the click to throttle off",
-            f"{stop['stopped']} of {stop['stops']}, at most {stop['stop_ms']['max']:.0f} ms",
+            "clicks on the view's stop button: throttle off",
+            f"{stop['stopped']} of {stop['stops']}, after at most {stop['stop_ms']['max']:.0f} ms",
         ),
-        (f"lateness of the loop's commands while {report['pages']} pages of the view are open", cost),
+        (f"commands are late, with {report['pages']} pages of the view", cost),
         ("pictures in the view", picture),
-        ("processor time of the view, share of one core", f"{report['cpu_pct']:.1f} %"),
+        ("the view's share of a core", f"{report['cpu_pct']:.1f} %"),
     ]
 
 
@@ -253,49 +255,45 @@ def _students(run: str, root: Path) -> list[Row]:
     times = _clock(root)
 
     def row(student: Mapping[str, Any]) -> Row:
-        count = student["decoder_layers"]
-        layers = f"{count} decoder layer{'s' if count > 1 else ''} of {student['feedforward']}"
+        shape = f"{student['width']}x{student['height']}, {student['decoder_layers']} x {student['feedforward']}"
         if share := student.get("backbone_channels"):
-            layers += f", {share:.0%} of the backbone's channels"
+            shape += f", {share:.0%} of channels"
         return (
-            f"{student['name']}: {student['width']}x{student['height']}, {layers}",
+            f"{student['name']}: {shape}",
             format(student["size_mb"], ".1f"),
-            f"{student['instructions_g']:.3g} ({student['simd_g']:.3g})",
+            f"{student['instructions_g']:.3g}",
             times.get(shape_of(student), ""),
-            f"{student['hits']} of {student['trials']}",
-            f"{student['pushed_hits']} of {student['pushed_trials']} at {student['pushed_latency_ms']:.2g} ms",
+            str(student["hits"]),
+            f"{student['pushed_hits']} at {student['pushed_latency_ms']:.2g} ms",
             " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
         )
 
-    counted = "10^9 instructions (SIMD), *counted*", "ms on a Pi 5, *computed*"
-    driven = "balloons hit, left alone", "balloons hit, pushed, with plans as late as"
-    return [("", "MB", *counted, *driven, f"{' / '.join(actions)} error against the recordings, %"), *map(row, rows)]
+    hits = (f"hit of {rows[0]['trials']}", f"pushed, hit of {rows[0]['pushed_trials']}")
+    return [("", "MB", "10^9 instructions", "ms", *hits, "error, %"), *map(row, rows)]
 
 
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
-    conditions = [key for key, value in policies[0].items() if isinstance(value, dict)]
+    conditions = {key: value["trials"] for key, value in policies[0].items() if isinstance(value, dict)}
     words = {"alone": "left alone", "decoy": "beside a red decoy"}
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
-        hits = (f"{policy[how]['hits']} of {policy[how]['trials']}" for how in conditions)
-        return (name, f"{policy['human_s']:.0f}", *hits)
+        return (name, f"{policy['human_s']:.0f}", *(str(policy[how]["hits"]) for how in conditions))
 
-    return [
-        ("policy", "seconds of human driving", *(f"hits, {words.get(how, how)}" for how in conditions)),
-        *map(row, policies),
-    ]
+    hits = (f"{words.get(how, how)}: hits of {trials}" for how, trials in conditions.items())
+    return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
 def _parameters(root: Path) -> list[Row]:
-    """What papermill's -p sets, as the cells of parameters say it."""
+    """The notebooks' titles, and what papermill's -p sets; run_dir is in all of them."""
     rows: list[Row] = []
     for path in sorted((root / "notebooks").glob("*.ipynb")):
-        for name, default, why in parameters_in(path):
-            rows.append((f"[{path.stem}](../notebooks/{path.name})", f"`{name}`", f"`{default}`", why))
-    return [("notebook", "parameter", "default", "meaning"), *rows]
+        title = nbformat.read(path, as_version=4).cells[0].source.partition("\n")[0].removeprefix("# ")
+        names = ", ".join(f"`{name}`" for name, *_ in parameters_in(path) if name != "run_dir")
+        rows.append((f"[{path.stem}](../notebooks/{path.name})", title, names))
+    return [("notebook", "question", "parameters to turn"), *rows]
 
 
 TABLES: dict[str, Callable[[Path], list[Row]]] = {

@@ -38,6 +38,8 @@ OF_LABORATORY = (  # in runs/, where make leaves them
     "faults-crawler.json",
     "faults-inverted.json",
     "random.json",
+    "mutants.json",
+    "kills.json",
     "pi-fast.json",
     "pi.json",
 )

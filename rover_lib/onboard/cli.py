@@ -339,10 +339,18 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @PORT
 @click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Required frames per second.")
 @click.option("--receiver", is_flag=True, help="Only test the receiver, with a human at the transmitter.")
+@click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
 def doctor(
-    ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, receiver: bool, as_json: bool
+    ctx: click.Context,
+    artifact: Path | None,
+    camera: str,
+    port: str,
+    hz: float,
+    receiver: bool,
+    recording: Path | None,
+    as_json: bool,
 ) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
@@ -355,7 +363,10 @@ def doctor(
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
     else:
-        found = checking.examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent)
+        log_folder = default_log().parent
+        found = checking.examine(
+            artifact, camera=camera, port=port, rate_hz=hz, log_folder=log_folder, recording=recording
+        )
     checks = []
     for check in found:
         checks.append(check)
@@ -580,17 +591,17 @@ ALLOW = click.option(
 )
 
 
-@release.command(short_help="Split an artifact into parts for the transfer.")
+@release.command(short_help="Sign and describe an artifact for the transfer.")
 @click.argument("artifact", type=ARTIFACT)
 @click.argument("folder", type=FILE)
 @click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
 @ALLOW
 @click.pass_obj
 def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
-    """Split ARTIFACT into parts for the transfer, in FOLDER. Refuses what the rover would refuse."""
-    from rover_lib.onboard.care.release import pack as pack_parts
+    """Put ARTIFACT into FOLDER for the transfer, signed and described. Refuses what the rover would refuse."""
+    from rover_lib.onboard.care.release import pack as pack_release
 
-    show(pack_parts(artifact, folder, releases.expected, allow, sign_key), True)
+    show(pack_release(artifact, folder, releases.expected, allow, sign_key), True)
 
 
 UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")

@@ -199,8 +199,8 @@ def test_a_rover_that_is_broken_or_lost_stops_the_rest_and_the_next_deployment_h
     assert "second: failed: " in done.stdout
     assert fleet.releases("canary").status()["healthy"]
     assert not (fleet.folder / "third").exists()
-    shutil.rmtree(fleet.folder / "second")  # a new card, with no part on it
-    for at in ("part-0000", "stage", "prune"):
+    shutil.rmtree(fleet.folder / "second")  # a new card, with nothing on it
+    for at in ("policy.pt", "stage", "prune"):
         fleet.lost("second", at)
         done = fleet.deploy(artifacts["static"], **one_by_one)
         assert done.returncode != 0
@@ -246,12 +246,12 @@ def test_a_service_that_does_not_get_ready_with_it_has_the_model_before(fleet, a
 
 
 @pytest.mark.release
-def test_parts_that_were_damaged_on_the_way_are_sent_again(fleet, artifacts):
+def test_what_was_damaged_on_the_way_is_sent_again(fleet, artifacts):
     packed = pack(artifacts["static"], fleet.folder / "packed")
     incoming = fleet.folder / "third" / "models" / "incoming" / packed["sha256"]
     incoming.mkdir(parents=True)
-    for part in (fleet.folder / "packed").glob("part-*"):
-        (incoming / part.name).write_bytes(part.read_bytes()[:-1] + b"?")  # flipped on the way
+    content = (fleet.folder / "packed" / "policy.pt").read_bytes()
+    (incoming / "policy.pt").write_bytes(content[:-1] + b"?")  # flipped on the way
     done = fleet.deploy(artifacts["static"], "--limit", "third")
     assert done.returncode == 0, done.stdout
     assert fleet.releases("third").status()["healthy"]

@@ -113,19 +113,6 @@ def test_a_failure_leaves_nothing(tmp_path, monkeypatch):
     assert not list((tmp_path / "cache").iterdir())
 
 
-def test_progress_is_told(tmp_path, monkeypatch):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(record, "record_drive", lambda folder, index, seed: True)
-    told = []
-
-    def progress(items, desc, total):
-        told.append((desc, total))
-        return items
-
-    record_episodes(tmp_path / "episodes", count=3, progress=progress)
-    assert told == [("recording", 3)]
-
-
 def test_recordings_of_before_are_of_a_car_that_turns_left(recorded, tmp_path):
     """Their policies still hit: the side travels with the recordings, and all pulses stay as they are."""
     folder = shutil.copytree(sorted(recorded.glob("episode_*"))[0], tmp_path / "episode_1")

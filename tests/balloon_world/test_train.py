@@ -231,10 +231,3 @@ def test_no_recordings_are_refused(tmp_path):
     with pytest.raises(RoverError):
         train(tmp_path / "empty", tmp_path / "best_model.pth", steps=3)
     assert [p.name for p in tmp_path.iterdir()] == ["empty"]
-
-
-def test_a_loss_that_is_not_finite_ends_the_training(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(training_module, "KL_WEIGHT", float("nan"))
-    with pytest.raises(TrainingError, match="not finite, found nan"):
-        train(recorded, tmp_path / "best_model.pth", seed=9, steps=3, device="cpu")
-    assert not list(tmp_path.iterdir())

@@ -115,17 +115,6 @@ def test_a_plan_that_is_not_finite_drives_nothing():
         run_trials(Constant(float("nan"), 0), worlds=1)
 
 
-def test_progress_is_told():
-    told = []
-
-    def progress(items, desc, total):
-        told.append((desc, total))
-        return items
-
-    run_trials(Constant(0, 0.05), worlds=2, progress=progress)
-    assert told == [("driving", 2)]
-
-
 @pytest.mark.slow
 def test_several_at_once_drive_as_one_by_one():
     policies = {"left": Constant(-0.2, 0.05), "right": Constant(0.2, 0.05), "straight": Constant(0.0, 0.05)}

@@ -1,5 +1,4 @@
 import hashlib
-import time
 
 import numpy as np
 import pytest
@@ -164,18 +163,6 @@ def test_a_world_that_ended_cannot_go_on():
 def test_a_negative_seed_is_refused():
     with pytest.raises(WorldError, match="must not be negative"):
         World(-1)
-
-
-@pytest.mark.release
-def test_rendering_is_quick():
-    world = World(4)
-    times = []
-    while not world.done:
-        start = time.process_time()
-        world.render()
-        times.append(time.process_time() - start)
-        world.step(*expert(world))
-    assert np.median(times) < 0.012, "aim 4 ms; the rest is for slow machines"
 
 
 @pytest.mark.parametrize(("left", "side"), [(None, -1), (1, 1), (-1, -1)])

@@ -7,7 +7,6 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
-from rover_lib.onboard.cli import main as onboard
 
 
 @pytest.fixture
@@ -147,8 +146,3 @@ def test_names_the_thing_and_the_remedy(here, command, thing, remedy):
     assert thing in sentence and remedy in result.output, result.output
     assert "Traceback" not in result.output
     assert contents(here) == before  # nothing half-written, and nothing lost
-
-
-def test_a_command_that_a_rover_lacks_says_where_there_are_more():
-    result = CliRunner().invoke(onboard, ["list"])
-    assert result.exit_code == 2 and "type it on a workstation, which has more" in result.output

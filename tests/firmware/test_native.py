@@ -163,6 +163,21 @@ def test_up_to_three_flipped_bits_are_no_command(text, data):
     assert read(bytes(bad)) == []
 
 
+NEARLY = (
+    *("<D 0 1 2 1900 232", ">D  0 1 2 1900 232", ">D 0 1 2 1900 232 ", ">D 0 1 2 1900 232 0", ">D 0 1 2 1900"),
+    *(f">D 0 1 2 {n} 232" for n in ("+1900", "01900", "-1900", "1900.0", "0x76C", 1900 + 2**32, "1900" + " " * 60)),
+    *(">d 0 1 2 1900 232", ">X 0 1 2 1900 232", "S1900T600", ">", ""),
+)
+
+
+@pytest.mark.parametrize("body", NEARLY)
+def test_what_is_nearly_a_line_is_no_command(body):
+    assert read(servo_link.frame(body)) == []  # with the right checksum
+    good = servo_link.frame(">D 0 1 2 1900 232")
+    for bad in (good[:-10] + b"\n", good[:-9] + b"\n", good[:-1] + b"0\n", good[:-2] + b"\n", good[1:]):
+        assert read(bad) == []
+
+
 @given(st.binary(max_size=80), LINES)
 def test_a_line_is_found_behind_any_rubbish(rubbish, text):
     assert len(read(rubbish + text)) == 1

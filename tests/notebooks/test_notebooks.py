@@ -6,7 +6,6 @@ import re
 import shutil
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import nbformat
@@ -238,19 +237,6 @@ def test_root_learns_at_once_that_it_may_load_no_artifact(one_notebook, old_run,
         run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began"))
 
 
-def test_a_second_run_of_the_same_name_waits_for_the_first(one_notebook, old_run, monkeypatch):
-    """It would have removed what the first had made, and executed its own notebooks among the first one's files."""
-
-    def while_another_starts(source, folder, given, bars):
-        whole(source, folder, given, bars)
-        monkeypatch.setattr(runs, "_execute", lambda *args: pytest.fail("it began"))
-        with pytest.raises(runs.RoverError, match="another process is at work in it"):
-            runs.run("ck", "episodes", "mine", runs_dir=old_run.parent, notebooks=one_notebook)
-
-    run_with(monkeypatch, one_notebook, old_run, while_another_starts)
-    assert (old_run / "policy_static.pt").read_text() == "new"
-
-
 def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monkeypatch):
     assert run_with(monkeypatch, one_notebook, old_run, whole) == old_run
     after = contents(old_run)
@@ -261,61 +247,12 @@ def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monk
     assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
 
 
-@pytest.mark.parametrize("count", range(0, 16, 2))
-def test_an_interrupt_while_it_takes_its_place_leaves_the_last_one(one_notebook, old_run, monkeypatch, count):
-    before, moved = contents(old_run.parent), []
-    rename = Path.rename
-
-    def interrupted(path, target):
-        moved.append(path)
-        if len(moved) == count + 1:
-            raise KeyboardInterrupt
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, "rename", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_with(monkeypatch, one_notebook, old_run, whole)
-    monkeypatch.undo()
-    assert contents(old_run.parent) == before
-
-
 def test_what_says_how_a_student_was_taught_outlives_a_run_of_it(one_notebook, old_run, monkeypatch):
     """A student's distill.json is of its checkpoint; a teacher's students.json is of its old artifact."""
     for stage in ("distill", "students"):
         write_stage(old_run / f"{stage}.json", stage, params={}, metrics={})
     run_with(monkeypatch, one_notebook, old_run, whole)
     assert (old_run / "distill.json").exists() and not (old_run / "students.json").exists()
-
-
-def test_a_run_that_was_killed_while_it_took_its_place_is_undone_by_the_next(one_notebook, old_run, monkeypatch):
-    before = contents(old_run)
-    beside = old_run.with_name(".mine.old")
-    beside.mkdir()
-    (old_run / "policy_static.pt").rename(beside / "policy_static.pt")
-    (old_run / "figures").rename(beside / "figures")
-    (old_run / "figures").mkdir()
-    (old_run / "policy_static.pt").write_text("new")
-
-    def fails(source, folder, given, bars):
-        raise runs.NotebookError("no such checkpoint")
-
-    with pytest.raises(runs.NotebookError):
-        run_with(monkeypatch, one_notebook, old_run, fails)
-    assert contents(old_run) == before and not beside.exists()
-
-
-def test_a_run_that_is_a_file_or_on_another_disk_is_known_before_the_work(one_notebook, old_run, monkeypatch):
-    (old_run.parent / "link").symlink_to("../disk/large")  # which nothing can be renamed to from beside the link
-
-    def elsewhere(source, folder, given, bars):
-        assert folder.parent == old_run.parents[1] / "disk"
-        (folder / "policy_static.pt").write_text("new")
-
-    run_with(monkeypatch, one_notebook, old_run.parent / "link", elsewhere)
-    assert (old_run.parent / "link" / "policy_static.pt").read_text() == "new"
-    (old_run.parent / "file").write_text("a user's")
-    with pytest.raises(runs.NotebookError, match="file: is a file, and not a run's folder"):
-        run_with(monkeypatch, one_notebook, old_run.parent / "file", lambda *args: pytest.fail("it began"))
 
 
 def test_what_is_removed_of_the_last_run_is_never_put_back(one_notebook, old_run, monkeypatch):
@@ -444,6 +381,12 @@ def turned(demo_run, tmp_path_factory):
     return folder
 
 
+def test_none_of_their_parameters_is_left_out():
+    """Notebook 05's `rovers`, a folder, is test_rovers_are_drawn's."""
+    for name, (_, given) in TURNED.items():
+        assert given.keys() == parameters_of(NOTEBOOKS / f"{name}.ipynb") - {"run_dir", "rovers"}
+
+
 def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     found = {stage: json.loads((turned / f"{stage}.json").read_text()) for stage, _ in TURNED.values()}
     assert found["calibrate"]["params"] == {"samples": 7, "seed": 3, "smooth": 0.7}
@@ -465,12 +408,18 @@ def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
 
 
 def test_the_batch_of_the_docs_runs(demo_run, tmp_path, monkeypatch, capsys):
-    """As it stands in docs/notebooks.md, on fewer frames."""
+    """As it stands in docs/notebooks.md, on fewer frames. Only the first of its runs is executed."""
     (code,) = re.findall(
         r"^```python\n(.*?)^```", (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text(), re.M | re.S
     )
-    few, execute = {"03_quantize": {"choosing_frames": 1}, "04_compare": {"held_out_frames": 2}}, runs.execute
-    monkeypatch.setattr(runs, "execute", lambda name, folder, **given: execute(name, folder, **few[name], **given))
+    few, real, done = {"03_quantize": {"choosing_frames": 1}, "04_compare": {"held_out_frames": 2}}, runs.execute, []
+
+    def execute(name, folder, **given):
+        assert given.keys() <= parameters_of(NOTEBOOKS / f"{name}.ipynb")
+        done.append(name)
+        return real(name, folder, **few[name], **given) if done.count(name) == 1 else folder / f"{name}.ipynb"
+
+    monkeypatch.setattr(runs, "execute", execute)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "demo").symlink_to(demo_run)
     monkeypatch.chdir(tmp_path)

@@ -1,10 +1,8 @@
 """A policy learns on from what humans drove, and from nothing else; interrupted, it goes on where it stopped."""
 
-import contextlib
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,9 +27,8 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint.files import write_trainer
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Sample
 from rover_lib.workshop.run import pipeline, session
@@ -202,34 +199,6 @@ def assert_same(folder, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("asked", [2, 4])
-def test_killed_while_it_looks_at_the_recordings_it_goes_on(
-    checkpoint, old, new, recipe, taught, tmp_path, monkeypatch, asked
-):
-    """It is interrupted once in the old recordings, and once in the new ones."""
-    save_each_step(monkeypatch, finetune_module)
-    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
-    with monkeypatch.context() as patch:
-        interrupt(patch, finetune_module.BatchedPolicy, "features", at=asked)
-        with pytest.raises(KeyboardInterrupt):
-            finetune(checkpoint, [old, new], "better", **arguments)
-    assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
-
-
-@pytest.mark.slow
-def test_killed_while_it_writes_it_leaves_nothing_half(checkpoint, old, new, recipe, taught, tmp_path, monkeypatch):
-    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
-    with monkeypatch.context() as patch:
-        interrupt(patch, finetune_module, "write_stage")
-        with pytest.raises(KeyboardInterrupt):
-            finetune(checkpoint, [old, new], "better", **arguments)
-    assert not (tmp_path / "better").exists()
-    assert_same(finetune(checkpoint, [old, new], "better", **arguments), taught)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["better", "cache"]
-    assert [p.name.split("-")[0] for p in (tmp_path / "cache").iterdir()] == ["lessons"] * 2
-
-
-@pytest.mark.slow
 def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, new, recipe, tmp_path):
     longer = replace(recipe, transformer_steps=150, together_steps=0, correction_weight=1000.0, to_parent=1.0)
     folder = finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, recipe=longer, device="cpu")
@@ -288,22 +257,6 @@ def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old
     assert (folder / "policy_static.pt").stat().st_size < 6e6  # it has 12 MB with all channels
 
 
-@pytest.mark.slow
-def test_a_policy_with_other_statistics_is_asked_again(checkpoint, old, new, recipe, tmp_path, monkeypatch):
-    """The weights did not change, but the cache holds what the policy planned with the wrong statistics."""
-    was = load_checkpoint(checkpoint)
-    plans, rows = [], np.arange(2 * recipe.samples)
-    monkeypatch.setattr(finetune_module.Lessons, "refuse_stranger", lambda self, *_: plans.append(self.plans[rows]))
-    for shift in (0.0, 0.02):
-        config = replace(was.config, action_unnorm=Affine((1.0, 1.0), (0.0, shift)))
-        write_lerobot(tmp_path / "parent", config, was.weights, {})
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            interrupt(patch, finetune_module._Room, "train")
-            finetune(tmp_path / "parent", [old, new], "better", runs_dir=tmp_path, recipe=recipe, device="cpu")
-    before, corrected = plans
-    assert corrected[..., 1] - before[..., 1] == pytest.approx(0.02, abs=1e-6)
-
-
 # --- what cannot be ---
 
 
@@ -348,25 +301,6 @@ def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint
     with pytest.raises(FinetuneError, match="is there already"):
         finetune(checkpoint, [old, new], "better", runs_dir=tmp_path / "runs", device="cpu")
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["better"]
-
-
-def test_ended_while_the_run_takes_its_place_it_goes_on(checkpoint, old, new, tmp_path, monkeypatch):
-    """A run's folder with only some of its files would keep the same command from going on."""
-    taught = SimpleNamespace(folder=tmp_path / "phases")
-    monkeypatch.setattr(finetune_module, "_train_phases", lambda work: taught)
-
-    def leave(folder, *_):
-        for name in ("best_model.pth", "finetune.json"):
-            (folder / name).touch()
-
-    monkeypatch.setattr(finetune_module, "_leave", leave)
-    for at in (1, 2, 3):
-        with monkeypatch.context() as patch:
-            interrupt(patch, Path, "rename", at)
-            with contextlib.suppress(KeyboardInterrupt):
-                finetune(checkpoint, [old, new], f"better-{at}", runs_dir=tmp_path, device="cpu")
-        folder = tmp_path / f"better-{at}"
-        assert not folder.exists() or (folder / "finetune.json").exists()
 
 
 def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):

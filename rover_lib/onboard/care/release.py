@@ -44,9 +44,7 @@ SIGNATURE = "policy.pt.sig"
 SIGNERS = Path("/etc/rover/allowed_signers")  # in the format of ssh-keygen(1); provision.yml writes it
 SIGNER, NAMESPACE = "rover", "rover-policy"  # the principal there, and what a signature is for
 NAME = re.compile(r"([0-9a-f]{64})(-\d+)?")  # ...-2: a second copy, because the first was damaged while in use
-PART = re.compile(r"part-\d{4,}")
-PART_BYTES = 8 << 20  # the most that is sent again after a transfer was cut off
-MOST_PARTS = 1000
+COPIED_BYTES = 8 << 20  # at once
 SPARE_BYTES = 64 << 20  # left free for logs
 JSON_BYTES = 100_000  # largest release.json or history.json
 HISTORY = 100
@@ -140,13 +138,12 @@ def pack(
     allow: Iterable[str] = (),
     key: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Cut an artifact into parts in a folder of their own, with a release.json that describes the whole.
+    """Put a copy of an artifact into a folder of its own, with its signature and a release.json that describes it.
 
-    Parts are sent one by one, so that an interrupted transfer can continue. The parts of an earlier pack() in the
-    folder are replaced. key: ssh key to sign the artifact with; a rover accepts only artifacts that its own laptops
-    have signed. Returns the content of release.json: name (the content hash), sha256, bytes, parts, mode, origin.
-    Raises as inspect_artifact(). Raises ReleaseError, and changes nothing, if the key cannot sign or the folder holds
-    other files.
+    What an earlier pack() has left in the folder is replaced. key: ssh key to sign the artifact with; a rover accepts
+    only artifacts that its own laptops have signed. Returns the content of release.json: name (the content hash),
+    sha256, bytes, mode, origin. Raises as inspect_artifact(). Raises ReleaseError, and changes nothing, if the key
+    cannot sign or the folder holds other files.
     """
     artifact, folder = Path(artifact), Path(folder)
     inspected = inspect_artifact(artifact, expected, allow)
@@ -154,15 +151,12 @@ def pack(
     for old in _read_earlier_pack(artifact, folder):
         old.unlink()
     folder.mkdir(parents=True, exist_ok=True)
-    about = {**_about(inspected), "parts": 0}
+    about = _about(inspected)
     try:
-        with artifact.open("rb") as f:
-            while part := f.read(PART_BYTES):
-                (folder / f"part-{about['parts']:04d}").write_bytes(part)
-                about["parts"] += 1
+        (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
         if signature:
             (folder / SIGNATURE).write_bytes(signature)
-        (folder / ORIGIN).write_text(json.dumps(about, indent=1, sort_keys=True) + "\n")
+        shutil.copyfile(artifact, folder / POLICY)
     except BaseException:
         for half in _read_earlier_pack(artifact, folder):  # make room on a full disk
             half.unlink()
@@ -171,14 +165,15 @@ def pack(
 
 
 def _read_earlier_pack(artifact: Path, folder: Path) -> list[Path]:
-    """Return the files of an earlier pack(), release.json first. Raises ReleaseError if there are other files."""
+    """Return the files of an earlier pack(), release.json last. Raises ReleaseError if there are other files."""
     if not folder.exists():
         return []
     remedy = "pack into a folder of its own"
     if not folder.is_dir():
         raise ReleaseError(f"{folder}: not a folder", remedy=remedy)
-    files = sorted(folder.iterdir(), key=lambda p: (p.name != ORIGIN, p.name))
-    ours = [p for p in files if _is_packed(p) and not p.samefile(artifact)]
+    files = sorted(folder.iterdir(), key=lambda p: (p.name == ORIGIN, p.name))
+    names = (POLICY, SIGNATURE, ORIGIN) if (folder / ORIGIN).is_file() else ()  # a policy.pt alone is somebody's
+    ours = [p for p in files if p.is_file() and p.name in names and not p.samefile(artifact)]
     if others := [p for p in files if p not in ours]:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise ReleaseError(
@@ -187,10 +182,6 @@ def _read_earlier_pack(artifact: Path, folder: Path) -> list[Path]:
             remedy=remedy,
         )
     return ours
-
-
-def _is_packed(path: Path) -> bool:
-    return path.is_file() and (path.name in (ORIGIN, SIGNATURE) or PART.fullmatch(path.name) is not None)
 
 
 def sign(artifact: Path | str, key: Path | str) -> bytes:
@@ -423,18 +414,17 @@ class Releases:
             new = self.releases / ".new"
             new.mkdir()
             new.chmod(0o755)  # whatever the umask is: the service's user must be able to read it
-            parts = [source / f"part-{i:04d}" for i in range(about["parts"])] if about else [source]
-            most = about["bytes"] if about else ARCHIVE_BYTES
-            arrived, wanted = _join(parts, new / POLICY, most), sha256 or (about or {}).get("sha256")
+            artifact, most = (source / POLICY, about["bytes"]) if about else (source, ARCHIVE_BYTES)
+            arrived, wanted = _copy(artifact, new / POLICY, most), sha256 or (about or {}).get("sha256")
             if wanted and arrived != wanted:
                 raise ReleaseError(
                     f"{source}: arrived damaged (sha256 {arrived[:12]}, not {wanted[:12]})", remedy="send it again"
                 )
             try:
                 if not unsigned:
-                    signature = source / SIGNATURE if about else Path(f"{source}.sig")
+                    signature = Path(f"{artifact}.sig")
                     check_signature(new / POLICY, signature, self.signers)
-                    _join([signature], new / SIGNATURE, JSON_BYTES)
+                    _copy(signature, new / SIGNATURE, JSON_BYTES)
                 here = _about(inspect_artifact(new / POLICY, self.expected, allow))
             except RoverError as e:
                 what = e.what.replace(str(new / POLICY), str(source))
@@ -446,8 +436,8 @@ class Releases:
             here["origin"] = about["origin"] if about else {**here["origin"], "file": _file(source)}
             if existing := self._intact(here["name"]):
                 return self._accept(existing, new / SIGNATURE, unsigned)
-            _write(new / DIGEST, f"{arrived}  {POLICY}\n")
-            _write(new / ORIGIN, json.dumps(here, indent=1, sort_keys=True) + "\n")
+            _write(new / DIGEST, [f"{arrived}  {POLICY}\n".encode()])
+            _write(new / ORIGIN, [json.dumps(here, indent=1, sort_keys=True).encode() + b"\n"])
             _sync(new)
             name = self._new_name(here["name"])
             new.rename(self.releases / name)
@@ -462,7 +452,7 @@ class Releases:
         check_signature(policy, signature, self.signers)
         new = policy.with_name(f".{SIGNATURE}")
         new.unlink(missing_ok=True)
-        _join([signature], new, JSON_BYTES)
+        _copy(signature, new, JSON_BYTES)
         new.replace(policy.with_name(SIGNATURE))
         _sync(policy.parent)
         return Staged(name, True)
@@ -604,11 +594,9 @@ class Releases:
             origin = {key: about["origin"][key] for key in ("file", "host")}
             if not all(isinstance(v, str) and v.isprintable() for v in origin.values()):
                 raise ValueError("its origin is not printable text")
-            size, parts = about["bytes"], about["parts"]
-            counts = isinstance(size, int) and isinstance(parts, int)
-            if not counts or not 0 < size <= ARCHIVE_BYTES or not 0 < parts <= MOST_PARTS:
-                raise ValueError("its sizes are impossible")
-            return {"name": about["name"], "sha256": about["sha256"], "origin": origin, "bytes": size, "parts": parts}
+            if not isinstance(about["bytes"], int) or not 0 < about["bytes"] <= ARCHIVE_BYTES:
+                raise ValueError("its size is impossible")
+            return {key: about[key] for key in ("name", "sha256", "bytes")} | {"origin": origin}
         except (OSError, ValueError, KeyError, TypeError, ReleaseError) as e:
             raise ReleaseError(
                 f"{folder / ORIGIN}: not what 'rover release pack' writes ({e})", remedy="send it again"
@@ -680,7 +668,7 @@ class Releases:
         """
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
-            _write(new, json.dumps(names[-HISTORY:]) + "\n")
+            _write(new, [json.dumps(names[-HISTORY:]).encode()])
             new.replace(self.models / "history.json")
             _sync(self.models)
 
@@ -769,45 +757,40 @@ def _read_json(path: Path) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def _join(parts: list[Path], target: Path, most: int) -> str:
-    """Join parts into one new, synced file, and return its SHA-256.
+def _copy(source: Path, target: Path, most: int) -> str:
+    """Copy a file into a new, synced one, and return its SHA-256.
 
-    Raises ReleaseError if a part is missing, or if together they have more than `most` bytes.
+    Raises ReleaseError if it is missing, or has more than `most` bytes.
     """
     digest = hashlib.sha256()
-    file = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+
+    def contents() -> Iterator[bytes]:
+        left = most
+        with _open_file(source) as file:
+            while content := file.read(min(COPIED_BYTES, left + 1)):
+                if (left := left - len(content)) < 0:
+                    raise ReleaseError(f"{source}: larger than it can be", remedy="send it again")
+                digest.update(content)
+                yield content
+
     try:
-        os.fchmod(file, 0o644)
-        for part in parts:
-            try:
-                with _open_file(part) as source:
-                    while content := source.read(min(PART_BYTES, most + 1)):
-                        if (most := most - len(content)) < 0:
-                            raise ReleaseError(f"{part}: larger than it can be", remedy="send it again")
-                        digest.update(content)
-                        _write_all(file, content)
-            except FileNotFoundError:
-                raise ReleaseError(f"{part}: not arrived", remedy="send it again") from None
-        os.fsync(file)
-    finally:
-        os.close(file)
+        _write(target, contents(), os.O_EXCL)
+    except FileNotFoundError:
+        raise ReleaseError(f"{source}: not arrived", remedy="send it again") from None
     return digest.hexdigest()
 
 
-def _write(path: Path, text: str) -> None:
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+def _write(path: Path, contents: Iterable[bytes], how: int = os.O_TRUNC) -> None:
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | how, 0o644)
     try:
         os.fchmod(file, 0o644)
-        _write_all(file, text.encode())
+        for content in contents:
+            left = memoryview(content)
+            while left:
+                left = left[os.write(file, left) :]
         os.fsync(file)
     finally:
         os.close(file)
-
-
-def _write_all(file: int, content: bytes) -> None:
-    left = memoryview(content)
-    while left:
-        left = left[os.write(file, left) :]
 
 
 def _sync(folder: Path) -> None:

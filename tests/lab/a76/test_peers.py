@@ -1,9 +1,7 @@
 """Other engines: what needs none of them is tested always, the engines themselves with ROVER_PEERS=1."""
 
-import json
 import os
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +20,6 @@ from lab.a76.count_run import errors_pct
 from lab.a76.peers import ENGINES, Made
 from lab.a76.report import LABEL, artifact_metrics
 from lab.a76.symbols import GuestFunctions, by_kernel
-from lab.debian import DebianError
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -141,71 +138,6 @@ def test_their_float_policy_is_ours(tiny, tiny_file, monkeypatch):
     torch.testing.assert_close(given, expected, rtol=0, atol=1e-6)
 
 
-@pytest.fixture
-def tools(tiny, monkeypatch):
-    """Instead of an engine's tools: what they were asked for, and files as they would leave them."""
-    seen = SimpleNamespace(calls=[], int8_layers=peers.int8_layers(tiny))
-
-    def run(python, script, checkpoint, calibration, artifact, **options):
-        with np.load(calibration) as given:
-            seen.calls.append((Path(script).name, {k: given[k] for k in given}, options["env"]["PYTHONPATH"]))
-        artifact.write_bytes(b"made")
-        return json.dumps({"int8_layers": seen.int8_layers, "float_layers": ["head"], "versions": {"tool": "1"}})
-
-    monkeypatch.setattr(peers, "packages_here", lambda engine: Path("/packages") / engine.name)
-    monkeypatch.setattr(peers, "run", run)
-    return seen
-
-
-def test_an_engine_gets_the_calibration_frames_and_is_asked_once(tiny, tools, tmp_path):
-    engine, samples = ENGINES[0], file_samples(tmp_path, 4, seed=2)
-    out = tmp_path / "peers"
-    made = peers.quantize_with(engine, tiny, samples, out)
-    path = made.path
-    assert (path.name, path.read_bytes(), made.report["versions"]) == ("onnxruntime.onnx", b"made", {"tool": "1"})
-    ((script, given, python_path),) = tools.calls
-    assert (script, python_path) == ("make_onnxruntime.py", "/packages/onnxruntime")
-    np.testing.assert_array_equal(given["state"], [s.state for s in samples])
-    np.testing.assert_array_equal(given["frames"][2], prepare_frame(samples[2].frame_bgr(), 72, 128))
-    assert peers.quantize_with(engine, tiny, samples, out) == made
-    assert len(tools.calls) == 1
-    peers.quantize_with(engine, tiny, samples[:3], out)
-    assert len(tools.calls) == 2, "other frames"
-    path.write_bytes(b"damaged")
-    peers.quantize_with(engine, tiny, samples[:3], out)
-    assert (len(tools.calls), path.read_bytes()) == (3, b"made")
-
-
-def test_a_layer_left_in_float_is_no_peer(tiny, tools, tmp_path):
-    tools.int8_layers -= 1
-    with pytest.raises(CountError, match=r"executorch: .* became INT8, and \d+ in ours"):
-        peers.quantize_with(ENGINES[1], tiny, file_samples(tmp_path, 2, seed=2), tmp_path / "peers")
-    assert not list((tmp_path / "peers").iterdir())
-
-
-def test_what_cannot_be_fetched_is_said(tmp_path, monkeypatch):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
-    monkeypatch.setenv("UV_OFFLINE", "1")
-    for get in (peers.packages_here, peers.packages_there):
-        with pytest.raises(CountError, match=r"uv failed .*; is the index within reach that has .*onnxruntime==\S+"):
-            get(ENGINES[0])
-    assert not list((tmp_path / "cache").iterdir())
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(CountError, match="no uv to fetch"):
-        peers.packages_here(ENGINES[0])
-
-
-def test_the_compiler_is_named_when_it_cannot_be_installed(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(peers.os, "geteuid", lambda: 1000)
-    with pytest.raises(
-        DebianError, match=r"packages g\+\+-aarch64-linux-gnu, which are not here; sudo apt-get install"
-    ):
-        peers._compile(tmp_path)
-
-
 def test_counts_of_another_policy_are_refused(tmp_path):
     with pytest.raises(CountError, match=r"arm\.json: not found; count the run's own artifacts first"):
         peers.count_peers(tmp_path)
@@ -273,30 +205,6 @@ def test_peers_join_what_was_counted(without_engines, tiny_run):
     assert rows["executorch"]["made_with"] == {"tool": "1"}
     assert read_manifest(tiny_run.folder / "peers" / "policy_static_affine.pt")["scheme"] == "affine"
     assert peers.count_peers(tiny_run.folder, frames=6)["metrics"] == content["metrics"], "again, over itself"
-
-
-def test_an_affine_artifact_of_the_run_is_not_counted_twice(without_engines, tiny_run, monkeypatch):
-    def affine(*rest):
-        raise AssertionError("made and counted twice")
-
-    monkeypatch.setattr(peers, "affine", affine)
-    (tiny_run.folder / "policy_static_affine.pt").write_bytes(b"x" * 2_000_000)
-    arm_json(tiny_run.folder, policy_static_affine={"instructions_g": 0.15})
-    rows = peers.count_peers(tiny_run.folder, frames=6)["metrics"]["peers"]
-    (tiny_run.folder / "policy_static_affine.pt").unlink()
-    assert rows["torch_affine"] == {"artifact": "policy_static_affine", "file_mb": 2.0, "instructions_g": 0.15}
-
-
-def test_a_peer_that_fails_leaves_arm_json_as_it_was(without_engines, tiny_run, monkeypatch):
-    def fails(*rest, **how):
-        raise CountError("the emulated program ended with 1")
-
-    arm_json(tiny_run.folder)
-    before = (tiny_run.folder / "arm.json").read_bytes()
-    monkeypatch.setattr(peers, "count_artifact", fails)
-    with pytest.raises(CountError, match="ended with 1"):
-        peers.count_peers(tiny_run.folder, frames=6)
-    assert (tiny_run.folder / "arm.json").read_bytes() == before
 
 
 # --- the engines ------------------------------------------------------------------------------------------------------

@@ -133,12 +133,6 @@ def test_without_a_checkout(monkeypatch, tmp_path):
 class TestFirmware:
     pytestmark = with_firmware
 
-    def test_it_is_built_once(self):
-        first = arduino.build.__wrapped__()
-        made = first.program.stat().st_mtime_ns
-        assert arduino.build.__wrapped__() == first
-        assert first.program.stat().st_mtime_ns == made
-
     @needs.real_time
     def test_every_pulse_is_there(self, emulated):
         time.sleep(0.1)

@@ -10,11 +10,7 @@ from lab.pi import container_run
 from lab.pi.deployment_bench import DeploymentBench, Line, line_of
 from lab.pi.deployment_faults import FAULTS, wrong_rows
 from lab.pi.emulation import EmulationError
-from lab.pi.fleet import REPORT as REPORT_TASK
-from lab.pi.fleet import results_of, wanted_of
-from lab.pi.playbooks import REPOSITORY
 
-ABOUT = {"name": "a" * 64, "sha256": "b" * 64, "bytes": 100, "parts": 2}
 GOOD = {"healthy": True, "status_true": True, "healed_by_rerun": True}
 
 
@@ -56,35 +52,6 @@ def test_a_rover_is_found_in_the_table():
     assert line_of(STATUS, "rover2") == Line(False, "none", "2026-11-21", "no model: deploy one; release 0123: damaged")
     with pytest.raises(EmulationError, match="no line of rover3"):
         line_of(STATUS, "rover3")
-
-
-REPORT = """
-TASK [Show each result] ****
-ok: [canary] => {
-    "msg": "canary: deployed"
-}
-ok: [second] => {
-    "msg": "second: failed: [Errno 30] \\"Read-only\\""
-}
-
-TASK [Fail if any rover failed] ****
-    "msg": "other: nothing"
-"""
-
-
-def test_the_report_is_read_by_rover():
-    assert f"- name: {REPORT_TASK}\n" in (REPOSITORY / "ansible" / "deploy.yml").read_text()
-    assert results_of(REPORT) == {"canary": "deployed", "second": 'failed: [Errno 30] "Read-only"'}
-
-
-def test_what_a_broken_rover_must_lead_to():
-    before = dict.fromkeys(("canary", "second", "third"), "static")
-    assert wanted_of("second", before, "mixed") == {
-        "canary": ("deployed", "mixed"),
-        "second": ("failed", "static"),
-        "third": ("untouched: second failed", "static"),
-    }
-    assert [start for start, _ in wanted_of("", before, "static").values()] == ["had it already"] * 3
 
 
 def test_what_is_not_well_is_said():

@@ -6,30 +6,22 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
-import pytest
 from aiohttp import web
 
-from balloon_world.simulated_arduino import PinEvent
 from lab.pi import container, view_proofs
-from lab.pi.emulation import EmulationError
 from lab.pi.view_proofs import (
     FILES,
     TOKEN,
     VIEW_UNIT,
     VIEW_USER,
-    listening,
-    page_token,
     spoilt,
     status,
-    throttles,
-    view_again,
     view_gone,
 )
 from rover_lib.onboard.view.server import Address, View
 
 ROOT = Path(__file__).parents[3]
 SECRET = "a" * 24
-HERE = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid\n"
 
 
 class StandIn:
@@ -78,16 +70,6 @@ def served(token: str = SECRET):
         thread.join(10)
 
 
-def test_where_a_port_is_listened_to_is_the_kernels_table(tmp_path):
-    four, six = tmp_path / "tcp", tmp_path / "tcp6"
-    four.write_text(HERE + "   0: 0100007F:2116 00000000:0000 0A 0 0 0\n   1: 00000000:0016 00000000:0000 0A 0 0 0\n"
-                    "   2: 0100007F:2116 0100007F:C001 01 0 0 0\n")  # fmt: skip
-    six.write_text(HERE + f"   0: {'0' * 32}:2116 {'0' * 32}:0000 0A 0 0 0\n")
-    assert listening(8470, (str(four),)) == ["0100007F"]
-    assert listening(8470, (str(four), str(six))) == ["0100007F", "0" * 32]
-    assert listening(22, (str(four), str(six))) == ["00000000"] and listening(1, (str(four),)) == []
-
-
 def test_the_doors_of_a_view_are_shut_and_one_that_is_open_is_seen(monkeypatch):
     with served() as port:
         rows = view_proofs._doors(port, SECRET)
@@ -100,36 +82,12 @@ def test_the_doors_of_a_view_are_shut_and_one_that_is_open_is_seen(monkeypatch):
     assert status(port, "/") == 0 and [row.holds for row in view_proofs._doors(port, SECRET)] == [False] * 3
 
 
-def test_a_throttle_that_stays_as_it_is_is_told_once():
-    events = [PinEvent(at, "pulse", "throttle", us, 1016.0) for at, us in ((1.0, 120.0), (2.0, 300.0), (5.0, 120.0))]
-    events += [PinEvent(3.5, "pulse", "steering", 1500.0, 20000.0), PinEvent(3.6, "line", "", 0.0, 0.0)]
-    assert throttles(events, 3.0, 4.0) == [300.0] and throttles(events, 3.0, 5.0) == [300.0, 120.0]
-    assert throttles(events, 0.5, 0.9) == [] and throttles(events, 6.0, 7.0) == [120.0]
-
-
 def test_a_drive_that_this_machine_spoilt_is_no_fault_of_the_view():
     by_us = '{"event": "the view is gone"}\n{"event": "ended: stopped from the view (127.0.0.1)"}\n'
     assert not spoilt(by_us) and view_proofs._after_the_drive(by_us).holds
     busy = '{"event": "ended: the Arduino has not answered for 187 ms, the link is behind"}\n'
     assert len(spoilt(busy + by_us)) == 1 and not view_proofs._after_the_drive(busy).holds
     assert not spoilt('{"event": "ended: the camera is gone"}') and not view_proofs._after_the_drive(by_us * 2).holds
-
-
-def test_the_token_of_a_rover_without_a_view_is_an_error(tmp_path):
-    pi = StandIn(tmp_path)
-    with pytest.raises(EmulationError, match=f"rover1: no {TOKEN}"):
-        page_token(pi)
-    (tmp_path / TOKEN.lstrip("/")).write_text(f"{SECRET}\n")
-    assert page_token(pi) == SECRET
-
-
-def test_it_is_served_again_after_a_boot_or_the_row_says_so(tmp_path, monkeypatch):
-    pi = StandIn(tmp_path)
-    (tmp_path / TOKEN.lstrip("/")).write_text(SECRET)
-    with served() as port:
-        assert [row.holds for row in view_again(pi, port)] == [True]
-    monkeypatch.setattr(view_proofs, "START_S", 0.0)
-    assert [row.holds for row in view_again(pi, port)] == [False]
 
 
 def test_what_is_left_of_a_view_is_found(tmp_path):

@@ -97,7 +97,7 @@ def serve() -> None:
 
 @pytest.fixture(scope="module")
 def judged():
-    """judged(path, proof) judges an artifact, or a folder of parts, in a process forked from a new interpreter.
+    """judged(path, proof) judges an artifact, or a folder that was packed, in a process forked from a new interpreter.
 
     Not from this one, where a fork could use memory that earlier tests have freed, beyond its limit, and wait for ever
     for a lock that another thread held at that moment.
@@ -381,6 +381,15 @@ MANIFESTS = [
     ({"rate_hz": True}, "rate_hz must be from 5 to 120"),
     ({"chunk": 32_000}, "chunk must be from 1 to 256, found 32000"),
     ({"chunk": True}, "chunk must be from 1 to 256"),
+    ({"chunk": "32"}, "manifest key 'chunk'"),
+    ({"chunk": ...}, "manifest key 'chunk'"),
+    ({"schema": 99}, "schema 99"),
+    ({"cameras": []}, "has no cameras"),
+    ({"cameras": [{"name": "cam_front"}]}, "lacks name, height or width"),
+    ({"cameras": [{"name": ["cam"], "height": 72, "width": 128}]}, "is not a name and a size"),
+    ({"state_names": []}, "state_names must be names"),
+    ({"action_names": [["steering"]]}, "action_names must be names"),
+    ({"action_names": ["steering"]}, "tolerance"),
     ({"weights_mb": -1}, "weights_mb must be from 0"),
     ({"gmac": float("nan")}, "gmac must be from 0"),
     ({"cameras": [{"name": "cam_front", "height": 1, "width": 2}]}, "is not a name and a size"),
@@ -408,6 +417,8 @@ RECORDS = {  # what -> (record, edit, message)
     **PICKLES,
     **{f"{what} in the parity vectors": ("parity.npz", *row) for what, row in VECTORS.items()},
     **{f"manifest {i}": ("manifest.json", manifest_with(**values), says) for i, (values, says) in enumerate(MANIFESTS)},
+    "no manifest": ("manifest.json", lambda _: None, "manifest.json"),
+    "no parity vectors": ("parity.npz", lambda _: None, "parity.npz"),
     **{f"no manifest {i}": ("manifest.json", lambda _, t=t: t, "manifest is no") for i, t in enumerate(NO_MANIFESTS)},
 }
 
@@ -482,9 +493,9 @@ def describes(**values: object) -> Callable[[Path], None]:
 
 
 PACKED = {
-    "a part that is a FIFO": ("part-0001", replaced_by(a_fifo), "not a file"),
-    "a part without end": ("part-0001", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
-    "a part that is larger": ("part-0001", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
+    "a policy that is a FIFO": ("policy.pt", replaced_by(a_fifo), "not a file"),
+    "a policy without end": ("policy.pt", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
+    "a policy that is larger": ("policy.pt", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
     "a description that is a FIFO": ("release.json", replaced_by(a_fifo), "not what 'rover release pack' writes"),
     "a deep description": (
         "release.json",
@@ -492,9 +503,8 @@ PACKED = {
         "not what 'rover release pack' writes",
     ),
     "a long description": ("release.json", lambda p: p.write_text(" " * 9_000_000), "not what 'rover release pack'"),
-    "a billion parts": ("release.json", describes(parts=10**9, bytes=10**9), "its sizes are impossible"),
-    "a terabyte": ("release.json", describes(bytes=10**12), "its sizes are impossible"),
-    "less than nothing": ("release.json", describes(bytes=-1), "its sizes are impossible"),
+    "a terabyte": ("release.json", describes(bytes=10**12), "its size is impossible"),
+    "less than nothing": ("release.json", describes(bytes=-1), "its size is impossible"),
     "fewer bytes than there are": ("release.json", describes(bytes=1000), "larger than it can be"),
     "another name": ("release.json", describes(name="../../harm"), "its name or sha256 is not a hash"),
     "a terminal's commands": (
@@ -506,8 +516,7 @@ PACKED = {
 
 
 @pytest.mark.parametrize("what", PACKED)
-def test_no_parts_of_another_form_are_joined(artifacts, tmp_path, monkeypatch, refused, what):
-    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", 20 << 20)
+def test_nothing_packed_in_another_form_is_staged(artifacts, tmp_path, refused, what):
     name, change, message = PACKED[what]
     pack(artifacts["fp32"], tmp_path / "packed", EITHER)
     change(tmp_path / "packed" / name)

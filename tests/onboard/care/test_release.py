@@ -177,7 +177,6 @@ def lose(folder: Path, inodes: set[int]) -> None:
             path.write_bytes(b"")
 
 
-PART_BYTES = 100_000  # of a transfer here: an artifact is several parts
 STEPS = 34  # of a deployment; test_cuts_are_all_of_a_deployment holds it to what is
 
 
@@ -266,25 +265,15 @@ def test_nothing_unsynced_when_current_is_switched(releases, two):
 # Transfers
 
 
-@pytest.fixture(scope="session")
-def all_packed(two, keys, tmp_path_factory) -> Path:
-    """The second of the two, in parts."""
-    folder = tmp_path_factory.mktemp("laptop") / "packed"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rover_lib.onboard.care.release.PART_BYTES", PART_BYTES)
-        assert pack(two[1], folder, key=keys / "ours")["parts"] == len(list(folder.glob("part-*"))) > 3
-    return folder
-
-
 @pytest.fixture
-def packed(all_packed, tmp_path, monkeypatch) -> Path:
-    """The second of the two, in parts, to do anything with."""
-    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", PART_BYTES)
-    return Path(shutil.copytree(all_packed, tmp_path / "packed"))
+def packed(two, keys, tmp_path) -> Path:
+    """The second of the two, packed to travel."""
+    pack(two[1], tmp_path / "packed", key=keys / "ours")
+    return tmp_path / "packed"
 
 
 @pytest.mark.slow
-def test_parts_make_the_artifact_again(releases, packed, two):
+def test_what_was_packed_becomes_the_artifact_again(releases, packed, two):
     staged = releases.stage(packed)
     assert staged.changed and staged.name == content_hash(two[1])
     assert releases.path_of(staged.name).read_bytes() == two[1].read_bytes()
@@ -297,41 +286,38 @@ def test_an_artifact_in_a_folder_of_any_name_is_taken(releases, two, tmp_path):
     folder = tmp_path / "my\N{NO-BREAK SPACE}policies, \udcff"
     folder.mkdir()
     shutil.copy(two[1], folder / "policy.pt")
-    pack(folder / "policy.pt", tmp_path / "parts")
-    name = releases.stage(tmp_path / "parts", unsigned=True).name
+    pack(folder / "policy.pt", tmp_path / "packed")
+    name = releases.stage(tmp_path / "packed", unsigned=True).name
     (origin,) = (r.origin for r in releases.all() if r.name == name)
     assert origin.endswith(r"my\xa0policies, \udcff/policy.pt")
-
-
-def test_packing_again_changes_nothing(packed, two, keys):
-    def content():
-        return {p.name: (p.read_bytes()) for p in packed.iterdir()}
-
-    before = content()
-    pack(two[1], packed, key=keys / "ours")
-    assert content() == before
-
-
-def test_a_disk_that_fills_while_packing_is_left_without_halves(two, tmp_path, monkeypatch):
-    write = Path.write_bytes
-
-    def full(path, content):
-        write(path, content[:100])
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="No space left"):
-        pack(two[1], tmp_path / "packed")
-    assert not list((tmp_path / "packed").iterdir())
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-@pytest.mark.parametrize("foreign", ["notes.txt", "part-0000/inside", "part-one", ".hidden", "policy.pt"])
+def test_packing_again_replaces_what_was_packed(packed, two, keys):
+    before = contents(packed)
+    pack(two[1], packed, key=keys / "ours")
+    assert contents(packed) == before
+    pack(two[0], packed)
+    assert set(contents(packed)) == {"policy.pt", "release.json"}  # no signature of the one before
+
+
+def test_a_disk_that_fills_while_packing_is_left_without_halves(two, tmp_path, monkeypatch):
+    def full(source, target):
+        Path(target).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        pack(two[1], tmp_path / "packed")
+    assert not list((tmp_path / "packed").iterdir())
+
+
+@pytest.mark.parametrize("foreign", ["notes.txt", "policy.pt/inside", ".hidden"])
 def test_a_folder_that_holds_anything_else_is_refused_and_left_as_it_is(packed, two, foreign):
-    (packed / "part-0000").unlink()
+    (packed / "policy.pt").unlink()
     (packed / foreign).parent.mkdir(exist_ok=True)
     (packed / foreign).write_text("not ours")
     before = contents(packed)
@@ -342,7 +328,7 @@ def test_a_folder_that_holds_anything_else_is_refused_and_left_as_it_is(packed, 
     assert contents(packed) == before
 
 
-@pytest.mark.parametrize("name", ["policy_static.pt", "part-0000", "release.json"])
+@pytest.mark.parametrize("name", ["policy_static.pt", "policy.pt", "release.json"])
 def test_the_artifact_in_the_folder_is_not_removed(two, tmp_path, name):
     folder = tmp_path / "runs"
     folder.mkdir()
@@ -358,34 +344,21 @@ def test_a_file_in_place_of_the_folder_is_refused(two, tmp_path):
         pack(two[0], tmp_path / "packed")
 
 
-def test_packing_a_smaller_artifact_leaves_no_part_of_the_larger_one(packed, two, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.care.release.PART_BYTES", 1 << 30)
-    pack(two[0], packed)
-    assert set(contents(packed)) == {"part-0000", "release.json"}
-
-
-def test_a_flipped_byte_on_the_way_is_found_and_the_same_transfer_repeated_heals(releases, packed):
-    old, part = releases.current, packed / "part-0002"
-    good = part.read_bytes()
-    part.write_bytes(bytes([good[0] ^ 1]) + good[1:])
-    with pytest.raises(ReleaseError, match=r"arrived damaged .* send it again"):
-        releases.stage(packed)
-    assert_drives(releases, {old})
-    part.write_bytes(good)
-    assert_drives(releases, {deploy(releases, packed)} - {old})
-
-
-def test_a_transfer_that_was_cut_goes_on(releases, packed):
-    old, last = releases.current, max(packed.glob("part-*"))
-    good = last.read_bytes()
-    last.unlink()
-    with pytest.raises(ReleaseError, match="not arrived"):
-        releases.stage(packed)
-    last.write_bytes(good[: len(good) // 2])
-    with pytest.raises(ReleaseError, match="arrived damaged"):
-        releases.stage(packed)
-    assert_drives(releases, {old})
-    last.write_bytes(good)
+def test_what_arrives_damaged_or_not_at_all_is_refused_and_the_same_transfer_repeated_heals(releases, packed):
+    old, policy = releases.current, packed / "policy.pt"
+    good = policy.read_bytes()
+    flipped = bytes([good[0] ^ 1]) + good[1:]
+    for bad, says in (
+        (flipped, r"arrived damaged .* send it again"),
+        (good[:-9], "arrived damaged"),
+        (good + b"x", "larger than it can be; send it again"),
+        (None, "not arrived; send it again"),
+    ):
+        policy.unlink() if bad is None else policy.write_bytes(bad)
+        with pytest.raises(ReleaseError, match=says):
+            releases.stage(packed)
+        assert_drives(releases, {old})
+    policy.write_bytes(good)
     assert_drives(releases, {deploy(releases, packed)} - {old})
 
 

@@ -334,7 +334,7 @@ def sealed(body):
 
 
 def test_a_line_that_is_nested_without_end_is_skipped(tmp_path, good):
-    assert read_bytes(good + sealed(b'{"kind":"x","y":' + b"[" * 5000 + b"]" * 5000), tmp_path).damaged == 1
+    assert read_bytes(good + sealed(b'{"kind":"x","y":' + b"[" * 200_000 + b"]" * 200_000), tmp_path).damaged == 1
 
 
 @pytest.mark.parametrize(
@@ -414,24 +414,6 @@ def test_a_disk_that_takes_a_line_without_its_end(path, monkeypatch, end):
     flight = read_log(path)
     assert flight.ticks["frame"].tolist() == list(range(10))  # none lost, none twice
     assert (flight.drives, flight.damaged) == (1, 0)
-
-
-def test_a_long_failure_loses_the_oldest_and_marks_the_gap(path, monkeypatch):
-    monkeypatch.setattr(telemetry, "QUEUE_TICKS", 50)
-    monkeypatch.setattr(telemetry, "RETRY_S", 0.02)
-    path.mkdir()
-    with FlightLog(path, header=HEADER, **LIMITS, flush_s=0.02) as log:
-        until(lambda: log.failures >= 1)
-        for k in range(200):
-            log.tick(tick(k))
-        path.rmdir()
-        until(path.is_file)
-    flight = read_log(path)
-    assert flight.ticks["frame"].tolist() == list(range(150, 200))
-    assert log.dropped == 150
-    assert {e.text: e.fields for e in flight.events}[telemetry.MISSING] == {"ticks": 150}
-    found = flight.summary()
-    assert (found["ticks_not_logged"], found["missed"]) == (150, 0)
 
 
 def test_ticks_that_were_not_logged_are_not_missed(path, monkeypatch):
@@ -530,17 +512,6 @@ def test_a_logger_that_is_stuck_or_raises_does_not_matter(path, monkeypatch):
     assert [e.text for e in read_log(path, 0).events] == ["one", "and another"]
     assert len(read_log(path).events) == telemetry.QUEUE_EVENTS
     assert len(read_log(path).ticks["t_s"]) == 1
-
-
-def test_a_tick_costs_the_loop_little(path):
-    row, times_s = tick(0), []
-    with FlightLog(path, header=HEADER, **LIMITS, flush_s=0.02) as log:
-        for _ in range(2000):
-            start = time.perf_counter()
-            log.tick(row)
-            times_s.append(time.perf_counter() - start)
-            time.sleep(0.0001)
-    assert np.median(times_s) < 100e-6  # 1 us here; the other threads' turns are the rest
 
 
 # ---- the summary

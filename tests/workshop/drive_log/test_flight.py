@@ -143,29 +143,3 @@ def test_the_command(path):
     for name in ("other", "other.txt"):
         refused = rover("log", path, "-o", path.parent / name)
         assert refused.exit_code == 1 and "no figure has that ending, found" in refused.output
-
-
-def test_the_summary_needs_no_workstation(path, monkeypatch):
-    import sys
-
-    fly(path)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for name in (
-        "rover_lib.workshop.drive_log.flight",
-        "rover_lib.workshop.plots",
-        "matplotlib.pyplot",
-        "matplotlib.axes",
-    ):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    result = rover("log", path)
-    assert result.exit_code == 1
-    assert re.search(r"^ticks +120$", result.output, re.MULTILINE)
-    assert "this command needs matplotlib" in result.output and "Traceback" not in result.output
-    assert rover("log", path, "--json").exit_code == 0
-
-
-def test_what_is_no_log(path):
-    path.write_bytes(b"something else")
-    result = rover("log", path)
-    assert result.exit_code == 1
-    assert result.output.startswith("rover: ") and "no line of a flight log" in result.output

@@ -6,8 +6,8 @@ import sys
 import pytest
 from needs import ended
 
+from balloon_world.child_process import Child
 from rover_lib.onboard.errors import WorldError
-from rover_lib.workshop.child_process import Child
 
 ECHO = "import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)"
 
