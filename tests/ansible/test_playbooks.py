@@ -155,6 +155,7 @@ def test_wrong_arguments_end_in_a_sentence_before_anything_is_done(tmp_path):
 def test_values_that_no_unit_can_have_are_refused(tmp_path):
     cases = [
         ("service", {"rover_camera": "/dev/video0\nExecStartPre=+/bin/true"}),
+        ("service", {"rover_camera": "csi --throttle-limit 1"}),
         ("service", {"rover_models": "/var/lib/rover\nUser=root"}),
         ("service", {"rover_home": "opt"}),
         ("service", {"rover_hz": "30\nUser=root"}),
@@ -530,6 +531,13 @@ def test_a_value_in_the_unit_is_one_word_of_its_command(units, value):
     before = commands(unit)["ExecStartPre"]
     unit.write_text(rendered(unit.name, **given))
     assert commands(unit) == {"ExecStart": expected, "ExecStartPre": before}
+
+
+@pytest.mark.parametrize(("camera", "more"), [("csi", True), ("csi:1,shutter=8000", True), ("/dev/video0", False)])
+def test_the_service_of_a_pi_camera_may_use_what_libcamera_needs(camera, more):
+    unit = rendered("rover-drive.service", rover_camera=camera)
+    assert f"--camera {camera} " in unit.replace('"', "")
+    assert [f"DeviceAllow=char-{d} rw" in unit for d in ("video4linux", "media", "dma_heap")] == [True, more, more]
 
 
 @pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car.csi import CsiError, is_csi, read_csi
 from rover_lib.onboard.car.picture import (
     LEAST,
     MOST_BYTES,
@@ -99,10 +100,10 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg file with one JPEG
-    after another. size: (width, height) to request from a V4L2 camera. rate_hz: frames per second to request, and the
-    rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time stamps may come
-    from. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg
+    file with one JPEG after another. size: (width, height) to request from a camera. rate_hz: frames per second to
+    request, and the rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time
+    stamps may come from. Any thread may call any method.
     """
 
     def __init__(
@@ -333,6 +334,8 @@ def path_of(source: str, dev: Path = Path("/dev")) -> Path:
 def _reader(
     source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
+    if is_csi(source):
+        return _csi(source, size, rate_hz, closing)
     path = path_of(source)
     source = str(path)
     try:
@@ -353,6 +356,13 @@ def _reader(
         f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
         remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
     )
+
+
+def _csi(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
+    try:
+        yield from read_csi(source, size, rate_hz, closing)
+    except CsiError as error:
+        raise CameraError(error.args[0], remedy=error.args[1]) from None
 
 
 def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
