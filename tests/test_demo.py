@@ -166,7 +166,14 @@ def test_what_readme_says_to_type_works(demo_run, tmp_path, monkeypatch):
     }
     assert [words[1] for words in asked] == ["demo", "test", "notebooks-open", "watch", "run"]
     for words in asked[2:]:
-        dry = ["make", "-n", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", *words[1:]]
+        dry = [
+            "make",
+            "-n",
+            "--no-print-directory",
+            f"VENV={sys.prefix}",
+            f"--old-file={sys.prefix}/.ready",
+            *words[1:],
+        ]
         command = subprocess.run(dry, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
         if words[1] == "run":
             assert command == f"{sys.prefix}/bin/rover run 'best_model.pth' 'episodes' --name 'mine'"
