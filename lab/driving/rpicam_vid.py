@@ -17,7 +17,7 @@ from pathlib import Path
 from rover_lib.onboard.car.camera import _fifo
 from rover_lib.onboard.car.csi import PROGRAM
 
-OPTIONS: tuple[str, ...] = (
+OPTIONS = (
     "camera",
     "width",
     "height",
@@ -28,8 +28,14 @@ OPTIONS: tuple[str, ...] = (
     "output",
     "verbose",
     "metadata",
+    "metadata-format",
+    "shutter",
+    "gain",
+    "ev",
+    "exposure",
+    "awb",
+    "rotation",
 )
-OPTIONS += ("metadata-format", "shutter", "gain", "ev", "exposure", "awb", "rotation")
 
 
 def install(folder: Path) -> Path:

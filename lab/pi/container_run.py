@@ -94,8 +94,8 @@ def run_container(
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
     provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
     the view's service, which other runs always include. faults: include the faults of deployments, which
-    run only with torch. pieces: only provision, cut off after each so-manieth task. say: called
-    with a line for each step.
+    run only with torch. pieces: only provision, cut off after each of so many tasks. say: called with a line for
+    each step.
     Raises RoverError if it cannot begin: without root, without artifacts, or if packages cannot be installed.
     """
     output, demo = Path(output), Path(demo)
@@ -265,7 +265,7 @@ class _Run:
         self.metrics["drive"] = {"ticks": len(states), "driven": driven, "ended": ended, "recorded": recorded}
 
     def cut_off(self, every: int) -> None:
-        """Provision another rover, from nothing, by plays that are killed after every so-manieth task."""
+        """Provision another rover, from nothing, by plays that are killed after every `every`-th task."""
 
         def done(play: Play) -> None:
             self.log.write(f"===== provision, in pieces\n{play.output}\n")

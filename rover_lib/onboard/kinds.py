@@ -12,6 +12,7 @@ import math
 import os
 import stat
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,9 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
 PARTS = ("checkpoint part", "dataset part")
-PULL = "git lfs pull, where it was cloned, or download the file itself"
 REFUSED = {
     "document": "give a file or folder that it describes",
-    "pointer": PULL,
+    "pointer": "git lfs pull, where it was cloned, or download the file itself",
     "packed": "unpack it, and give the folder or the file in it",
 }
 POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
@@ -127,15 +127,15 @@ def refuse_part(path: Path | str) -> None:
         raise KindError(f"{path}: this is {CALLED[kind]}", remedy=REFUSED[kind])
 
 
-def is_pointer(path: Path) -> bool:
-    """Whether Git LFS left a pointer in place of a file, as a clone without it does."""
-    try:
+def refuse_pointer(path: Path, error: type[RoverError]) -> None:
+    """Raise `error` if Git LFS left a pointer in place of a file, as a clone without it does."""
+    with suppress(OSError):
         if not path.is_file():  # opening a pipe would wait for ever
-            return False
+            return
         with path.open("rb") as f:
-            return f.read(len(POINTER)) == POINTER
-    except OSError:
-        return False
+            head = f.read(len(POINTER))
+        if head == POINTER:
+            raise error(f"{path}: {CALLED['pointer']}", remedy=REFUSED["pointer"])
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.csi import CsiError, is_csi, read_csi
+from rover_lib.onboard.car.csi import is_csi, read_csi
 from rover_lib.onboard.car.picture import (
     LEAST,
     MOST_BYTES,
@@ -33,7 +33,7 @@ from rover_lib.onboard.car.picture import (
     decode_jpeg,
     is_squeezed,
 )
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CameraError
 
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0
@@ -54,10 +54,6 @@ NEAR_S = 600.0  # a time stamp further from a clock than this does not come from
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
 Reader = Generator[Read, None, None]
-
-
-class CameraError(RoverError):
-    """A camera that is missing, has stopped, or delivers something different than before."""
 
 
 def size_like(width: int, height: int) -> tuple[int, int]:
@@ -335,7 +331,7 @@ def _reader(
     source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
     if is_csi(source):
-        return _csi(source, size, rate_hz, closing)
+        return read_csi(source, size, rate_hz, closing)
     path = path_of(source)
     source = str(path)
     try:
@@ -356,13 +352,6 @@ def _reader(
         f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
         remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
     )
-
-
-def _csi(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
-    try:
-        yield from read_csi(source, size, rate_hz, closing)
-    except CsiError as error:
-        raise CameraError(error.args[0], remedy=error.args[1]) from None
 
 
 def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:

@@ -11,7 +11,9 @@ import select
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
+
+from rover_lib.onboard.errors import CameraError
 
 PROGRAM = "rpicam-vid"
 SOURCE = re.compile(r"csi(?::(\d))?((?:,[a-z]+=[\w.-]+)*)", re.ASCII)  # csi, csi:1, csi,shutter=8000,gain=4
@@ -25,21 +27,19 @@ END_S = 1.0
 MOST_BYTES = 8_000_000  # of a stream without a JPEG
 
 
-class CsiError(Exception):
-    """rpicam-vid cannot be started, or has ended. args: what was wrong, and what to do."""
-
-
 def is_csi(source: str) -> bool:
     """Whether a camera's name means a Raspberry Pi camera."""
     return source == "csi" or source.startswith(("csi:", "csi,"))
 
 
 def command(source: str, size: tuple[int, int], rate_hz: float, metadata: str) -> list[str]:
-    """Return rpicam-vid's command line. size: (width, height). Raises CsiError for a source that is not understood."""
+    """Return rpicam-vid's command line. size: (width, height). Raises CameraError for another source."""
     found = SOURCE.fullmatch(source)
     given = dict(setting.split("=") for setting in (found[2] if found else "").split(",")[1:])
     if not found or set(given) - set(SETTINGS):
-        raise CsiError(f"{source}: not understood", f"csi, csi:1, or csi,NAME=VALUE with {', '.join(SETTINGS)}")
+        raise CameraError(
+            f"{source}: not understood", remedy=f"csi, csi:1, or csi,NAME=VALUE with {', '.join(SETTINGS)}"
+        )
     options: dict[str, object] = {"camera": found[1] or 0, "width": size[0], "height": size[1], "framerate": rate_hz}
     options |= {"timeout": 0, "codec": "mjpeg", "quality": QUALITY, "output": "-", "verbose": 0}
     options |= {"metadata": metadata, "metadata-format": "txt", **DEFAULTS, **given}
@@ -48,8 +48,8 @@ def command(source: str, size: tuple[int, int], rate_hz: float, metadata: str) -
 
 def read_csi(
     source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event
-) -> Iterator[tuple[bytes, float | None]]:
-    """Yield the newest JPEG and its time stamp (s). Raises CsiError without the program, or once it ends."""
+) -> Generator[tuple[bytes, float | None], None, None]:
+    """Yield the newest JPEG and its time stamp (s). Raises CameraError without the program, or once it ends."""
     reading, writing = os.pipe()
     process = None
     with tempfile.TemporaryFile() as errors:
@@ -61,7 +61,7 @@ def read_csi(
                 )
             except OSError as error:
                 remedy = "sudo apt-get install rpicam-apps-lite, on Raspberry Pi OS; is the cable in?"
-                raise CsiError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy) from None
+                raise CameraError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy=remedy) from None
             assert process.stdout
             yield from _pairs(process.stdout.fileno(), reading, closing)
             if not closing.is_set():
@@ -69,8 +69,8 @@ def read_csi(
                 errors.seek(0)
                 said = errors.read()[-200:].decode(errors="replace").split("\n")
                 why = next((text for text in reversed(said) if text.strip()), f"its status is {code}").strip()
-                raise CsiError(
-                    f"{source}: {PROGRAM} has ended: {why}", "`rpicam-hello --list-cameras` shows what is there"
+                raise CameraError(
+                    f"{source}: {PROGRAM} has ended: {why}", remedy="`rpicam-hello --list-cameras` shows what is there"
                 )
         finally:
             os.close(reading)
@@ -82,7 +82,7 @@ def read_csi(
                     process.stdout.close()
 
 
-def _pairs(pictures: int, entries: int, closing: threading.Event) -> Iterator[tuple[bytes, float | None]]:
+def _pairs(pictures: int, entries: int, closing: threading.Event) -> Generator[tuple[bytes, float | None], None, None]:
     """Yield (JPEG, time stamp) of two streams until the first ends; of several that wait, the newest."""
     pending, text = bytearray(), b""
     begun, stamps = 0, 0  # how many of each have come
@@ -106,6 +106,8 @@ def _pairs(pictures: int, entries: int, closing: threading.Event) -> Iterator[tu
                     waiting = {begun: bytes(pending[start : end + 2])}
                 del pending[: end + 2]
             if len(pending) > MOST_BYTES:
-                raise CsiError(f"no JPEG in {MOST_BYTES / 1e6:g} MB of {PROGRAM}'s stream", "update rpicam-apps")
+                raise CameraError(
+                    f"no JPEG in {MOST_BYTES / 1e6:g} MB of {PROGRAM}'s stream", remedy="update rpicam-apps"
+                )
         for number in [n for n in waiting if n <= stamps]:
             yield waiting.pop(number), known.get(number)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.kinds import PULL, is_pointer
+from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.contents import (
@@ -423,8 +423,7 @@ def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
         raise CheckpointError(
             f"{path}: {reason}", remedy="a LeRobot folder has config.json and model.safetensors"
         ) from None
-    if is_pointer(path):
-        raise CheckpointError(f"{path}: a Git LFS pointer, not the file that it stands for", remedy=PULL)
+    refuse_pointer(path, CheckpointError)
     if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
     if most_bytes is not None and status.st_size > most_bytes:

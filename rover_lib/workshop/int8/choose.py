@@ -130,17 +130,17 @@ class Chooser:
             all_but_odd = round(100 * (1 - share), 1)
             for pct in sorted({*USUAL_PCT, all_but_odd}, reverse=True):
                 tried[f"frames {pct:g}"] = replace(scheme, observer="frames", usual_pct=pct)
-            for share in ALL_WIDER:
-                wider = tuple((place, share) for place in self.calibration.frames)
-                name = f"frames {all_but_odd:g}, all {share:g} wider"
+            for by in ALL_WIDER:
+                wider = tuple((place, by) for place in self.calibration.frames)
+                name = f"frames {all_but_odd:g}, all {by:g} wider"
                 tried[name] = replace(scheme, observer="frames", usual_pct=all_but_odd, wider=wider)
         table = {}
         for name in progress(tried, desc="observers"):
             module = quantize(self.checkpoint, tried[name], self.calibration).module
             table[name] = self.error(module)
         best = min(table, key=lambda name: _worst(table[name]))
-        for name in tried:  # of these, what clips less comes first
-            rival = name.startswith(("minmax", "frames")) and not name.endswith("wider")
+        for name, how in tried.items():  # of these, what clips less comes first
+            rival = how.observer in ("minmax", "frames") and not how.wider
             if rival and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
                 best = name
                 break

@@ -382,7 +382,7 @@ def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str,
 
 
 def hits_needed(limits: Mapping[str, Any], trials: int | None) -> int:
-    """Return how many balloons FP32 has to hit in so many worlds; the limit is for GATED_WORLDS."""
+    """Return how many balloons FP32 must hit in `trials` worlds; params.yml says it for GATED_WORLDS."""
     return math.floor(limits["fp32_hits"] * (trials or GATED_WORLDS) / GATED_WORLDS)
 
 

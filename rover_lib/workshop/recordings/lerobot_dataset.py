@@ -22,7 +22,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
-from rover_lib.onboard.kinds import PULL, is_pointer
+from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
@@ -234,18 +234,13 @@ def fetch_dataset(source: Source) -> Source:
     return replace(source, path=hub.fetch(*given))
 
 
-def _refuse_pointer(path: Path) -> None:
-    if is_pointer(path):
-        raise EpisodeError(f"{path}: a Git LFS pointer, not the file that it stands for", remedy=PULL)
-
-
 def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     """Read meta/info.json. hub_id: user/name if the dataset is on the Hub. Raises EpisodeError."""
     path = root / INFO
     try:
         if path.stat().st_size > INFO_BYTES:
             raise _broken(f"{path}: is larger than any that LeRobot writes")
-        _refuse_pointer(path)
+        refuse_pointer(path, EpisodeError)
         content = path.read_bytes()
         info = json.loads(content)
         if content.startswith(codecs.BOM_UTF8):
@@ -393,7 +388,7 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
         if not path.is_dir() and not path.is_file():
             raise _broken(f"{path}: not a plain file")
         size += path.stat().st_size
-        _refuse_pointer(path)
+        refuse_pointer(path, EpisodeError)
         if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
             raise _broken(f"{path}: is larger than any that LeRobot writes")
     rows = values = unpacked = 0

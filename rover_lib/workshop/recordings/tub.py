@@ -43,7 +43,6 @@ from rover_lib.workshop.untrusted import quote
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
-THROTTLES = "as-recorded", "negated"
 
 
 @dataclass(frozen=True)
@@ -61,8 +60,8 @@ class _Record:
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
     """Read all usable records as samples of two actions.
 
-    throttle: one of THROTTLES, None if the tub does not need it. Raises EpisodeError for what is no tub or has no
-    record, and for one in which three in four throttles are negative, if `throttle` is None.
+    throttle: "as-recorded" or "negated", None if the tub does not need it. Raises EpisodeError for what is no tub or
+    has no record, and for one in which three in four throttles are negative, if `throttle` is None.
     """
     tub = Path(tub)
     faults = Faults(tub)

@@ -9,7 +9,7 @@ import pytest
 
 from lab.driving import rpicam_vid
 from rover_lib.onboard.car.camera import Camera, CameraError
-from rover_lib.onboard.car.csi import CsiError, command, is_csi
+from rover_lib.onboard.car.csi import command, is_csi
 from rover_lib.onboard.care.doctor import camera_rate
 
 SIZE = 96, 64
@@ -43,7 +43,7 @@ def test_the_command_has_size_rate_and_exposure():
     assert "--camera=0" in command("csi,exposure=normal", (640, 360), 30.0, "7")
     for wrong in ("csi:x", "csi:", "csi,output=/etc/passwd", "csi,gain=1 --output=x", "csi,gain"):
         assert is_csi(wrong)
-        with pytest.raises(CsiError, match="not understood"):
+        with pytest.raises(CameraError, match="not understood"):
             command(wrong, (640, 360), 30.0, "7")
     assert not is_csi("csi.mjpeg")
 
