@@ -18,7 +18,7 @@ from typing import Any
 from rover_lib.onboard.care.release import MAY_DIFFER
 from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import recorded_range as judge
-from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates
+from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates, hits_needed
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
 OF_BENCHMARKS = {  # the original's acceptance table
@@ -262,7 +262,7 @@ def _list_failures(
     """
     limits, hits = params["gates"], stages["compare"]["fp32"]["hits"]
     failed = []
-    trained = gate("fp32 hits", hits, ">=", limits["fp32_hits"])
+    trained = gate("fp32 hits", hits, ">=", hits_needed(limits, stages["compare"]["fp32"]["trials"]))
     if trained["passed"] is False:
         remedies = [
             "No other format can fix this: train longer, on more recordings.",
