@@ -62,6 +62,8 @@ def _break_logger() -> None:
     telemetry._seal = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
 
 
+# What a human gives by hand, a gesture before the car drives, is waited for only if stdin is a terminal.
+IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
 INSIDE = {"end the loop's thread": _end_this_thread, "raise in the loop": _raise, "raise in the logger": _break_logger}
 
 
@@ -117,7 +119,7 @@ class Drive(RoverCommand):
         env: dict[str, str] = {}
         code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
         if self.in_terminal:
-            code += "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
+            code += IN_TERMINAL
         if start in INSIDE:
             code += f"from {__name__} import on_signal; on_signal({start!r}); "
         run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
