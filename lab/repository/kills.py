@@ -138,7 +138,8 @@ def kill_randomly(work: Work, inputs: Path, times: int, seed: int = 0) -> dict[s
 
     Returns the counts, and in `wrong` a sentence for each attempt that lost something or ended in another way.
     """
-    rng, wrong, killed, finished = random.Random(seed), [], 0, 0
+    rng, killed, finished = random.Random(seed), 0, 0
+    wrong: list[str] = []
     whole, whole_s, _ = _whole(work, inputs)
     while killed < times and len(wrong) < 5:
         with _folder() as folder:
