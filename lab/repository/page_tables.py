@@ -161,7 +161,8 @@ def _guessed(root: Path) -> list[Row]:
 
 def _real(root: Path) -> list[Row]:
     """What policies plan on real recordings."""
-    rows: list[Row] = [("policy", "FP32 off the driver, %", "best guess, %", "static INT8, %", "of the spread, %", "verdict")]
+    header = "policy", "FP32 off the driver, %", "best guess, %", "static INT8, %", "of the plans' spread, %", "verdict"
+    rows: list[Row] = [header]
     for name, found in _metrics(root / "results" / "real", "recordings")["policies"].items():
         guesses = found["against_driver"]["guesses"].values()
         best = min((g["errors_pct"] for g in guesses), key=lambda errors: sum(errors.values()))
