@@ -128,7 +128,9 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
         # It does the same work and some of it in float, so that its shorter time is chance.
         shorter = f"the {mixed['time_ms']:.1f} ms measured for it are chance"
-        mixed["not_timed"] = f"it does what static INT8 does and more, so that {shorter} and its time is given as static's"
+        mixed["not_timed"] = (
+            f"it does what static INT8 does and more, so that {shorter} and its time is given as static's"
+        )
         mixed |= {"time_ms": static["time_ms"], "times_faster": static["times_faster"]}
     return rows
 
