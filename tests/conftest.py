@@ -17,7 +17,7 @@ os.environ.setdefault("ROVER_AS_ROOT", "1")
 # No deadline for hypothesis's examples: one that waits for another program's turn has not failed.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
-LEFT_MB = 300
+LEFT_MB = 150
 _give_back_from = [0.0]  # megabytes held, above which a test's end frees what is left
 
 

@@ -1,6 +1,14 @@
 """The demo's run, made by `make demo`, must pass the gates of params.yml; before a release, `make demo-more` too."""
 
+import os
+import re
+import shlex
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import nbformat
 import numpy as np
@@ -23,6 +31,7 @@ from rover_lib.workshop.run.pipeline import Recipe, prepare_chooser
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 from rover_lib.workshop.run.session import load
 
+ROOT = Path(__file__).parents[1]
 STAGES = ("load", "calibrate", "quantize", "compare")
 
 
@@ -144,3 +153,48 @@ def test_int8_survives_light_that_jumps(demo_run):
     for action in ("steering", "throttle"):
         assert found["frames"][f"{action}_mae_pct"] <= gates[f"{action}_mae_pct"]
     assert worst(found["minmax"]) > 2 * worst(found["frames"])
+
+
+@pytest.mark.slow
+def test_what_readme_says_to_type_works(demo_run, tmp_path, monkeypatch):
+    """The demo has run the first two, and its own `rover run`; here the view, JupyterLab and Python start."""
+    (tmp_path / "Makefile").symlink_to(ROOT / "Makefile")
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(demo_run)
+    (tmp_path / "policy_static.pt").symlink_to(demo_run / "policy_static.pt")
+    monkeypatch.chdir(tmp_path)
+    lines = re.findall(r"^    (.*)$", (ROOT / "README.md").read_text().partition("## The map")[0], re.M)
+    asked = [shlex.split(line, comments=True) for line in lines if line.startswith("make ")]
+    seen = {
+        "watch": r"http://127\.0\.0\.1:\d+/\?token=",
+        "notebooks-open": r"http://localhost:\d+/lab/tree/01_load.ipynb\?token=",
+    }
+    assert [words[1] for words in asked] == ["demo", "test", "notebooks-open", "watch", "run"]
+    for words in asked[2:]:
+        dry = ["make", "-n", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", *words[1:]]
+        command = subprocess.run(dry, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
+        if words[1] == "run":
+            assert command == f"{sys.prefix}/bin/rover run 'best_model.pth' 'episodes' --name 'mine'"
+            continue
+        env = os.environ | {"PYTHONPATH": str(ROOT), "BROWSER": "true", "ROVER_AS_ROOT": "1", "HOME": str(tmp_path)}
+        with started(command + " --web-port 0" * (words[1] == "watch"), env) as output:
+            assert any(re.search(seen[words[1]], line) for line in output), command
+    names: dict = {"frame_bgr": np.zeros((360, 640, 3), np.uint8), "state": np.zeros(2, np.float32)}
+    exec("\n".join(line for line in lines if not line.startswith("make ")), names)
+    assert names["chunk"].shape == (32, 2)
+
+
+@contextmanager
+def started(command, env):
+    """Run a command until it has said what it was started for: give its lines, and end it."""
+    process = subprocess.Popen(
+        ["sh", "-c", f"exec {command}"], env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    late = threading.Timer(120, process.kill)
+    late.start()
+    try:
+        yield process.stdout
+    finally:
+        late.cancel()
+        process.terminate()
+        process.communicate(timeout=60)

@@ -154,6 +154,11 @@ def test_readme_says_how_to_begin_in_few_words():
     assert len(text.split()) <= 700 and re.search(r"\[!\[.*\]\(pictures/\w+\.png\)\]\(notebooks/\w+\.ipynb\)", text)
 
 
+def test_the_pages_are_short():
+    """A page that grows must take something out of another."""
+    assert sum(len(page.read_text().split()) for page in (ROOT / "docs").glob("*.md")) <= 15_000
+
+
 def test_the_first_hour_is_eight_commands_at_most():
     lines = re.findall(r"^    \S.*? +# (\d)\b", (ROOT / "docs" / "first_hour.md").read_text(), re.M)
     assert [int(number) for number in lines] == list(range(1, len(lines) + 1)) and 5 < len(lines) <= 8

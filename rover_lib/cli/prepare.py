@@ -30,6 +30,7 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
 
 
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
+PLAN_FRAMES = 32  # steps of a plan, as trained by default
 ACTION_NAMES = click.option(
     "--action-names", default="", help="Names of a LeRobotDataset's actions in order, if it has none."
 )
@@ -301,6 +302,10 @@ def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> 
         del report[name]
     show({done: report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
+        if (frames := report["frames_in_a_usual_episode"]) < PLAN_FRAMES:
+            click.echo(
+                f"half of its episodes have at most {frames} frames, a plan {PLAN_FRAMES}: its drives have holes"
+            )
         click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
 
 
@@ -310,8 +315,9 @@ def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> 
 @click.option(
     "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
 )
+@click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a car that drives forward by < 0.")
 @AS_JSON
-def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, as_json: bool) -> None:
+def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, throttle: str | None, as_json: bool) -> None:
     """Write the donkeycar tub in the folder TUB, of any age, as a LeRobotDataset v3 to the new folder OUT.
 
     Steering and throttle become those of this machine's car (car.yml). Deleted records and those at which a pilot drove
@@ -322,7 +328,7 @@ def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, as_json: bool
     from rover_lib.workshop.recordings.export_dataset import export_dataset as write
     from rover_lib.workshop.recordings.tub import read_tub
 
-    report = write(read_tub(tub, this_car(), terminal_bar()), out, size=size, progress=terminal_bar())
+    report = write(read_tub(tub, this_car(), terminal_bar(), throttle), out, size=size, progress=terminal_bar())
     _say_export(report, out, "imported", as_json)
 
 

@@ -339,10 +339,18 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @PORT
 @click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Required frames per second.")
 @click.option("--receiver", is_flag=True, help="Only test the receiver, with a human at the transmitter.")
+@click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
 def doctor(
-    ctx: click.Context, artifact: Path | None, camera: str, port: str, hz: float, receiver: bool, as_json: bool
+    ctx: click.Context,
+    artifact: Path | None,
+    camera: str,
+    port: str,
+    hz: float,
+    receiver: bool,
+    recording: Path | None,
+    as_json: bool,
 ) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
@@ -355,7 +363,10 @@ def doctor(
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
     else:
-        found = checking.examine(artifact, camera=camera, port=port, rate_hz=hz, log_folder=default_log().parent)
+        log_folder = default_log().parent
+        found = checking.examine(
+            artifact, camera=camera, port=port, rate_hz=hz, log_folder=log_folder, recording=recording
+        )
     checks = []
     for check in found:
         checks.append(check)

@@ -169,33 +169,6 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp
 
 
 @real_time
-def test_a_view_that_hangs_and_then_dies_takes_no_tick(demo_run, tmp_path):
-    folder = fresh(tmp_path)
-    with watched(demo_run, folder) as (server, _, process):
-        server.signal(signal.SIGSTOP)
-        time.sleep(2.0)
-        server.signal(signal.SIGKILL)
-        report = ending(process, folder)
-    assert (report["ticks"], report["ended"]) == (300, "300 ticks")
-
-
-@real_time
-def test_a_flood_of_requests_takes_no_tick_and_writes_nothing(demo_run, tmp_path):
-    from lab.driving.page import flood
-
-    folder = fresh(tmp_path)
-    with watched(demo_run, folder) as (server, page, process):
-        before = {p.name for p in folder.iterdir()}
-        page.close()  # in the middle
-        counts = flood(server.url, 3.0)
-        assert counts.get("403", 0) > 100 and set(counts) <= {"0", "200", "403"}
-        report = ending(process, folder)
-    assert (report["ticks"], report["ended"]) == (300, "300 ticks")
-    assert {p.name for p in folder.iterdir()} - before <= {"drive"}
-    assert sum(e.text == "armed" for e in read_log(folder / "flight.log").events) == 1
-
-
-@real_time
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
     """A camera of some seconds, which torch may take to load, the car being another world's."""
     folder = fresh(tmp_path)

@@ -77,8 +77,9 @@ def test_a_simulation_lives_through_a_busy_machine(simulation, seconds, tmp_path
                 old.append(await tab.value("document.body.classList.contains('old')"))
             assert sum(old) < seconds / 10
             assert await tab.sideways("body") == {"cut": [], "scrolls": []}
+            await tab.until("newest.world.results.INT8[1] > 0")
             await tab.click("drive FP32")
-            await tab.until("newest.world.results.INT8[1] > 0 && newest.world.drives === 'FP32'")
+            await tab.until("newest.world.drives === 'FP32'")
             await tab.click("stop")
             await tab.until("newest.phase === 'ended' && newest.text.startsWith('stopped here')")
             await tab.click("next")

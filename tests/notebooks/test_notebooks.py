@@ -381,6 +381,12 @@ def turned(demo_run, tmp_path_factory):
     return folder
 
 
+def test_none_of_their_parameters_is_left_out():
+    """Notebook 05's `rovers`, a folder, is test_rovers_are_drawn's."""
+    for name, (_, given) in TURNED.items():
+        assert given.keys() == parameters_of(NOTEBOOKS / f"{name}.ipynb") - {"run_dir", "rovers"}
+
+
 def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     found = {stage: json.loads((turned / f"{stage}.json").read_text()) for stage, _ in TURNED.values()}
     assert found["calibrate"]["params"] == {"samples": 7, "seed": 3, "smooth": 0.7}

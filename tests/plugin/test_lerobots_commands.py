@@ -20,6 +20,7 @@ import needs
 import numpy as np
 import pandas as pd
 import pytest
+from test_lerobots_way import TINY, lerobot_train, rover
 
 from balloon_world.car import CameraFeed, VirtualCar
 from balloon_world.simulated_arduino import REST_US
@@ -314,6 +315,35 @@ def stop(process, board):
 def take_over(process, board):
     board.ready(False)  # he does not wiggle the stick again
     board.transmitter(1700, REST_US[1])
+
+
+@pytest.mark.emulated
+@pytest.mark.slow
+@needs.simavr
+@needs.real_time
+def test_from_recordings_to_pins(eyes, plugin, tmp_path, monkeypatch):
+    """export-dataset, LeRobot's own training, `rover run`, and LeRobot lets what that made drive."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    rover("world", "record", tmp_path / "mine", "--count", 3)
+    rover("export-dataset", tmp_path / "mine", tmp_path / "dataset", "--size", "96x48")
+    few = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", "--steps=2", "--save_freq=2")
+    last = lerobot_train(
+        tmp_path / "dataset", tmp_path / "train", *few, "--batch_size=2", *TINY, cache=tmp_path / "cache"
+    )
+    small = ("--samples", 6, "--iterations", 2)
+    rover("run", last, tmp_path / "dataset", "--name", "a", "--runs-dir", tmp_path, *small)
+    (tmp_path / "drive").mkdir()
+    command, given = driving(tmp_path / "drive", tmp_path / "a/policy_static.pt", 2)
+    with (
+        EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board,
+        LeRobot(command, plugin, eyes, **robot(board.port, eyes), **given) as drive,
+    ):
+        end_s = time.monotonic() + START_S
+        events = watched(board, lambda: drive.over(end_s))
+        assert drive.ended() == 0, drive.text[-3000:]
+    moved = {e.pulse_us for e in events if e.pin == "steering"}
+    assert len(moved) > 1 and len(rows(tmp_path / "drive" / given["dataset__root"].name)) >= 30
 
 
 @pytest.mark.emulated

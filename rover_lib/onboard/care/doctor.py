@@ -35,6 +35,7 @@ from rover_lib.onboard.drive.pilot import blank, frozen
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.recording.turning import measure_recorded
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the requested frame rate must be reached
@@ -87,6 +88,7 @@ def examine(
     port: str = "",
     rate_hz: float = 30.0,
     log_folder: Path | None = None,
+    recording: Path | None = None,
     host: Host | None = None,
     dev: Path = Path("/dev"),
     boot_s: float = BOOT_S,
@@ -94,7 +96,7 @@ def examine(
     """Run all checks, and yield each result as soon as it is known. Takes a few seconds in all. Raises nothing.
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go; None means the
-    current folder. host, dev and boot_s are there for the tests.
+    current folder. recording: what was just recorded, to see which way it steers. host, dev and boot_s are for tests.
     """
     host = host or Host()
     device = path_of(str(camera), dev)
@@ -108,6 +110,7 @@ def examine(
         "Arduino": lambda: arduino(port or find_port(dev), dev=dev, proc_root=host.proc_root, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
+        "side": lambda: side(recording) if recording else (),
         "engines": lambda: engines_here(),
         "artifact": lambda: policy(artifact),
         "temperature": lambda: temperature(host),
@@ -433,6 +436,19 @@ def car(artifact: Path | str | None = None) -> Iterator[Check]:
             if not (meant := car_of(read_manifest(Path(artifact)))).drives_like(this):
                 remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
                 yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
+
+
+def side(recording: Path) -> Iterator[Check]:
+    """Hold what a recorded drive's pictures show of its steering against car.yml. Raises EpisodeError for no drive."""
+    found, said = measure_recorded(recording), this_car().positive
+    if found.side is None:
+        remedy = "record a minute in which the car turns to both sides: rover record --max-seconds 60 episodes"
+        yield Check("side", "warning", found.words(), remedy)
+    elif found.side != said:
+        remedy = f"is the camera's picture mirrored? If not, steering: positive: {found.side} belongs into car.yml"
+        yield Check("side", "fail", f"{found.words()}, and this car's file says {said}", remedy)
+    else:
+        yield Check("side", "ok", found.words())
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:

@@ -22,6 +22,7 @@ COASTS_S = 0.5  # a car whose throttle is released rolls on for this time
 # after it was told.
 BEGINS_S = 0.12
 LATE_FRAME_S = 0.2  # six frames of a camera
+CUT = 0.005  # of throttle; less is rounding and blending
 CAP = "is there a cap or dirt on the lens?"
 SLACK_S = 0.002  # a control that is due this much later belongs to this tick: recordings have about the ticks' rate
 HOLE_S = 0.3  # a gap between measured pulses after which a replay stops the car
@@ -115,6 +116,8 @@ class PolicyPilot:
         self._follower = Follower(settings, rate_hz)
         self._sight = Sight(camera, settings)
         self._frame_age_s = self._asking_s = 0.0  # the longest since the last warnings()
+        self._cut = 0.0  # the most throttle that the limit has taken away, not said yet
+        self._said_cut = False
 
     @property
     def plan(self) -> tuple[Plan, float] | None:
@@ -144,6 +147,7 @@ class PolicyPilot:
             asking_s = self._planner.asking_s
             why = f"the policy has not answered for {asking_s:.1f} s" if asking_s > 0.1 else "no new frame came"
             raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
+        self._cut = max(self._cut, command.cut)
         pulses = self._calibration.pulses(command.steering, command.throttle)
         return Order(
             command.steering,
@@ -169,6 +173,9 @@ class PolicyPilot:
         """Yield sentences about how late camera and policy were since the last call."""
         age_s, asking_s, plan = self._frame_age_s, self._asking_s, self._follower.plan
         self._frame_age_s = self._asking_s = 0.0
+        if self._cut > CUT and not self._said_cut:
+            self._said_cut, limit = True, self._settings.throttle_limit
+            yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
         if age_s > LATE_FRAME_S:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:

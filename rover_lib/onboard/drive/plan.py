@@ -143,7 +143,8 @@ class Plan:
 class Command:
     """What to do at a tick: steering in [-1, 1], throttle in [0, 1], or from -1 on a car with reverse.
 
-    fade: factor that the throttle was multiplied by because of the plan's age, in [0, 1].
+    fade: factor that the throttle was multiplied by because of the plan's age, in [0, 1]. cut: the throttle that
+    throttle_limit took away.
     """
 
     steering: float
@@ -151,6 +152,7 @@ class Command:
     plan: Plan
     age_s: float  # since the frame of the plan in use
     fade: float
+    cut: float = 0.0
 
 
 class Follower:
@@ -197,7 +199,8 @@ class Follower:
         steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
         limit = self.settings.throttle_limit  # forwards and backwards
-        return Command(float(steering), max(min(float(throttle), limit), -limit), plan, age_s, fade)
+        kept = max(min(float(throttle), limit), -limit)
+        return Command(float(steering), kept, plan, age_s, fade, abs(float(throttle) - kept))
 
     def _fade(self, age_s: float) -> float:
         stop_s = self.stop_s()

@@ -613,10 +613,10 @@ def _csv_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def json_controls(path: Path) -> list[dict[str, Any]]:
-    """Return the controls in an episode_data.json as they are there; none if it cannot be read."""
+def json_controls(path: Path, key: str = "control_samples") -> list[dict[str, Any]]:
+    """Return the controls, or what else is under `key`, in an episode_data.json; none if it cannot be read."""
     try:
         content = json.loads(_data_of(path))
-        return [row for row in content["control_samples"] if isinstance(row, dict)]
+        return [row for row in content[key] if isinstance(row, dict)]
     except (ValueError, RecursionError, TypeError, KeyError):
         return []

@@ -65,18 +65,22 @@ def verdict(
 
     stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and distill if they were made.
     params: the content of params.yml. refusals: by mode, what a rover would refuse its artifact for, as
-    `release.Expected.refusals`. "deploy" in the result is None if no artifact of this policy should drive a car.
+    `release.Expected.refusals`. "ready" in the result: whether the policy drives; "deploy" is None if no artifact of it
+    should drive this car.
     """
     rows = _rows(stages, params)
     failed = _list_failures(stages, params, names, rows)
     unfit = _not_ready(stages, failed)
     best = _best(list(rows.values()), params["verdict"])
-    deploy = None if unfit else best["mode"]
     slow = {} if best["mode"] in ("static", "mixed") else {"mode": "it is slow"}
     refused = (refusals or {}).get(best["mode"], slow)
+    deploy = None if unfit or set(refused) - set(MAY_DIFFER) else best["mode"]
     for row in rows.values():
         row["because"] = _because(row, best, params["verdict"])
+    if deploy is None:
+        best["because"] = "the best of them"
     judged = {
+        "ready": not unfit,
         "deploy": deploy,
         "artifact": None if deploy is None else f"policy_{deploy}.pt",
         "why": (unfit or _why(best, rows["fp32"])) + _for_another_robot(refused),
@@ -85,9 +89,9 @@ def verdict(
         "compared": "least ms" if time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms" else "p50 ms",
         "modes": list(rows.values()),
         "failed": failed,
-        "cautions": _cautions(stages, params, rows, best),
+        "cautions": _cautions(stages, params, rows, best, deploy is not None),
     }
-    return judged | {"next": _next(judged, stages, names)}
+    return judged | {"next": _next(judged, best["mode"], stages, names)}
 
 
 # --- the modes beside each other --------------------------------------------------------------------------------------
@@ -378,8 +382,8 @@ def _not_ready(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared, lines = stages["compare"], []
     unbeaten = compared.get("guesses", {}).get("warnings", [])
-    lines += [f"{warning[0].upper()}{warning[1:]}." for warning in unbeaten]
-    lines += [f"{warning[0].upper()}{warning[1:]}." for warning in stages["load"].get("fit", {}).get("warnings", [])]
+    for warning in (*unbeaten, *stages["load"].get("fit", {}).get("warnings", [])):
+        lines.append(f"{warning[0].upper()}{warning[1:]}{'' if warning.endswith('?') else '.'}")
     looking = compared.get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
     if actions and not any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions):
@@ -463,7 +467,11 @@ def against(row: Mapping[str, Any]) -> str:
 
 
 def _cautions(
-    stages: Stages, params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]], best: Mapping[str, Any]
+    stages: Stages,
+    params: Mapping[str, Any],
+    rows: Mapping[str, Mapping[str, Any]],
+    best: Mapping[str, Any],
+    drives: bool,
 ) -> list[str]:
     """Say what weakens the verdict, such as numbers that do not fit, too few recordings, no trial drives, or times that
     were not measured on a Pi.
@@ -491,7 +499,7 @@ def _cautions(
             f"Judged on {compared['frames']} frames of {count(len(split['held_out']), 'episode')}{alone}: too few to "
             "be sure. Record some 20 drives more, in other light and places."
         )
-    if not compared["fp32"]["trials"]:
+    if drives and not compared["fp32"]["trials"]:
         lines.append(
             "Nobody drove: only errors on recordings were judged. The first metres are the test, so hold the stick."
         )
@@ -542,12 +550,15 @@ def count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[str, str]]:
+def _next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names) -> list[dict[str, str]]:
     """Return at most three commands to type next, with the reason for each."""
     deploy, drove = judged["deploy"], bool(stages["compare"]["fp32"]["trials"])
     student = f"{names.name}-qat"
     left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"
     run = _shell("rover", "run", f"runs/{student}/{left}", names.episodes, "--name", student)
+    if set(judged["refused"]) - set(MAY_DIFFER):
+        why = "how long a plan takes, on any machine"
+        return [{"command": _shell("rover", "benchmark", names.artifact(best)), "why": why}]
     if deploy is None:
         commands = [
             (
@@ -559,8 +570,6 @@ def _next(judged: Mapping[str, Any], stages: Stages, names: Names) -> list[dict[
         ]
         return [{"command": command, "why": why} for command, why in commands]
     artifact = names.artifact(deploy)
-    if set(judged["refused"]) - set(MAY_DIFFER):
-        return [{"command": _shell("rover", "benchmark", artifact), "why": "how long a plan takes, on any machine"}]
     allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
     deploying = f"ansible-playbook -i inventory.ini ansible/deploy.yml -e {_shell(f'rover_artifact={artifact}')}"
     deploying += f" -e '{allow}'" if allow else ""

@@ -47,6 +47,7 @@ from rover_lib.workshop.recordings.lerobot_dataset import (
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     CAMERA,
+    LEAST_RATED,
     Episode,
     Recordings,
     Sample,
@@ -95,7 +96,7 @@ def export_dataset(
         recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
-    rate_hz = _rate_hz(recordings)
+    rate_hz = usual_rate_hz(recordings)
     car = car_of(recordings.samples)
     with lock_folder(out.with_name(f".{out.name}.new")) as beside:
         new = beside / out.name
@@ -105,9 +106,11 @@ def export_dataset(
     return report
 
 
-def _rate_hz(recordings: Recordings) -> int:
+def usual_rate_hz(recordings: Recordings) -> int:
     """Return the frames per second of all episodes. Raises EpisodeError if they differ: a dataset has only one rate."""
-    rates = {e.id: found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None}
+    longest = max(len(e.samples) for e in recordings.episodes)
+    long = [e for e in recordings.episodes if len(e.samples) >= min(longest, LEAST_RATED)]
+    rates = {e.id: found for e in long if (found := frame_rate_hz(e.samples)) is not None}
     if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
     usual_hz = float(np.median(list(rates.values())))
@@ -165,7 +168,8 @@ def _write(
         use_videos=video,
         video_backend=BACKEND,
     )
-    written, short, broken = 0, 0, 0
+    short, broken = 0, 0
+    lengths: list[int] = []
     origins: list[str] = []
     driven_by: list[str] = []
     outcomes: list[str | None] = []
@@ -191,18 +195,19 @@ def _write(
                             }
                         )
                     dataset.save_episode()
-                    written += len(rows)
+                    lengths.append(len(rows))
                     driven_by.append(POLICY if episode.by_policy else HUMAN)
                     outcomes.append(episode.outcome)
                     origins.append(f"{episode.id} from frame {rows[0][0].row}")
         dataset.finalize()
-    if not written:
+    if not lengths:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
     return {
         "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images"),
         "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
         "episodes": len(origins),
-        "frames": written,
+        "frames": sum(lengths),
+        "frames_in_a_usual_episode": int(np.median(lengths)),
         "frames_a_second": rate_hz,
         "recorded_episodes": len(recordings.episodes),
         "left_out_pictures_not_whole": broken,

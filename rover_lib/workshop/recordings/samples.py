@@ -24,7 +24,7 @@ OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has an
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times")
+REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times", "reverse_on_a_car_without")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -173,6 +173,9 @@ def car_of(samples: Iterable[Any]) -> Car:
         names = ", ".join(sorted(car.name for car in cars))
         raise EpisodeError("the recordings are of several cars", found=names, remedy="use those of one car")
     return cars[0] if cars else Car()
+
+
+LEAST_RATED = 10  # frames; fewer do not show a rate
 
 
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:

@@ -4,7 +4,8 @@
 
 A tub of donkeycar 4 on is manifest.json, catalogs with a line of JSON for each picture, and images/. An older one has a
 record_<number>.json for each picture. Its angle is positive to the right; the car says to which side our steering is,
-and whether it drives backwards: if not, negative throttle is "stopped".
+and whether it drives backwards: if not, negative throttle is "stopped". Some cars drive forward by negative throttle;
+that a tub is of such a one must be said.
 
 Records that the manifest calls deleted, or at which a pilot drove, are left out. An episode ends where records are
 missing, where another session begins, and at a hole in time. Only a session's first record has a state that is known
@@ -13,7 +14,9 @@ without another one, neutral; the first record of any other episode gives the ne
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +29,20 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import (
+    LEAST_RATED,
+    Episode,
+    Recordings,
+    Sample,
+    Source,
+    frame_rate_hz,
+    is_another_rate,
+)
 from rover_lib.workshop.untrusted import quote
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
+THROTTLES = "as-recorded", "negated"
 
 
 @dataclass(frozen=True)
@@ -45,12 +57,25 @@ class _Record:
     throttle: float
 
 
-def read_tub(tub: Path | str, car: Car, progress: Progress = silent) -> Recordings:
-    """Read all usable records as samples of two actions. Raises EpisodeError for what is no tub, or has no record."""
+def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
+    """Read all usable records as samples of two actions.
+
+    throttle: one of THROTTLES, None if the tub does not need it. Raises EpisodeError for what is no tub or has no
+    record, and for one in which three in four throttles are negative, if `throttle` is None.
+    """
     tub = Path(tub)
     faults = Faults(tub)
     records = {record.index: record for record in _read_records(tub, faults)}
     ordered = [records[index] for index in sorted(records)]
+    negative, moving = sum(r.throttle < 0 for r in ordered), sum(r.throttle != 0 for r in ordered)
+    if throttle is None and 4 * negative > 3 * moving:
+        raise EpisodeError(
+            f"{tub}: most throttles are negative",
+            found=f"{negative} of {moving}",
+            remedy="--throttle negated if its car drives forward by them, --throttle as-recorded if it drove backwards",
+        )
+    if throttle == "negated":
+        ordered = [replace(r, throttle=-r.throttle) for r in ordered]
     times_s = [r.time_s for r in ordered if r.time_s is not None]
     steps_s = np.diff(times_s)
     usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
@@ -65,6 +90,10 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent) -> Recordin
     episodes = []
     for i, run in enumerate(progress(runs, desc="reading the tub", total=len(runs))):
         if samples := _samples(run, tub, images, car, first[i], faults):
+            found_hz = frame_rate_hz(samples)
+            if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
+                faults.add(tub, "another_rate", f"{found_hz:.1f} Hz from record {run[0].index} on", len(samples))
+                continue
             length_s = samples[-1].time_s - samples[0].time_s
             name = f"{run[0].session or 'session'} from {run[0].index}"
             episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))
@@ -163,6 +192,13 @@ def _read_manifest(path: Path) -> tuple[list[str], set[Any]]:
     raise EpisodeError(f"{path}: does not say which catalogs there are", remedy="is it a tub of donkeycar 4 or later?")
 
 
+def _as_ms(date: Any) -> float | None:
+    """Return a record's date as milliseconds; None for what is none, as a tub without times can be read too."""
+    with suppress(ValueError, TypeError):
+        return datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp() * 1000
+    return None
+
+
 def _read_record(
     text: str, where: str, index: int | None, deleted: set[Any], tub: Path, faults: Faults
 ) -> Iterator[_Record]:
@@ -170,7 +206,7 @@ def _read_record(
     try:
         row = json.loads(text)
         number = row["_index"] if index is None else index
-        ms = row.get("_timestamp_ms", row.get("milliseconds") if index is None else None)
+        ms = row.get("_timestamp_ms", row.get("milliseconds", _as_ms(row.get("timestamp"))))
         values = row[ANGLE], row[THROTTLE]
         if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
             raise ValueError(f"{quote(values)} with {quote(row[PICTURE])}")

@@ -7,6 +7,7 @@ The copy is a run like any other: `rover report runs/try1` judges it again, and 
 
 import json
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -35,14 +36,17 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     with build_beside(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
-        for path in new.glob("*.ipynb"):  # only the folder itself, as a whole text: run_dir
-            old, own = (json.dumps(json.dumps(str(each)))[1:-1] for each in (source, folder))
-            path.write_text(path.read_text().replace(old, own))
+        own = "run_dir = " + json.dumps(json.dumps(str(folder)))[1:-1]
+        for path in new.glob("*.ipynb"):  # whatever folder papermill wrote there: the run may have been moved since
+            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', lambda _: own, path.read_text()))
     return folder
 
 
 def main() -> None:
-    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named."""
+    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named.
+
+    It opens the first notebook, as JupyterLab's launcher shows neither the folder's question nor its figures.
+    """
     name, copy = (*sys.argv[1:], "", "")[:2]
     try:
         folder = copy_run(name, copy) if name else NOTEBOOKS
@@ -50,7 +54,8 @@ def main() -> None:
         sys.exit(f"rover: {error}")
     root = ["--allow-root"] if os.geteuid() == 0 else []  # a container may have no other user
     print(f"opening {folder}", file=sys.stderr)
-    os.execv(sys.executable, [sys.executable, "-m", "jupyterlab", *root, str(folder)])
+    first = f"--LabApp.default_url=/lab/tree/{NAMES[0]}.ipynb"  # in the address that it prints, too
+    os.execv(sys.executable, [sys.executable, "-m", "jupyterlab", *root, first, str(folder)])
 
 
 if __name__ == "__main__":

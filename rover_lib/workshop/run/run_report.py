@@ -142,7 +142,7 @@ def headline(judged: Mapping[str, Any]) -> str:
     failed = judged["failed"]
     misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
     if judged["deploy"] is None:
-        return f"not ready to drive{misses}"
+        return f"{'to benchmark only: no policy for this car' if judged['ready'] else 'not ready to drive'}{misses}"
     row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
     return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
 
@@ -207,15 +207,18 @@ def write_card(run_dir: Path | str) -> Path:
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
     recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
-    use = f"rover drive {judged['artifact']}" if judged["artifact"] else "none of them: no artifact should drive a car"
+    use, cautions = "No artifact of this policy should drive a car.", judged["cautions"]
+    if judged["artifact"]:
+        use = f"To drive, in a checkout of {CARD}: `rover drive {judged['artifact']}`. "
+        use += "In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`."
+        cautions = cautions or ["Nothing speaks against it."]
     text = [
         "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
         f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
         f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
         f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
         f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
-        f"To drive, in a checkout of {CARD}: `{use}`. In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`.",
-        "", "## Keep in mind", "", *(f"- {line}" for line in judged["cautions"] or ["Nothing speaks against it."]), "",
+        use, "", "## Keep in mind", "", *(f"- {line}" for line in cautions), "",
     ]  # fmt: skip
     path.write_text("\n".join(text))
     return path

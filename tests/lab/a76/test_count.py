@@ -261,6 +261,7 @@ def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     assert "policy_static.onnx" in reports.table(report)
 
 
+@pytest.mark.release  # half a minute more of the emulated core
 def test_a_pi_4_has_no_dot_product(report, counts, tiny_run, again, monkeypatch):
     """Of four counts one is made here: the others are those of `report`."""
     count = counting.count_artifact

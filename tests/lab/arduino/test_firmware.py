@@ -94,33 +94,6 @@ def test_neutral_before_anything_else(board):
     assert status.receiver_steering_us == status.receiver_throttle_us == "-"
 
 
-@pytest.mark.parametrize(
-    ("steering_us", "throttle_us"), [(1456, 120), (1008, 104), (1948, 948), (1500, 136), (1333, 173)]
-)
-def test_manual_is_the_transmitter(board, steering_us, throttle_us):
-    board.transmitter(*REST)
-    board.run_ms(100)
-    board.transmitter(steering_us, throttle_us)
-    board.run_ms(100)
-    events = board.run_ms(300)
-    on_pins(events, steering_us, throttle_us, within_us=STEP_US)
-    status = board.status
-    assert abs(status.receiver_steering_us - steering_us) <= ARDUINO_STEP_US
-    assert abs(status.receiver_throttle_us - throttle_us) <= 2  # captured by hardware
-    assert abs(status.receiver_steering_period_us - STEERING_PERIOD_US) <= 2 * ARDUINO_STEP_US
-    assert abs(status.receiver_throttle_period_us - THROTTLE_PERIOD_US) <= 2 * ARDUINO_STEP_US
-
-
-def test_autonomous_is_the_host_over_the_whole_range(armed):
-    for share in range(11):
-        steering_us, throttle_us = 900 + round(share * 111.2), 238 - round(share * 11.8)
-        armed.drive(steering_us, throttle_us, 170)
-        events = armed.drive(steering_us, throttle_us, 45)
-        on_pins(events, steering_us, throttle_us, within_us=ARDUINO_STEP_US / 2 + EDGE_US)
-        assert (armed.status.steering_us, armed.status.throttle_us) == (steering_us, throttle_us)
-    assert armed.status.state == "A"
-
-
 def test_recorded_pulses_come_out_as_they_went_in(board):
     """What a transmitter sent, through the receiver's pins, and as actions through the host, within a timer step."""
     pwm = PwmCalibration()
@@ -150,18 +123,6 @@ def test_recorded_pulses_come_out_as_they_went_in(board):
             on_pins(events, sent.steering_us, sent.throttle_us, within_us=STEP_US)
             checked += 1
     assert checked >= 5
-
-
-def test_a_pulse_never_changes_while_it_lasts(armed):
-    """Commands at any phase: each pulse is commanded or between two commands, none is cut or joined."""
-    armed.drive(1485, 200, 50)
-    events = []
-    for n in range(60):
-        events += armed.drive(1485 + 20 * (n % 2), 200 + 8 * (n % 2), 7.3, every_ms=7.3)
-    assert {1485, 1505} <= {round(us) for us in widths(events, "steering")} <= set(range(1485, 1506))
-    assert {round(us) for us in widths(events, "throttle")} == {200, 204, 208}
-    assert all(abs(e.period_us - STEERING_PERIOD_US) <= EDGE_US for e in pulses(events, "steering"))
-    assert all(abs(e.period_us - THROTTLE_PERIOD_US) <= EDGE_US for e in pulses(events, "throttle"))
 
 
 # ---- who drives

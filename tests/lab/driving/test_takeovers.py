@@ -19,7 +19,6 @@ from rover_lib.onboard.drive.takeover import LET_GO_S, TakeoverRecorder
 from rover_lib.onboard.errors import TakenOver
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.export_dataset import export_dataset
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 
@@ -322,22 +321,3 @@ def test_every_frame_says_who_drove_as_the_pins_of_the_emulated_arduino_do(taken
             judged[sample.driver] += 1
     print(f"frames that say who drove as the pins do: {judged}, of {len(recordings.samples)} samples")
     assert judged[HUMAN] > 40 and judged[POLICY] > 10 and judged[NOBODY] > 5
-
-
-@pytest.mark.emulated
-@needs.simavr
-def test_lerobots_loader_reads_a_mixed_drive(taken_over, tmp_path, monkeypatch):
-    import datasets
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-    export_dataset(taken_over[1], tmp_path / "out")
-    theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
-    ours = [s for s in load_recordings(taken_over[1], chunk=2).samples if s.driver != NOBODY]
-    marks = [bool(mark) for mark in theirs.hf_dataset["intervention"]]
-    assert len(marks) > 60 and {True, False} == set(marks)
-    drivers = [s.driver for s in load_recordings(tmp_path / "out", chunk=2).samples]
-    assert [driver == HUMAN for driver in drivers] == marks
-    assert 0 <= len(ours) - len(marks) <= 3  # an episode of one frame is left out
-    actions = {tuple(np.round(s.chunk[0], 5)) for s in ours}
-    assert all(tuple(np.round(np.asarray(action), 5)) in actions for action in theirs.hf_dataset["action"])

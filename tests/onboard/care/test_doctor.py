@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from pty_board import board_of
+from recorded import pass_a_wall
 
 from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.care.doctor import Check, examine
+from rover_lib.onboard.errors import EpisodeError
 
 USB = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04200001)
 METADATA = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04A00000)
@@ -553,3 +557,22 @@ def test_a_rover_that_drives(tmp_path, artifacts, quick):
     assert found["drives"] is True
     assert {"camera", "Arduino", "link", "transmitter", "artifact", "inference"} <= {c["name"] for c in found["checks"]}
     assert not [c for c in found["checks"] if c["verdict"] == "fail"]
+
+
+@pytest.mark.parametrize(
+    ("gain", "positive", "verdict"),
+    [(-8, "right", "ok"), (8, "right", "fail"), (8, "left", "ok"), (0, "right", "warning")],
+)
+def test_which_way_a_recorded_minute_steers(tmp_path, monkeypatch, gain, positive, verdict):
+    content = {"control_samples": [], "frame_samples": []}
+    for i, (steering, frame) in enumerate(pass_a_wall(gain)):
+        cv2.imwrite(str(tmp_path / f"{i}.jpg"), frame)
+        content["control_samples"].append({"system_timestamp": 9 + i / 30, "steering_normalized": steering})
+        content["frame_samples"].append({"timestamp": 9 + i / 30, "image_path": f"{i}.jpg"})
+    (tmp_path / "episode_data.json").write_text(json.dumps(content))
+    monkeypatch.setattr(doctor, "this_car", lambda: replace(Car(), positive=positive))
+    found = only(doctor.side(tmp_path))
+    (tmp_path / "episode_data.json").write_text("{}")
+    with pytest.raises(EpisodeError, match="no drive to measure"):
+        list(doctor.side(tmp_path))
+    assert found.verdict == verdict and bool(found.remedy) == (verdict != "ok")

@@ -476,6 +476,15 @@ def test_orders_are_pulses(pilot):
     assert (order.age_s, order.fade, order.plan) == (0.0, 1.0, 15)
 
 
+def test_what_the_limit_cuts_is_said_once(pilot):
+    drives(pilot, 0.5, throttle=0.2)
+    assert list(pilot.warnings()) == []
+    assert drives(pilot, 0.5, 0.5, throttle=0.31).throttle == 0.2
+    assert "the policy asks for throttle 0.31, cut at throttle_limit 0.2" in next(pilot.warnings())
+    drives(pilot, 0.5, 1.0, throttle=0.4)
+    assert list(pilot.warnings()) == []
+
+
 def test_a_plan_that_is_too_old(pilot):
     drives(pilot, 0.5)
     pilot.order(1.4)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from datetime import datetime, timedelta
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
-from rover_lib.workshop.recordings.export_dataset import export_dataset
+from rover_lib.workshop.recordings.export_dataset import export_dataset, usual_rate_hz
 from rover_lib.workshop.recordings.samples import frame_rate_hz
 from rover_lib.workshop.recordings.tub import read_tub
 
@@ -113,6 +114,48 @@ def test_an_episode_ends_where_records_are_missing(tmp_path):
     expected = {"deleted_record": 2, "a_pilot_drove": 1, "records_missing": 2, "hole_in_time": 1}
     assert kinds(recordings) == expected
     assert all(fault.handled == "left out" for fault in recordings.faults)
+
+
+@pytest.mark.parametrize("last_s", [0.0, 281.2], ids=["whole", "a hole"])
+def test_times_as_text(tmp_path, last_s):
+    """donkeycar 2 wrote each record's date: half a minute at 20 Hz, the last of it later."""
+    root = old_tub(tmp_path / "tub", 40)
+    for i in range(40):
+        path = root / f"record_{i}.json"
+        when = datetime(2019, 4, 5, 20, 20, 6) + timedelta(seconds=i / 25 + (last_s if i >= 30 else 0))
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"timestamp": str(when)}))
+    recordings = read_tub(root, LEFT)
+    assert [len(e.samples) for e in recordings.episodes] == ([30, 9] if last_s else [40])
+    assert frame_rate_hz(recordings.episodes[0].samples) == pytest.approx(25)
+
+
+def test_a_tub_that_drives_by_negative_throttle_is_asked_about(tmp_path):
+    """Two of three public tubs do: their cars drive forward by it, and read as stopped nothing would be left."""
+    rows = records(40)
+    for row in rows[:35]:
+        row["user/throttle"] = -0.2
+    root = tub(tmp_path / "tub", rows)
+    with pytest.raises(EpisodeError, match=r"most throttles are negative.*--throttle negated"):
+        read_tub(root, Car())
+    negated = read_tub(root, Car(), throttle="negated").samples
+    assert all(s.chunk[0, 1] == np.float32(0.2) for s in negated[:30])
+    assert all(s.chunk[0, 1] == 0 for s in read_tub(root, Car(), throttle="as-recorded").samples[:35])
+
+
+def test_runs_of_a_few_records_have_no_rate(tmp_path):
+    """A car's loop begins with two records at once, and holes leave runs of a few: their steps say nothing."""
+    rows = records(40)
+    rows[0]["_timestamp_ms"] += 40
+    rows[3]["_timestamp_ms"] += 25
+    rows[2]["_timestamp_ms"] += 20
+    for row in rows[4:]:
+        row["_timestamp_ms"] += 300
+    slower = records(60, "21-08-21_1", 40, 1_629_500_100_000)[:20]
+    for i, row in enumerate(slower):
+        row["_timestamp_ms"] += 15 * i
+    recordings = read_tub(tub(tmp_path / "tub", [*rows, *slower]), LEFT)
+    assert kinds(recordings) == {"hole_in_time": 1, "another_rate": 20}
+    assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
 
 
 def test_what_is_broken_is_counted(tmp_path):

@@ -29,6 +29,13 @@ def test_a_copy_works_in_its_own_folder_and_reads_the_same_recordings(run_dir):
     assert copy_run("demo", "try1", run_dir.parent) == copy  # opened again, not made anew
     assert [(f / "policy_static.pt").read_text() for f in (copy, run_dir)] == ["turned", "whole"]
     assert copy_run("demo", runs_dir=run_dir.parent).name == "demo-copy"
+    moved = run_dir.parent.rename(run_dir.parent.with_name("moved"))
+    assert (
+        f'run_dir = "{moved}/try2"'
+        in json.loads((copy_run("demo", "try2", moved) / "01_load.ipynb").read_text())["cells"][0][
+            "source"
+        ].splitlines()
+    )
 
 
 @pytest.mark.parametrize(

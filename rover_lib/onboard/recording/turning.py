@@ -1,0 +1,180 @@
+"""Measure to which side a recorded car turns for positive steering, from what its camera shows.
+
+    print(measure_recorded("episodes/episode_20260101_120000").words())
+
+When a car turns right, the background moves to the left. So steering is correlated with the horizontal shift of the
+pictures' upper part between frames (OpenCV's optical flow, the median of the points that are found again both ways).
+The car follows its steering late, so the delay with the strongest correlation counts. Neighbouring frames say nearly
+the same, so the correlation is judged as one of far fewer, independent frames (Bartlett's formula).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.recording.episode import json_controls, no_pulse, number_of
+
+WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
+STEP = 2  # frames from one examined picture to the next
+POINTS, WINDOW = 80, (11, 11)
+LEAST_POINTS = 8
+LONGEST_DELAY_S = 0.4
+SMOOTH = 5  # examined pictures
+LEAST_PAIRS = 25
+LEAST_SPREAD = 0.05  # standard deviation of steering, of full; with less, other motion decides the correlation
+SURE = 2.2  # standard errors from no correlation
+
+
+class Shot(Protocol):
+    """A picture of a drive. row: its number; a step of more than 1 is a picture that was left out."""
+
+    @property
+    def time_s(self) -> float: ...
+    @property
+    def row(self) -> int: ...
+    def frame_bgr(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class _File:
+    time_s: float
+    row: int
+    path: Path
+
+    def frame_bgr(self) -> np.ndarray:
+        try:
+            return read_jpeg(self.path)
+        except (OSError, PictureError) as e:
+            raise EpisodeError(f"{self.path}: cannot be read ({e})") from None
+
+
+@dataclass(frozen=True)
+class Turning:
+    """One recording's result. correlation: of steering with the shift of the background to the right, None without any.
+
+    sure: how many standard errors it is from 0. spread: the standard deviation of its steering, a share of full.
+    """
+
+    episode: str
+    correlation: float | None
+    sure: float
+    spread: float
+
+    @property
+    def side(self) -> str | None:
+        """The side that positive steering turns to: "right" or "left"; None if too little shows it."""
+        if self.correlation is None or self.spread < LEAST_SPREAD or self.sure < SURE:
+            return None
+        return "right" if self.correlation < 0 else "left"
+
+    def words(self) -> str:
+        if self.correlation is None:
+            return f"{self.episode}: too few pictures that move to tell which way it steers"
+        how = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
+        return f"{self.episode}: " + (f"positive steering is {self.side} ({how})" if self.side else f"not sure ({how})")
+
+
+def measure_recorded(folder: Path | str) -> Turning:
+    """Measure a drive that this project's recorder wrote, or the newest one in a folder of them.
+
+    Raises EpisodeError if there are no two controls and pictures.
+    """
+    folder = max((p for p in Path(folder).glob("episode_*") if p.is_dir()), default=Path(folder))
+    data, controls, shots = folder / "episode_data.json", [], []
+    for row in json_controls(data):
+        found = [number_of(row.get(name)) for name in ("system_timestamp", "steering_normalized")]
+        if not no_pulse(row, "steering") and all(v is not None and math.isfinite(v) for v in found):
+            controls.append(found)
+    for i, row in enumerate(json_controls(data, "frame_samples")):
+        path = (folder / str(row.get("image_path"))).resolve()
+        if (at_s := number_of(row.get("timestamp"))) is not None and path.is_relative_to(folder.resolve()):
+            shots.append(_File(at_s, i, path))
+    if len(controls) < 2 or len(shots) < 2:
+        raise EpisodeError(f"{folder}: no drive to measure", remedy="rover record --max-seconds 60 episodes, and drive")
+    times_s, steering = np.array(controls, np.float64).T
+    return measure_turning(folder.name, np.interp([s.time_s for s in shots], times_s, steering), shots)
+
+
+def measure_turning(name: str, steering: np.ndarray, samples: Sequence[Shot]) -> Turning:
+    """Measure one drive. samples: in order, of one camera. steering: (n,) float64, at each."""
+    spread = float(steering.std()) if len(steering) else 0.0
+    nothing = Turning(name, None, 0.0, spread)
+    if spread < LEAST_SPREAD / 2:
+        return nothing  # and no picture has to be read
+    try:
+        times_s, shifts = _shifts(samples)
+    except EpisodeError:
+        return nothing
+    if len(shifts) < LEAST_PAIRS:
+        return nothing
+    every_s = np.array([s.time_s for s in samples])
+    best = nothing
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7):
+        steered = np.interp(times_s - delay_s, every_s, steering)
+        found = _correlation(_smooth(steered), _smooth(shifts))
+        if found and found[1] > best.sure:
+            best = Turning(name, found[0], found[1], spread)
+    return best
+
+
+def _shifts(samples: Sequence[Shot]) -> tuple[np.ndarray, np.ndarray]:
+    """Return when two pictures were compared, in seconds, and how fast the background moved right, in pixels/s."""
+    chosen = list(samples[::STEP])
+    times_s, shifts = [], []
+    before = None
+    for first, second in pairwise(chosen):
+        if second.row - first.row != STEP:
+            before = None
+            continue
+        before = _grey(first) if before is None else before
+        after = _grey(second)
+        shift = _shift(before, after)
+        before = after
+        if shift is not None:
+            times_s.append((first.time_s + second.time_s) / 2)
+            shifts.append(shift / (second.time_s - first.time_s))
+    return np.array(times_s), np.array(shifts)
+
+
+def _grey(sample: Shot) -> np.ndarray:
+    frame = sample.frame_bgr()
+    height = round(WIDTH * frame.shape[0] / frame.shape[1])
+    small = cv2.resize(frame, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+
+
+def _shift(before: np.ndarray, after: np.ndarray) -> float | None:
+    points = cv2.goodFeaturesToTrack(before[: round(UPPER * len(before))], POINTS, 0.01, 3)
+    if points is None:
+        return None
+    flow: Any = cv2.calcOpticalFlowPyrLK  # OpenCV's types do not know that it finds where to begin
+    there, seen, _ = flow(before, after, points, None, winSize=WINDOW, maxLevel=3)
+    back, again, _ = flow(after, before, there, None, winSize=WINDOW, maxLevel=3)
+    good = (seen[:, 0] == 1) & (again[:, 0] == 1) & (np.abs(back - points).max((1, 2)) < 0.5)
+    return float(np.median((there - points)[good, 0, 0])) if good.sum() >= LEAST_POINTS else None
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    kernel = np.ones(SMOOTH)
+    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Return the correlation of two series, and how many standard errors it is from 0; None if one does not vary."""
+    x, y = x - x.mean(), y - y.mean()
+    n, norm = len(x), math.sqrt((x @ x) * (y @ y))
+    if norm < 1e-9:
+        return None
+    r = float(x @ y) / norm
+    lags = range(1, n // 2)
+    together = sum((1 - k / n) * (x[k:] @ x[:-k]) * (y[k:] @ y[:-k]) for k in lags) / norm**2
+    independent = min(max(n / max(1 + 2 * together, 1), 4), n)
+    return r, math.atanh(min(abs(r), 0.999)) * math.sqrt(independent - 3)

@@ -1,0 +1,99 @@
+"""Policies that must not drive, each through a whole `rover run`: nothing that a user sees may ask to drive them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from policies import TINY, lerobot_policy, trainer_content
+from recorded import real_recordings
+from test_odd_policies import run_here
+
+from rover_lib.workshop.act import ACT, inputs_of
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.run.describe import runs
+from rover_lib.workshop.run.run_report import PAGE, text, write, write_card
+
+pytestmark = pytest.mark.slow
+LEARNED, RIDGE = 200, 1e-2  # frames; of the features' variance
+DRIVES = re.compile(
+    r"ansible-playbook|deploy\.yml|drive\.yml|rover (?:drive|view|release)|lerobot_robot_rover |one to deploy"
+    r"|[Vv]erdict: deploy|put it on the rover|first metres"
+)
+
+
+def in_old_units(recordings, folder):
+    """Write the recordings without their pulses, as a trainer takes them to which 0.1687 is stopped."""
+    for source in sorted(recordings.glob("episode_*")):
+        (folder / source.name).mkdir(parents=True)
+        (folder / source.name / "frames").symlink_to(source / "frames")
+        content = json.loads((source / "episode_data.json").read_text())
+        for row in content["control_samples"]:
+            for name in [name for name in row if name.endswith("_us")]:
+                del row[name]
+        (folder / source.name / "episode_data.json").write_text(json.dumps(content))
+    return folder
+
+
+def learned(path, samples, change=(), of=lambda s: s.chunk):
+    """Write a policy of random weights whose last layer alone has learned, by least squares; `change` its weights."""
+    policy = lerobot_policy({"observation.images.cam_front": (36, 64)}, **TINY)
+    content = trainer_content(policy)
+    weights = content["model_state_dict"]
+    for name, factor in dict(change).items():
+        weights[f"model.{name}"] *= factor
+    torch.save(content, path)
+    checkpoint = load_checkpoint(path)
+    model = ACT(checkpoint.config, checkpoint.weights).eval()
+    kept = []
+    head = model.head
+    head.register_forward_pre_hook(lambda module, given: kept.append(given[0].detach().reshape(-1, TINY["dim_model"])))
+    few = pick_evenly(samples, LEARNED)
+    with torch.inference_mode():
+        for sample in few:
+            model(*inputs_of(sample, checkpoint.config))
+    x = torch.cat([torch.cat(kept), torch.ones(len(few) * TINY["chunk_size"], 1)], 1).double().numpy()
+    y, w = np.concatenate([of(s) for s in few]), ~np.concatenate([s.is_pad for s in few])
+    x, y = x[w], y[w]
+    solved = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y)
+    weights["model.action_head.weight"] = torch.from_numpy(solved[:-1].T.astype(np.float32).copy())
+    weights["model.action_head.bias"] = torch.from_numpy(solved[-1].astype(np.float32))
+    torch.save(content, path)
+
+
+def make(kind, path, tmp_path):
+    """Write the policy of that kind to `path`."""
+    recordings = real_recordings()
+    if kind == "random":
+        torch.save(trainer_content(lerobot_policy({"observation.images.cam_front": (36, 64)}, **TINY)), path)
+    elif kind == "in old units":
+        learned(path, load_recordings(in_old_units(recordings, tmp_path / "old")).samples)
+    else:
+        samples = load_recordings(recordings).samples
+        mean = np.concatenate([s.chunk for s in samples]).mean(0)
+        answer = {
+            "collapsed": lambda s: np.broadcast_to(mean, s.chunk.shape),
+            "straight ahead": lambda s: s.chunk * np.array([0, 1], np.float32),
+        }
+        change = {"encoder_robot_state_input_proj.weight": 30.0} if kind == "copies its state" else {}
+        learned(path, samples, change, answer.get(kind, lambda s: s.chunk))
+
+
+KINDS = ("of all six", "in old units", "collapsed", "copies its state", "straight ahead", "random")
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.release] * (k not in KINDS[1:3])) for k in KINDS])
+def test_what_is_not_ready_is_never_asked_to_drive(kind, tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "runs" / "bad"
+    make(kind, tmp_path / "best_model.pth", tmp_path)
+    given = {"checkpoint": str(tmp_path / "best_model.pth"), "episodes": str(real_recordings())}
+    run_here(folder, **given, held_out_frames=60)
+    judged = write(folder)["metrics"]
+    (listed,) = runs(tmp_path / "runs")
+    seen = {"notebooks": capsys.readouterr().out, "end": text(judged), "page": (folder / PAGE).read_text()}
+    seen |= {"card": write_card(folder).read_text(), "list": listed["verdict"]}
+    assert judged["headline"].startswith("not ready to drive") and judged["deploy"] is judged["artifact"] is None
+    assert {where: found.group() for where, words in seen.items() if (found := DRIVES.search(words))} == {}
