@@ -10,6 +10,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ TOO_SLOW = ("ncnn/vgg16/fp16", "ncnn/vision_transformer/fp16")  # the emulator h
 (EXECUTORCH,) = [engine for engine in peers.ENGINES if engine.name == "executorch"]
 TORCHVISION = "torchvision==0.25.0"  # the one for the torch that ExecuTorch's tools come with
 THREADS = 4
+TRACING = threading.Lock()  # two policies cannot be traced at once: torch.fx patches modules for the whole process
 SECTION = 1  # of the one network that guest/network.py runs
 GRAPHS = "--ncnn FOLDER: benchmark in a copy of ncnn's repository at its tag 20240102"
 
@@ -187,13 +189,14 @@ def count_policy(core: Core, shape: Shape) -> dict[str, Any]:
     noise: Any = [_Noise(np.zeros(2, np.float32), rng.integers(0, 256, (height, width, 3), np.uint8)) for _ in range(2)]
 
     def make(folder: Path) -> None:
-        weights = random_weights(shape.config, shape.backbone_channels)
-        checkpoint = Checkpoint(folder / "none", "trainer", shape.config, weights, "0" * 64, {})
-        calibration = None if shape.mode == "fp32" else observe.calibrate(checkpoint, noise)
-        policy: Any = ACT(shape.config, weights)
-        if calibration:
-            policy = quantize.quantize(checkpoint, Scheme(shape.mode), calibration)
-        export.export(policy, checkpoint, folder / "policy.pt", noise, calibration)
+        with TRACING:
+            weights = random_weights(shape.config, shape.backbone_channels)
+            checkpoint = Checkpoint(folder / "none", "trainer", shape.config, weights, "0" * 64, {})
+            calibration = None if shape.mode == "fp32" else observe.calibrate(checkpoint, noise)
+            policy: Any = ACT(shape.config, weights)
+            if calibration:
+                policy = quantize.quantize(checkpoint, Scheme(shape.mode), calibration)
+            export.export(policy, checkpoint, folder / "policy.pt", noise, calibration)
 
     key = key_of({"shape": repr(shape)}, act, observe, quantize, export)
     path = cache_folder("clock-policy", key, make) / "policy.pt"
