@@ -295,6 +295,12 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
     default=True,
     help="Leave out a deployment's faults, which are met with torch only.",
 )
+@click.option(
+    "--pieces",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Only provision, cut off after each Nth task that changes something.",
+)
 @click.pass_context
 def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:
     """Run every playbook on an emulated Pi in a container, and prove from within what they promise.

@@ -17,7 +17,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from lerobot_robot_rover.line import ACTIONS, FEATURES, line_to, named, unnamed
 from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
 from lerobot_robot_rover.rollout import DAGGER, STAYS, check_rollout, find_rollout
-from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, size_like
+from rover_lib.onboard.car.camera import Camera, check_shape, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.car.pwm import NEUTRAL
@@ -27,7 +27,7 @@ from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.drive.watch import find_unfinished_drive
-from rover_lib.onboard.errors import ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.errors import CameraError, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 

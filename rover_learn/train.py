@@ -131,7 +131,7 @@ SIZES = {
     ),
     "full": ActConfig(),
 }
-SMALL = TrainingRecipe(300, 900, 60, 16, 16, 16, samples=4000, feature_samples=4000, judged=500)
+SMALL = TrainingRecipe(200, 600, 40, 16, 16, 16, samples=4000, feature_samples=2400, judged=500)
 FULL = TrainingRecipe(
     *(200, 250, 20),
     *(32, 32, 8),

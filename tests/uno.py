@@ -16,6 +16,7 @@ REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol
 PULSE, CUT, LINE_IN, RESET = 1, 2, 3, 4
 PIN = {"steering": 0, "throttle": 1}
+EEPROM_BYTES = len(arduino.eeprom_of(car.Car()))
 
 
 @functools.cache
@@ -59,6 +60,8 @@ def _library() -> ctypes.CDLL:
         "uno_transmitter": [pointer, ctypes.c_int, real, real],
         "uno_wiggle": [pointer],
         "uno_reset": [pointer],
+        "uno_power": [pointer],
+        "uno_eeprom": [pointer, ctypes.c_char_p, ctypes.c_uint32, ctypes.c_bool],
         "uno_hang": [pointer, ctypes.c_uint32],
         "uno_watch": [pointer, ctypes.c_uint32, ctypes.c_uint32],
         "uno_longest_us": [pointer],
@@ -101,10 +104,13 @@ class Uno:
     events: all measurements, in the order in which they ended. lines: all lines that it sent, without their CRC.
     """
 
-    def __init__(self):
+    def __init__(self, eeprom: bytes | None = None):
+        """eeprom: its first bytes; None: of a board that has kept the default car."""
         self._c = _library()
         self._uno = self._c.uno_new(str(firmware()).encode())
         assert self._uno, f"simavr cannot load {firmware()}"
+        kept = arduino.eeprom_of(car.Car()) if eeprom is None else eeprom
+        self._c.uno_eeprom(self._uno, ctypes.create_string_buffer(kept, len(kept) or 1), len(kept), True)
         self.events: list[SimpleNamespace] = []
         self.lines: list[str] = []
         self._rest = b""
@@ -185,6 +191,17 @@ class Uno:
 
     def reset(self) -> None:
         self._c.uno_reset(self._uno)
+
+    def power(self) -> None:
+        """Switch it off and on."""
+        self._c.uno_power(self._uno)
+
+    @property
+    def eeprom(self) -> bytes:
+        """The EEPROM's first bytes: the boot's number, and the car."""
+        buffer = ctypes.create_string_buffer(EEPROM_BYTES)
+        self._c.uno_eeprom(self._uno, buffer, EEPROM_BYTES, False)
+        return buffer.raw
 
     def hang(self) -> None:
         """Turn loop() into an endless loop until the next reset."""

@@ -49,16 +49,32 @@ void watchdog_feed() { wdt_reset(); }
 
 /* ---- the car ---------------------------------------------------------------------------------------------------- */
 
-/* Kept so that right after a watchdog reset the pins have this car's neutral, not the default's. */
-static struct car kept __attribute__((section(".noinit")));
-static uint32_t kept_check __attribute__((section(".noinit")));
+/* Behind the boot's number in the EEPROM. The version is erased before anything else is written and comes last, so that
+ * a power cut leaves the old car or none; the CRC is for cells that forget. */
+static struct kept {
+    uint8_t version;
+    struct car car;
+    uint32_t check;
+} kept; /* what is there, or is being written */
+static uint8_t *const KEPT = (uint8_t *)2;
+static const uint8_t VERSION = 1, ERASED = 0xFF;
 
-const struct car *car_kept() { return kept_check == ~car_id(&kept) && car_allowed(&kept) ? &kept : &DEFAULT_CAR; }
+const struct car *car_kept() {
+    eeprom_read_block(&kept, KEPT, sizeof kept);
+    if (kept.version != VERSION || kept.check != ~car_id(&kept.car) || !car_allowed(&kept.car)) kept = {};
+    return &kept.car;
+}
 
 void car_keep(const struct car *car) {
-    if (!memcmp(&kept, car, sizeof kept) && kept_check == ~car_id(&kept)) return;
-    kept = *car;
-    kept_check = ~car_id(car);
+    static uint8_t left; /* writes; a byte takes the chip 3.4 ms */
+    if (memcmp(&kept.car, car, sizeof *car)) {
+        kept = {VERSION, *car, ~car_id(car)};
+        left = sizeof kept + 1;
+    }
+    if (!left || !eeprom_is_ready()) return;
+    left--;
+    uint8_t at = left == sizeof kept ? 0 : left, byte = left == sizeof kept ? ERASED : ((const uint8_t *)&kept)[at];
+    if (eeprom_read_byte(KEPT + at) != byte) eeprom_write_byte(KEPT + at, byte);
 }
 
 /* ---- pulses out: Timer1 (steering, D10), fast PWM up to OCR1A, and Timer2 (throttle, D3) --------------------------- */
@@ -77,8 +93,8 @@ static volatile uint16_t slow_period, slow_high; /* steps; from the next rising 
 static volatile uint16_t slow_low, slow_left;    /* of the period that is on; from the next match to the next edge */
 static volatile bool slow_rises;                 /* whether the next edge rises */
 
-/* Timer2, from its start: a throttle's neutral. The pin is low, and interrupts are off. */
-static void throttle_begin(const struct car *car) {
+/* Timer2, from its start: a throttle's neutral, if the pin is its. The pin is low, and interrupts are off. */
+static void throttle_begin(const struct car *car, bool pin) {
     const struct servo *throttle = &car->servos[THROTTLE];
     throttle_period = throttle->period_us;
     throttle_neutral = throttle->neutral_us / STEP_US;
@@ -91,7 +107,7 @@ static void throttle_begin(const struct car *car) {
     if (fast) {
         OCR2A = (uint8_t)(throttle->period_us / STEP_US - 1);
         OCR2B = (uint8_t)(throttle_neutral - 1);
-        TCCR2A = _BV(COM2B1) | _BV(WGM21) | _BV(WGM20);
+        TCCR2A = (pin ? _BV(COM2B1) : 0) | _BV(WGM21) | _BV(WGM20);
         TCCR2B = _BV(WGM22) | _BV(CS22); /* 16 MHz / 64 */
         TIMSK2 = _BV(TOIE2);
         return;
@@ -108,6 +124,8 @@ static void throttle_begin(const struct car *car) {
 }
 
 void pulses_begin(const struct car *car) {
+    bool known = car->servos[STEERING].period_us;
+    if (!known) car = &DEFAULT_CAR; /* its timers run, as clock and to wake loop(), without the pins */
     TCCR1A = 0;
     TCCR1B = 0;
     TIMSK1 = 0;
@@ -115,8 +133,9 @@ void pulses_begin(const struct car *car) {
     steering_ticks = (uint16_t)(car->servos[STEERING].period_us * 2);
     OCR1A = steering_ticks - 1;
     OCR1B = car->servos[STEERING].neutral_us * 2 - 1;
-    throttle_begin(car);
-    TCCR1A = _BV(COM1B1) | _BV(WGM11) | _BV(WGM10);
+    throttle_begin(car, known);
+    if (!known) throttle_period = 0; /* any car's is another */
+    TCCR1A = (known ? _BV(COM1B1) : 0) | _BV(WGM11) | _BV(WGM10);
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS11) | _BV(ICNC1) | _BV(ICES1); /* 16 MHz / 8 */
 }
 
@@ -147,7 +166,7 @@ static void throttle_change(const struct car *car) {
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         if (!(PIND & _BV(PIND3))) {
             TCCR2A = 0; /* the pin stays low */
-            throttle_begin(car);
+            throttle_begin(car, true);
         }
     }
 }
@@ -171,6 +190,7 @@ static void steering_change(uint16_t ticks) {
 }
 
 void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_us) {
+    if (!car->servos[STEERING].period_us) return;
     const struct servo *throttle = &car->servos[THROTTLE];
     bool is_fast = throttle_is_fast(car);
     if (steering_us < PULSE_MIN_US || steering_us > PULSE_MAX_US ||
@@ -188,6 +208,7 @@ void pulses_set(const struct car *car, uint16_t steering_us, uint16_t throttle_u
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         if (OCR1B != steering) OCR1B = steering;
     }
+    TCCR1A |= _BV(COM1B1); /* with the first car: the pin rises at the next period, with OCR1B of then */
     if (fast) {
         OCR2B = (uint8_t)(steps - 1);
     } else if (slow_high != steps) {

@@ -4,11 +4,13 @@
 
 #include "vehicle.h"
 
-/* The car that was told before the last reset, if the memory kept its power; otherwise the default. */
+/* The car in the EEPROM; nine zeros if there is none, or it is damaged. Call it once. */
 const struct car *car_kept();
+/* Writes a car into the EEPROM, if it is another than there, at most a byte each time and without waiting. Call it again
+ * and again, but not while the car drives. */
 void car_keep(const struct car *car);
 
-/* A car's neutral pulses on both pins. The first thing that setup() does. */
+/* A car's neutral pulses on both pins; of nine zeros none. The first thing that setup() does. */
 void pulses_begin(const struct car *car);
 /* Sets what the pins do from their next pulse on. Another car's pulses begin once no pulse is on. If a pulse is one that
  * none of the car's servos should see, both become neutral. Call it every 2 ms. */

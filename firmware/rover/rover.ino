@@ -29,7 +29,6 @@ static bool take(uint8_t byte, uint32_t now_ms) {
         hello_due = true;
       } else {
         vehicle_command(&vehicle, &command, now_ms);
-        if (command.kind == COMMAND_CAR) car_keep(&vehicle.car);
         status_due = true;
       }
       return true;
@@ -53,6 +52,7 @@ void loop() {
   for (uint8_t lost = serial_lost(); lost; lost--) count(&vehicle.lost_bytes);
   vehicle_tick(&vehicle, now_ms);
   pulses_set(&vehicle.car, vehicle.steering_us, vehicle.throttle_us);
+  if (vehicle_may_keep(&vehicle)) car_keep(&vehicle.car);
 
   /* Each turn of the loop reads a line, sends a hello or sends a status, but only one of these. A line without room is sent
    in a later turn, a status with the values of then. */

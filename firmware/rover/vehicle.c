@@ -134,7 +134,7 @@ void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pu
     if (channel == THROTTLE && throttle_is_fast(&vehicle->car) ? !within(pulse_us, FAST_PULSE_MIN_US, FAST_PULSE_MAX_US)
                                                                : !within(pulse_us, PULSE_MIN_US, PULSE_MAX_US))
         return;
-    if (distance(period_us, nominal) > nominal / 4) return;
+    if (!nominal || distance(period_us, nominal) > nominal / 4) return;
     judge_signal(vehicle, now_ms); /* before this pulse hides that the signal was lost */
     struct received *received = &vehicle->received[channel];
     uint8_t pulses = signal_pulses(vehicle, channel);
@@ -299,6 +299,11 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
 static void put_char(struct line *line, char c) {
     line_char(line, ' ');
     line_char(line, c);
+}
+
+bool vehicle_may_keep(const struct vehicle *vehicle) {
+    return vehicle->car_told && vehicle->state != AUTONOMOUS &&
+           distance(vehicle->throttle_us, neutral_us(vehicle, THROTTLE)) <= THROTTLE_DEAD_BAND_US;
 }
 
 uint8_t vehicle_hello(const struct vehicle *vehicle, char reset_cause, struct line *line) {

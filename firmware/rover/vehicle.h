@@ -10,7 +10,7 @@ extern "C" {
 #endif
 
 enum {
-    /* The car that is driven until another is told: actions -1 to 1 and 0 to 1 of rover_lib/onboard/car/pwm.py. */
+    /* The car of the recordings: actions -1 to 1 and 0 to 1 of rover_lib/onboard/car/pwm.py. */
     STEERING_PERIOD_US = 21316,
     STEERING_MIN_US = 900,
     STEERING_NEUTRAL_US = 1456,
@@ -116,7 +116,7 @@ struct vehicle {
     bool car_told;                      /* since the reset; also true of the default, which nobody needs to tell */
     uint16_t boot;                      /* tells this start of the firmware from others */
     uint32_t sequence;                  /* of the last command that was accepted as new */
-    uint16_t steering_us, throttle_us;  /* for the pins, always safe */
+    uint16_t steering_us, throttle_us;  /* for the pins, always safe; 0: no pulse, as no car is known */
     struct received received[2];
     struct moment wiggle[3];            /* the stick on either side, and both within WIGGLE_MS */
     uint16_t still_us;                  /* the steering stick has stayed near this */
@@ -140,7 +140,7 @@ bool car_allowed(const struct car *car);
 uint32_t car_id(const struct car *car);
 /* Whether the throttle's signal is a fast one, like the default's. */
 bool throttle_is_fast(const struct car *car);
-/* car: the one whose neutral the pins have now. */
+/* car: the one whose neutral the pins have now; nine zeros: none is known, and the pins have no pulse. */
 void vehicle_start(struct vehicle *vehicle, uint16_t boot, const struct car *car);
 /* A pulse of the transmitter, as measured. Implausible ones are no pulse. */
 void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pulse_us, uint16_t period_us,
@@ -151,6 +151,8 @@ enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms);
 void vehicle_command(struct vehicle *vehicle, const struct command *command, uint32_t now_ms);
 /* Checks all time limits and sets the pins' pulses. Call it every few milliseconds, after giving it all that is new. */
 void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms);
+/* Whether now is a time to write the car into the EEPROM: it was told, and does not drive. */
+bool vehicle_may_keep(const struct vehicle *vehicle);
 void count(uint16_t *counter);
 
 uint8_t vehicle_hello(const struct vehicle *vehicle, char reset_cause, struct line *line);

@@ -3,6 +3,7 @@
  * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
  * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
  *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N] [--periods S T]
+ *             [--eeprom HEX]
  *         --link           a symbolic link to the pty, for pyserial to open
  *         --log            on standard output, a line each: monotonic_s,event,pin,pulse_us,period_us
  *                          all: every pulse of a servo pin, every line of the host, every event
@@ -14,13 +15,14 @@
  *         --slow           its clock runs N times slower than this world's, for an emulated Pi that needs so long too;
  *                          pulses and periods are by its own clock
  *         --periods        of the transmitter's pulses, microseconds, where they are not those of the recordings' car
+ *         --eeprom         its first bytes; all others are erased
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
  *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), wiggle, ready 0|1, reset,
- *     hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
+ *     power (off and on), hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
  *     in a stopped car that nobody has opened the port of since.
  *     It ends with whoever started it.
  *
- * Written against simavr 1.6, which needs help in four places, see on_compare, match, on_flags and INT1.
+ * Written against simavr 1.6, which needs help in five places, see on_compare, match, on_flags, on_eeprom and INT1.
  */
 #include <stdbool.h>
 #include <stdint.h>
@@ -28,6 +30,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "avr_eeprom.h"
 #include "avr_extint.h"
 #include "avr_ioport.h"
 #include "avr_timer.h"
@@ -75,6 +78,8 @@ struct uno {
     uint32_t hung_at; /* flash address of the instruction that hang replaced, 0: none */
     uint8_t hung_code[2];
     void (*chip_reset)(avr_t *);
+    avr_io_write_t eeprom;
+    void *eeprom_param;
 };
 
 static double us(avr_cycle_count_t cycles) { return cycles * 1e6 / HZ; }
@@ -157,6 +162,24 @@ static void on_flags(struct avr_t *avr, avr_io_addr_t address, uint8_t value, vo
     for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++)
         if (vectors[i]->raised.reg == address && value >> vectors[i]->raised.bit & 1)
             avr_clear_interrupt(avr, vectors[i]);
+}
+
+/* simavr 1.6 writes the EEPROM in no time; the chip is busy with a byte for 3.4 ms. */
+enum { EECR = 0x3F, EEPE = 2, EEMPE = 4 };
+
+static avr_cycle_count_t written(avr_t *avr, avr_cycle_count_t when, void *param) {
+    (void)when, (void)param;
+    avr->data[EECR] &= (uint8_t)~EEPE;
+    return 0;
+}
+
+static void on_eeprom(struct avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
+    struct uno *uno = param;
+    bool writes = avr->data[EECR] & EEMPE && value & EEPE;
+    uno->eeprom(avr, address, value, uno->eeprom_param);
+    if (!writes) return;
+    avr->data[EECR] |= EEPE;
+    avr_cycle_timer_register(avr, HZ / 1000 * 34 / 10, written, NULL);
 }
 
 static avr_cycle_count_t feed(avr_t *avr, avr_cycle_count_t when, void *param) {
@@ -256,6 +279,11 @@ struct uno *uno_new(const char *elf) {
         }
     }
 
+    uno->eeprom = avr->io[AVR_DATA_TO_IO(EECR)].w.c;
+    uno->eeprom_param = avr->io[AVR_DATA_TO_IO(EECR)].w.param;
+    avr->io[AVR_DATA_TO_IO(EECR)].w.c = on_eeprom;
+    avr->io[AVR_DATA_TO_IO(EECR)].w.param = uno;
+
     static const struct { char out, out_bit, in, in_bit; } PINS[CHANNELS] = {{'B', 2, 'D', 2}, {'D', 3, 'B', 0}};
     for (int i = 0; i < CHANNELS; i++) {
         struct channel *channel = &uno->channels[i];
@@ -308,6 +336,20 @@ double uno_longest_us(struct uno *uno) { return us(uno->longest); }
 void uno_reset(struct uno *uno) {
     avr_reset(uno->avr);
     avr_regbit_set(uno->avr, uno->avr->reset_flags.extrf);
+}
+
+/* Off and on: the EEPROM is all that stays. */
+void uno_power(struct uno *uno) {
+    memset(uno->avr->data + uno->avr->ioend + 1, 0x5A, uno->avr->ramend - uno->avr->ioend);
+    avr_reset(uno->avr);
+    avr_regbit_set(uno->avr, uno->avr->reset_flags.porf);
+}
+
+/* The first n bytes of the EEPROM, read or written. */
+void uno_eeprom(struct uno *uno, uint8_t *bytes, uint32_t n, bool write) {
+    avr_eeprom_desc_t desc = {write ? bytes : NULL, 0, n};
+    avr_ioctl(uno->avr, write ? AVR_IOCTL_EEPROM_SET : AVR_IOCTL_EEPROM_GET, &desc);
+    if (!write) memcpy(bytes, desc.ee, n);
 }
 
 /* The code at a flash address becomes an endless loop, until the next reset. */
@@ -448,6 +490,8 @@ static bool obey(struct uno *uno, const char *line) {
         uno_wiggle(uno);
     } else if (!strncmp(line, "reset", 5)) {
         uno_reset(uno);
+    } else if (!strncmp(line, "power", 5)) {
+        uno_power(uno);
     } else if (!strncmp(line, "quit", 4)) {
         return false;
     } else {
@@ -468,7 +512,7 @@ static bool stays_up(int master, const char *name) {
 }
 
 int main(int argc, char **argv) {
-    const char *elf = NULL, *link_path = NULL, *log = NULL;
+    const char *elf = NULL, *link_path = NULL, *log = NULL, *eeprom = "";
     bool reset_on_open = false;
     double boot_s = 0;
     for (int i = 1; i < argc; i++) {
@@ -477,6 +521,7 @@ int main(int argc, char **argv) {
         else if (!strcmp(argv[i], "--log") && more) log = argv[++i];
         else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
         else if (!strcmp(argv[i], "--slow") && more) slow = atof(argv[++i]);
+        else if (!strcmp(argv[i], "--eeprom") && more) eeprom = argv[++i];
         else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
         else if (!strcmp(argv[i], "--periods") && i + 2 < argc) {
             period_us_of[STEERING] = atof(argv[++i]);
@@ -486,7 +531,7 @@ int main(int argc, char **argv) {
     if (log) pin_log.what = !strcmp(log, "all") ? PINS_ALL : !strcmp(log, "changes") ? PINS_CHANGES : PINS_NONE;
     if (!elf || !link_path || (log && !pin_log.what) || !(slow >= 1)) {
         fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] "
-                        "[--slow N] [--periods S T]\n");
+                        "[--slow N] [--periods S T] [--eeprom HEX]\n");
         return 2;
     }
     pid_t parent = getppid();
@@ -498,6 +543,11 @@ int main(int argc, char **argv) {
         fprintf(stderr, "arduino: cannot load %s\n", elf);
         return 1;
     }
+    uint8_t kept[64];
+    uint32_t bytes_kept = 0;
+    for (unsigned byte; bytes_kept < sizeof kept && sscanf(eeprom + 2 * bytes_kept, "%2x", &byte) == 1;)
+        kept[bytes_kept++] = (uint8_t)byte;
+    uno_eeprom(uno, kept, bytes_kept, true);
     int master, slave;
     char name[64];
     struct termios raw;

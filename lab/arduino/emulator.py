@@ -8,6 +8,7 @@ import functools
 import os
 import re
 import secrets
+import struct
 import tempfile
 import threading
 import time
@@ -17,7 +18,7 @@ from typing import NamedTuple
 from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import BOOT_S, REST_US, PinEvent
 from lab import debian
-from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.run_program import run
@@ -99,6 +100,11 @@ def symbol(name: str) -> int:
     return int(line[1], 16)
 
 
+def eeprom_of(car: Car, version: int = 1) -> bytes:
+    """Return the first bytes of the EEPROM of a board that has kept a car: boot number, version, numbers, CRC-32."""
+    return struct.pack("<HB9HI", 0, version, *car.numbers, ~car.id & 0xFFFFFFFF)
+
+
 def _set_nice(pid: int, nice: int) -> None:
     """Set the priority of a process that leads a session, as far as this user may.
 
@@ -127,6 +133,7 @@ class EmulatedArduino:
         boot_s: float = BOOT_S,
         nice: int = 0,
         slow: float = 1.0,
+        eeprom: bytes | None = None,
     ):
         """Start the process.
 
@@ -146,6 +153,7 @@ class EmulatedArduino:
         options += ["--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"]
         numbers = this_car().numbers
         options += ["--periods", str(numbers[0]), str(numbers[4])]
+        options += ["--eeprom", (eeprom_of(this_car()) if eeprom is None else eeprom).hex()]
         self._process = Child(
             "the emulated Arduino", built.program, built.firmware, *options, error=ArduinoError, talks=True
         )
@@ -191,6 +199,10 @@ class EmulatedArduino:
     def reset(self) -> None:
         """Press the reset button."""
         self._process.send_line("reset")
+
+    def power(self) -> None:
+        """Switch its power off and on again."""
+        self._process.send_line("power")
 
     def hang(self) -> None:
         """Make the firmware's loop() an endless loop until the next reset."""

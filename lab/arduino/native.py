@@ -126,6 +126,8 @@ def library() -> ctypes.CDLL:
     native.vehicle_start.argtypes = [vehicle, ctypes.c_uint16, ctypes.POINTER(CarNumbers)]
     native.car_allowed.restype = ctypes.c_bool
     native.car_allowed.argtypes = [ctypes.POINTER(CarNumbers)]
+    native.vehicle_may_keep.restype = ctypes.c_bool
+    native.vehicle_may_keep.argtypes = [vehicle]
     native.car_id.restype = u32
     native.car_id.argtypes = [ctypes.POINTER(CarNumbers)]
     native.vehicle_received.argtypes = [vehicle, ctypes.c_int, ctypes.c_uint16, ctypes.c_uint16, u32]
@@ -175,9 +177,15 @@ class NativeArduino:
         if not self.car.is_default:
             assert self.command("C", *self.car.numbers) == "k"
 
-    def start(self, kept: Car) -> None:
-        """Reset the board. kept: the car that it knows afterwards."""
-        self._native.vehicle_start(self._vehicle, 7, CarNumbers((ctypes.c_uint16 * 9)(*kept.numbers)))
+    def start(self, kept: Car | None) -> None:
+        """Reset the board. kept: the car that it knows afterwards; None: none."""
+        numbers = (ctypes.c_uint16 * 9)(*(kept.numbers if kept else ()))
+        self._native.vehicle_start(self._vehicle, 7, CarNumbers(numbers))
+
+    @property
+    def may_keep(self) -> bool:
+        """Whether the board may write its car into the EEPROM now."""
+        return self._native.vehicle_may_keep(self._vehicle)
 
     @property
     def status(self) -> Telemetry:

@@ -26,6 +26,7 @@ from lab.driving.cable import Cable
 from lab.driving.pins import BEFORE_S, STOPPED_THROTTLE_US
 from lab.driving.policy import PLAIN, RATE_HZ, make_artifact, pictures
 from lab.driving.priority import boost, boost_priority
+from lab.driving.rpicam_vid import install
 from rover_lib.onboard.drive.flight_log import LogError, read_log
 from rover_lib.onboard.errors import RoverError
 
@@ -61,6 +62,8 @@ def _break_logger() -> None:
     telemetry._seal = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
 
 
+# What a human gives by hand, a gesture before the car drives, is waited for only if stdin is a terminal.
+IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
 INSIDE = {"end the loop's thread": _end_this_thread, "raise in the loop": _raise, "raise in the logger": _break_logger}
 
 
@@ -102,7 +105,7 @@ class Drive(RoverCommand):
     """`rover drive` with the bench's artifact, camera and cable.
 
     start: how it is prepared: one of INSIDE; 'clock': bench.step_clock can set its clock; 'disk': its log is on
-    bench.disk; '': nothing of these.
+    bench.disk; 'csi': it reads the camera through rpicam-vid's stand-in; '': nothing of these.
     """
 
     arguments: tuple[str, ...] = ()  # further arguments of the command
@@ -116,17 +119,21 @@ class Drive(RoverCommand):
         env: dict[str, str] = {}
         code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
         if self.in_terminal:
-            code += "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
+            code += IN_TERMINAL
         if start in INSIDE:
             code += f"from {__name__} import on_signal; on_signal({start!r}); "
         run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
         if start == "clock":
             env = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)}
+        devices = bench.devices()
+        if start == "csi":
+            env = {"PATH": f"{install(bench.folder)}:{os.environ['PATH']}", "ROVER_CSI": str(bench.camera)}
+            devices[1] = "csi"
         options = ["--film", "--hz", RATE_HZ, "--threads", 1, "--log", self.log, "--view", bench.view]
-        super().__init__("drive", bench.artifact, *bench.devices(), *options, *self.arguments, run=run, env=env)
+        super().__init__("drive", bench.artifact, *devices, *options, *self.arguments, run=run, env=env)
 
     def children(self) -> list[int]:
-        """Return the ids of its child processes, of which the policy's is the only one."""
+        """Return the ids of its child processes, the policy's and, with 'csi', the camera's."""
         children = []
         for status in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
@@ -283,6 +290,12 @@ class DrivingBench:
 
     def signal(self, number: int) -> None:
         self.drive.process.send_signal(number)
+
+    def signal_children(self, number: int, name: str = "") -> None:
+        """Signal the drive's child processes, of which one has `name` in its command line."""
+        for pid in self.drive.children():
+            if name in Path(f"/proc/{pid}/cmdline").read_text():
+                os.kill(pid, number)
 
     def step_clock(self, seconds: int) -> None:
         """Step the system's clock as a drive that was started with 'clock' sees it."""

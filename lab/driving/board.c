@@ -38,7 +38,7 @@ static uint16_t pins[2];
 static struct event events[65536];
 static uint32_t event_count;
 
-const struct car *car_kept() { return &DEFAULT_CAR; } /* each start is a power-on's */
+const struct car *car_kept() { return &DEFAULT_CAR; }
 void car_keep(const struct car *car) { (void)car; }
 void pulses_begin(const struct car *car) {
     pulses_set(car, car->servos[STEERING].neutral_us, car->servos[THROTTLE].neutral_us);

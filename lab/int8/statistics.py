@@ -17,7 +17,7 @@ from torch import Tensor
 from rover_learn.train import TrainingRecipe, _train
 from rover_learn.training import Resumable
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import read_stage, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.choose import Chooser
@@ -28,7 +28,7 @@ from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.samples import Recordings, pick_evenly
 from rover_lib.workshop.run.pipeline import Recipe, prepare_chooser
 from rover_lib.workshop.run.session import Opened
 
@@ -77,9 +77,7 @@ def _judge(episodes: Path, folder: Path, seed: int, name: str, recipe: TrainingR
     p = params()
     recordings = load_recordings(episodes, SIZE.chunk, p["calibration"]["sync_s"])
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
-    with Resumable(folder / f"training-{seed}-{name.replace(' ', '-')}") as saved:
-        trained = _train(recordings, SIZE, recipe, seed, torch.device("cpu"), saved, STATISTICS[name])
-    weights = {k.removeprefix("model."): v for k, v in trained["model_state_dict"].items()}
+    weights = _weights(recordings, folder, seed, name, recipe)
     checkpoint = Checkpoint(folder, "trainer", SIZE, weights, f"{seed} {name}", {})
     how = Recipe.of(p)
     calibration = calibrate(checkpoint, how.choose(parts.calibration)[0], smooth=how.scheme.smooth)
@@ -95,3 +93,19 @@ def _judge(episodes: Path, folder: Path, seed: int, name: str, recipe: TrainingR
         "passed": (worst(errors) or 0.0) <= LIMIT_PCT,
         "histogram": by_histogram,
     }
+
+
+def _weights(recordings: Recordings, folder: Path, seed: int, name: str, recipe: TrainingRecipe) -> dict[str, Tensor]:
+    """Train the policy, unless an earlier call did. All of a training's backbones learn the same before their
+    statistics are measured, so that only the first of them does.
+    """
+    policy, phases = folder / f"{seed}-{name.replace(' ', '-')}.pt", folder / f"training-{seed}"
+    if not policy.is_file():
+        with Resumable(phases) as saved:
+            trained = _train(recordings, SIZE, recipe, seed, torch.device("cpu"), saved, STATISTICS[name])
+        with atomic_path(policy) as temporary:
+            torch.save(trained["model_state_dict"], temporary)
+        for left in phases.iterdir():
+            if left.name not in ("backbone.pt", "lock"):
+                left.unlink()
+    return {k.removeprefix("model."): v for k, v in torch.load(policy, weights_only=True).items()}

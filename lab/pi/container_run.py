@@ -24,6 +24,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
     view           [{row, wanted, found, holds}], see view_proofs.py
+    pieces         {cut_after, changed_after, undone, stale} of provisioning that is cut off, see cut_plays.py
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
 `wrong` has a sentence for everything that is not as it should be. The file pi-fast.log beside it has all that the
@@ -47,6 +48,7 @@ from lab.arduino.emulator import EmulatedArduino
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
 from lab.pi.container import CAMERA, PORT, Container
+from lab.pi.cut_plays import provision_in_pieces
 from lab.pi.debian_image import debian_image
 from lab.pi.deployment_bench import DeploymentBench
 from lab.pi.deployment_faults import break_deployments, row_of, wrong_rows
@@ -84,6 +86,7 @@ def run_container(
     short: bool = False,
     view: bool = False,
     faults: bool = True,
+    pieces: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> PiReport:
     """Run everything, and write the report to `output` whatever fails.
@@ -91,7 +94,8 @@ def run_container(
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
     provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
     the view's service, which other runs always include. faults: include the faults of deployments, which
-    run only with torch. say: called with a line for each step.
+    run only with torch. pieces: only provision, cut off after each of so many tasks. say: called with a line for
+    each step.
     Raises RoverError if it cannot begin: without root, without artifacts, or if packages cannot be installed.
     """
     output, demo = Path(output), Path(demo)
@@ -110,7 +114,7 @@ def run_container(
     ):
         run = _Run(report, Path(folder), log, engine)
         try:
-            run.all(artifacts[0], artifacts[1], short=short, view=view, faults=faults)
+            run.all(artifacts[0], artifacts[1], short=short, view=view, faults=faults, pieces=pieces)
         except RoverError as error:
             report.wrong.append(str(error))
         finally:
@@ -137,11 +141,13 @@ class _Run:
             "rover_view_port": free_port(),  # a free one, as the network is this machine's, which may run a view too
         }
 
-    def all(self, static: Path, other: Path, *, short: bool, view: bool, faults: bool) -> None:
+    def all(self, static: Path, other: Path, *, short: bool, view: bool, faults: bool, pieces: int | None) -> None:
         begun = time.monotonic()
         with self.report.step("system") as row:
             debian_image()
             cached = row["cached"] = self.metrics["system_cached"] = time.monotonic() - begun < 5
+        if pieces:
+            return self.cut_off(pieces)
         with Container(ROVER, nice=NICE) as pi:
             with self.report.step("boot"):
                 pi.boot()
@@ -162,6 +168,8 @@ class _Run:
                 self.proofs(pi, pins)
             if faults and self.engine == "torch":
                 self.deployment_faults(pi, static, other)
+        if not short:
+            self.cut_off(1)
 
     # The playbooks
 
@@ -255,6 +263,24 @@ class _Run:
         self.report.gate("the drive, recorded and brought home", "an episode, none left on the rover", recorded, whole)
         ended = next((str(e) for e in reversed(flight.events) if "ended" in str(e)), "")
         self.metrics["drive"] = {"ticks": len(states), "driven": driven, "ended": ended, "recorded": recorded}
+
+    def cut_off(self, every: int) -> None:
+        """Provision another rover, from nothing, by plays that are killed after every `every`-th task."""
+
+        def done(play: Play) -> None:
+            self.log.write(f"===== provision, in pieces\n{play.output}\n")
+            self.log.flush()
+
+        with Container("rover2", nice=NICE) as pi, self.report.step("provision, in pieces") as row:
+            pi.boot()
+            variables = {**self.variables, "rover_engine": "onnxruntime", "rover_view": True}
+            row |= provision_in_pieces(pi, folder=self.folder, variables=variables, every=every, done=done)
+            installed = environment(pi.root, "onnxruntime")
+        self.metrics["pieces"] = row
+        lacks = {key: row[key] for key in ("changed_after", "undone", "stale") if row[key]}
+        lacks |= {key: installed[key] for key in ("missing", "others", "unhashed") if installed[key]}
+        what = f"provision, killed {len(row['cut_after'])} times"
+        self.report.gate(what, "whole, and changed=0 after", lacks or "so", not lacks and len(row["cut_after"]) > 5)
 
     # The proofs
 

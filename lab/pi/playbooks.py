@@ -78,13 +78,14 @@ def run(
     folder: Path,
     check: bool = False,
     variables: Mapping[str, Any] | None = None,
+    more: Mapping[str, str] | None = None,
     timeout_s: float = 3600,
 ) -> Play:
     """Run ansible/<book>.yml on hosts, in this order.
 
     folder: for the inventory and Ansible's own files; plays with the same folder share ssh connections. check: run
-    with --check --diff. variables: passed with -e. A play that fails raises nothing. Raises EmulationError if there is
-    no Ansible, or if the play takes longer than timeout_s.
+    with --check --diff. variables: passed with -e. more: of Ansible's environment. A play that fails raises nothing.
+    Raises EmulationError if there is no Ansible, or if the play takes longer than timeout_s.
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     if not program.exists():
@@ -102,7 +103,7 @@ def run(
             stdout=output,
             stderr=subprocess.STDOUT,
             cwd=REPOSITORY,
-            env=environment(folder),
+            env={**environment(folder), **(more or {})},
             start_new_session=True,
         )
         try:

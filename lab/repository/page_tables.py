@@ -155,7 +155,8 @@ def span_of(row: Mapping[str, Any]) -> str:
 
 def _against(row: Mapping[str, Any]) -> str:
     computed, low, high = (row[f"predicted{end}_ms"] for end in ("", "_low", "_high"))
-    return f"{row['published_ms']:.3g}, {computed:.3g} ({low:.3g} to {high:.3g})"
+    outside = "" if low <= row["published_ms"] <= high else " *"
+    return f"{row['published_ms']:.3g}, {computed:.3g}{outside}"
 
 
 def shape_of(row: Mapping[str, Any]) -> str:

@@ -30,7 +30,6 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
 
 
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
-PLAN_FRAMES = 32  # steps of a plan, as trained by default
 ACTION_NAMES = click.option(
     "--action-names", default="", help="Names of a LeRobotDataset's actions in order, if it has none."
 )
@@ -302,9 +301,11 @@ def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> 
         del report[name]
     show({done: report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
-        if (frames := report["frames_in_a_usual_episode"]) < PLAN_FRAMES:
+        from rover_lib.onboard.care.release import Expected
+
+        if (frames := report["frames_in_a_usual_episode"]) < Expected.chunk:
             click.echo(
-                f"half of its episodes have at most {frames} frames, a plan {PLAN_FRAMES}: its drives have holes"
+                f"half of its episodes have at most {frames} frames, a plan {Expected.chunk}: its drives have holes"
             )
         click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
 

@@ -28,7 +28,7 @@ LONG_LIST = 12  # longer lists are for programs, and not printed for people
 BUSY = 0.5  # load per core in the last minute; above it, times are only rough
 # Options that several commands share:
 CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="A number, /dev/videoN, or a folder, FIFO or .mjpeg of JPEGs."
+    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder, FIFO or .mjpeg."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")

@@ -107,6 +107,10 @@ class WorldError(RoverError):
     """A recording, training or trial in the balloon world that is not possible."""
 
 
+class CameraError(RoverError):
+    """A camera that is missing, has stopped, or delivers something different than before."""
+
+
 class DriveFault(RoverError):
     """What stopped the car."""
 

@@ -12,6 +12,7 @@ import math
 import os
 import stat
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ CALLED = {
     "checkpoint part": "a part of a LeRobot checkpoint",
     "dataset part": "a part of a LeRobotDataset",
     "document": "a document",
+    "pointer": "a Git LFS pointer, not the file that it stands for",
+    "packed": "an archive",
 }
 WANTED = {  # what a command wants: the kinds that it accepts, and how to get one
     "artifact": (("artifact",), "give a policy_<mode>.pt, which rover run makes of a checkpoint"),
@@ -59,7 +62,22 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
 PARTS = ("checkpoint part", "dataset part")
+REFUSED = {
+    "document": "give a file or folder that it describes",
+    "pointer": "git lfs pull, where it was cloned, or download the file itself",
+    "packed": "unpack it, and give the folder or the file in it",
+}
+POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
+PACKED = (
+    (0, b"\x1f\x8b"),
+    (0, b"7z\xbc\xaf"),
+    (0, b"Rar!"),
+    (0, b"\xfd7zXZ"),
+    (0, b"\x28\xb5\x2f\xfd"),
+    (257, b"ustar"),
+)
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
+PACKED_NAMES = (*EPISODE_FILES, "config.json", "info.json", "model.safetensors", "best_model.pth", "manifest.json")
 HEAD = 65536  # bytes that are read of a file
 PICKLE_HEAD = 4096  # bytes that are read of a torch file's pickle, which names its keys early
 
@@ -93,15 +111,31 @@ def check_kind(path: Path | str, wanted: str) -> None:
 
 
 def refuse_part(path: Path | str) -> None:
-    """Raise KindError for a file of a LeRobot checkpoint or LeRobotDataset, and for a document, which nothing reads."""
+    """Raise KindError for a part of a LeRobot checkpoint or LeRobotDataset, and for what nothing here reads.
+
+    That is a document, an archive, or a Git LFS pointer.
+    """
     kind = next(iter(kinds_of(path)), "")
     if kind in PARTS:
         folder = Path(path).absolute().parent
+        if folder.name == "training_state":  # the optimizer's, beside pretrained_model
+            folder = folder.parent
         if kind == "dataset part":
             folder = next((p for p in (folder, *folder.parents[:4]) if (p / "meta" / "info.json").is_file()), folder)
         raise KindError(f"{path}: this is {CALLED[kind]}", remedy=f"give its folder, {os.path.relpath(folder)}")
-    if kind == "document":
-        raise KindError(f"{path}: this is {CALLED[kind]}", remedy="give a file or folder that it describes")
+    if kind in REFUSED:
+        raise KindError(f"{path}: this is {CALLED[kind]}", remedy=REFUSED[kind])
+
+
+def refuse_pointer(path: Path, error: type[RoverError]) -> None:
+    """Raise `error` if Git LFS left a pointer in place of a file, as a clone without it does."""
+    with suppress(OSError):
+        if not path.is_file():  # opening a pipe would wait for ever
+            return
+        with path.open("rb") as f:
+            head = f.read(len(POINTER))
+        if head == POINTER:
+            raise error(f"{path}: {CALLED['pointer']}", remedy=REFUSED["pointer"])
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
@@ -169,13 +203,18 @@ class PathTo(click.Path):
 
 def _of_folder(folder: Path) -> tuple[str, ...]:
     names = {p.name for p in folder.iterdir()}
+    if folder.name in ("meta", "data", "videos", "images") and (folder.parent / "meta" / "info.json").is_file():
+        return ("dataset part",)
+    if "training_step.json" in names:
+        return ("checkpoint part",)
     kinds = []
     artifacts = [n for n in names if n.startswith("policy_") and n.endswith((".pt", ".zip"))]  # not policy_...json
     if names & {"load.json", "run.json", "quantize.json"} or artifacts:
         kinds.append("run")
     if (folder / "meta" / "info.json").is_file():
         kinds.append("dataset")
-    if {"config.json", "adapter_config.json", "pretrained_model", "checkpoints", "last"} & names:
+    of_policy = {"config.json", "adapter_config.json", "pretrained_model", "checkpoints", "last", "model.safetensors"}
+    if of_policy & names or any(n.endswith(".distcp") or (folder / n / "pretrained_model").is_dir() for n in names):
         kinds.append("pretrained")
     if names & set(EPISODE_FILES) or any(n.startswith("episode_") and (folder / n).is_dir() for n in names):
         kinds.append("recordings")
@@ -190,6 +229,10 @@ def _of_folder(folder: Path) -> tuple[str, ...]:
 def _of_file(file: Path) -> tuple[str, ...]:
     with file.open("rb") as f:
         head = f.read(HEAD)
+    if head.startswith(POINTER):
+        return ("pointer",)
+    if any(head[at:].startswith(magic) for at, magic in PACKED):
+        return ("packed",)
     if head[:4] == b"PK\x03\x04":
         return _of_archive(file)
     if head[:1] == b"{":
@@ -221,7 +264,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
             names = z.namelist()
             pickled = next((name for name in names if name.endswith("/data.pkl")), None)
             if pickled is None:
-                return ()
+                return ("packed",) if any(Path(name).name in PACKED_NAMES for name in names) else ()
             with z.open(pickled) as f:
                 keys = f.read(PICKLE_HEAD)
     except Exception:  # zipfile raises errors of many types for a damaged file

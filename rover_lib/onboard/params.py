@@ -7,7 +7,9 @@ from typing import Any
 import yaml
 
 from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.stage import read_plain
 
+MOST_BYTES = 1_000_000  # ours have some kB, and PyYAML reads a megabyte in seconds
 DEFAULTS = Path(__file__).with_name("params.yml")  # all that a rover reads
 PLACES = (  # where the user's params.yml may be; the first one that exists is used
     Path(__file__).parents[2] / "params.yml",  # a checkout's
@@ -49,7 +51,7 @@ class _EachKeyOnce(yaml.SafeLoader):
 def read_params(path: Path | str) -> dict[str, Any]:
     """The content of one file. Raises ParamsError if it is missing, unreadable, or not a YAML mapping."""
     try:
-        content = yaml.load(Path(path).read_text(), _EachKeyOnce)
+        content = yaml.load(read_plain(path, MOST_BYTES).decode(), _EachKeyOnce)
     except FileNotFoundError:
         raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
     except OSError as e:

@@ -5,6 +5,7 @@ Metric keys end in their unit (_ms _mb _us _pct _hz _c _g). Papermill, pytest, A
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
@@ -26,6 +27,7 @@ from rover_lib.onboard.errors import RoverError
 
 SCHEMA = 1
 PARTS = ("params", "metrics", "inputs", "env")
+FILE_BYTES = 50_000_000  # largest report, list or file of settings that is read
 
 
 @contextmanager
@@ -57,7 +59,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def open_plain(path: Path | str, refusal: RoverError) -> BufferedReader:
+def open_plain(path: Path | str, refusal: RoverError | OSError) -> BufferedReader:
     """Open a plain file for reading. Raises OSError, and `refusal` if it is no plain file.
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.
@@ -67,6 +69,14 @@ def open_plain(path: Path | str, refusal: RoverError) -> BufferedReader:
         file.close()
         raise refusal
     return file
+
+
+def read_plain(path: Path | str, most_bytes: int = FILE_BYTES) -> bytes:
+    """Return a plain file's bytes. Raises OSError, also for what is no plain file or has more than most_bytes."""
+    with open_plain(path, OSError(errno.EINVAL, "not a file", str(path))) as file:
+        if (size := os.fstat(file.fileno()).st_size) > most_bytes:
+            raise OSError(errno.EFBIG, f"{size / 1e6:.0f} MB, at most {most_bytes / 1e6:g} are read", str(path))
+        return file.read(most_bytes)
 
 
 def sha256_of(path: Path | str) -> str:
@@ -158,7 +168,7 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(read_plain(path))
     except FileNotFoundError:
         raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets

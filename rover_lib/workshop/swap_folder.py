@@ -16,39 +16,51 @@ from pathlib import Path
 from rover_lib.onboard.errors import RoverError
 
 ADDED = ".added"  # a file in the folder of replaced files: names of the new files that replaced nothing, one per line
+ASKED = ".asked"  # a file in a folder that is being filled, if that can be gone on with: all that decides its content
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[Path]:
+def lock_folder(folder: Path, asked: str = "") -> Iterator[Path]:
     """An empty folder that only this process uses until the block ends; then it is removed with all its content.
 
-    Whatever a killed process left in it is removed first. Raises RoverError while another process uses it.
+    asked: all that decides what is made. If it is given, ASKED is in the folder, and while it is there the content
+    stays, also after an error or a kill. What an ended process left that was asked the same is then found again, less
+    its unfinished files; anything else goes first. Raises RoverError while another process uses the folder.
     """
-    held = _lock(folder)
+    held, note = _lock(folder), folder / ASKED
     try:
+        same = asked and _text(note) == asked
         for left in folder.iterdir():
-            _remove(left)
+            if not same or (left.name.startswith(".") and left != note):
+                _remove(left)
+        if asked:
+            note.write_text(asked)
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if not asked or _text(note) != asked:
+            shutil.rmtree(folder, ignore_errors=True)
         os.close(held)
 
 
 @contextmanager
-def build_beside(folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()) -> Iterator[Path]:
-    """Give an empty folder `.<name>.new` beside `folder`; its content moves into `folder` if the block ends well.
+def build_beside(
+    folder: Path, replaced: Callable[[Path], Iterable[Path]] = lambda _: (), asked: str = ""
+) -> Iterator[Path]:
+    """Give a folder `.<name>.new` beside `folder`; its content moves into `folder` if the block ends well.
 
-    Either all of it moves or nothing; the hidden folder is removed in any case.
+    Either all of it moves or nothing. The hidden folder begins empty and is removed in any case, except for what
+    `lock_folder` keeps if it is given `asked`.
 
     replaced: returns the files of `folder` to remove then, in addition to those with a successor; all others stay.
     Until the new content is complete, the old files lie in `.<name>.old`. If this process is killed meanwhile, the next
     call puts them back. Raises RoverError while another process makes something for that folder.
     """
     old = folder.with_name(f".{folder.name}.old")
-    with lock_folder(folder.with_name(f".{folder.name}.new")) as new:
+    with lock_folder(folder.with_name(f".{folder.name}.new"), asked) as new:
         if old.exists():  # the last process was killed during the swap
             _put_back(old, folder)
         yield new
+        (new / ASKED).unlink(missing_ok=True)
         if folder.exists():
             _take_place(new, folder, old, replaced(folder))
         else:
@@ -109,6 +121,10 @@ def _lock(folder: Path) -> int:
         except FileNotFoundError:
             pass
         os.close(held)  # the process that used it has just ended and removed it
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.is_file() else ""
 
 
 def _remove(path: Path) -> None:

@@ -155,6 +155,7 @@ def test_wrong_arguments_end_in_a_sentence_before_anything_is_done(tmp_path):
 def test_values_that_no_unit_can_have_are_refused(tmp_path):
     cases = [
         ("service", {"rover_camera": "/dev/video0\nExecStartPre=+/bin/true"}),
+        ("service", {"rover_camera": "csi --throttle-limit 1"}),
         ("service", {"rover_models": "/var/lib/rover\nUser=root"}),
         ("service", {"rover_home": "opt"}),
         ("service", {"rover_hz": "30\nUser=root"}),
@@ -342,6 +343,26 @@ def test_a_card_that_is_full_because_of_us_is_not_refused(tmp_path):
     assert preflight(tmp_path, mounts=[{"mount": "/", "size_available": 900_000_000}]).returncode == 0
 
 
+# A run that was cut off before its handlers
+
+
+def test_what_an_earlier_run_left_to_do_is_done_by_the_next_and_once(tmp_path):
+    handlers = [row["name"] for row in yaml.safe_load((ROLE / "handlers" / "main.yml").read_text())]
+    begin = next(t for t in yaml.safe_load((ROLE / "tasks" / "system.yml").read_text()) if "notify" in t)
+    end = yaml.safe_load((ANSIBLE / "provision.yml").read_text())[0]["post_tasks"]
+    tasks = json.loads(json.dumps([begin, begin, *end, begin]).replace("/run/", f"{tmp_path}/"))
+    flush = {"name": "Flush", "ansible.builtin.meta": "flush_handlers"}
+    book = {"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False}
+    book["tasks"] = [task for given in tasks for task in (given, flush)]
+    book["handlers"] = [{"name": name, "ansible.builtin.debug": {"msg": name}} for name in handlers]
+    (tmp_path / "play.yml").write_text(json.dumps([book]).replace('"root"', f'"{Path.home().owner()}"'))
+    found = run(program("ansible-playbook"), "-i", "localhost,", tmp_path / "play.yml", tmp=tmp_path)
+    ran = re.findall(r"^RUNNING HANDLER \[(.*?)\]", found.stdout, re.MULTILINE)
+    later = {"Name the Arduino", "Restart the view"}  # another handler, or view.yml's last task, does that
+    assert sorted(ran) == sorted(set(handlers) - later), found.stdout + found.stderr
+    assert " changed=1 " in found.stdout and (tmp_path / "rover-provisioning").exists(), found.stdout
+
+
 # The units, as they are on a rover
 
 
@@ -510,6 +531,13 @@ def test_a_value_in_the_unit_is_one_word_of_its_command(units, value):
     before = commands(unit)["ExecStartPre"]
     unit.write_text(rendered(unit.name, **given))
     assert commands(unit) == {"ExecStart": expected, "ExecStartPre": before}
+
+
+@pytest.mark.parametrize(("camera", "more"), [("csi", True), ("csi:1,shutter=8000", True), ("/dev/video0", False)])
+def test_the_service_of_a_pi_camera_may_use_what_libcamera_needs(camera, more):
+    unit = rendered("rover-drive.service", rover_camera=camera)
+    assert f"--camera {camera} " in unit.replace('"', "")
+    assert [f"DeviceAllow=char-{d} rw" in unit for d in ("video4linux", "media", "dma_heap")] == [True, more, more]
 
 
 @pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])

@@ -51,7 +51,7 @@ static bool fast(void) { return car[4] < 3000; }
 static uint32_t id_of(const uint16_t *numbers) { return crc32((const char *)numbers, 18); }
 static uint16_t stick_us[2] = {1456, 120};
 static uint16_t seen_us[2]; /* of them, the receiver's last pulses */
-static uint32_t seen_ms[2];
+static uint32_t seen_ms[2], seen_before_ms[2]; /* of the last pulse, and of the one before */
 static uint16_t rest_us[2]; /* the sticks on arming */
 static bool signal_on = true;
 static bool misreading;           /* some throttle pulses are measured wrongly */
@@ -59,7 +59,7 @@ static bool sides[2], wiggled;    /* the steering stick was there, with the thro
 static uint32_t sides_ms[2], wiggled_ms;
 static void forget_wiggle(void) { sides[0] = sides[1] = wiggled = false; }
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
-static bool throttle_may_pass, was_lost;
+static bool throttle_may_pass, was_awaited;
 static uint32_t wanted_us[2];     /* of the last drive that must count */
 static uint32_t wanted_since_ms, wanted_heard_ms;
 static bool wanted;
@@ -89,8 +89,10 @@ static void check(void) {
     if (!neutral && lost) fail("no signal, and not neutral");
     if (lost) forget_wiggle();
     if (lost) throttle_may_pass = false;
-    if (lost && !was_lost) at_rest = 0; /* pulses of the one signal count while the other is awaited */
-    was_lost = lost;
+    /* Pulses of the one signal count while the other is awaited: as soon as two within 100 ms, a signal, are not there. */
+    bool awaited = now_ms - seen_before_ms[0] > 100 || now_ms - seen_before_ms[1] > 100;
+    if (awaited && !was_awaited) at_rest = 0;
+    was_awaited = awaited;
     if (vehicle.state == MANUAL && before_state != MANUAL) throttle_may_pass = at_rest >= 8;
     if (vehicle.state == MANUAL) {
         uint16_t throttle_us = throttle_may_pass ? seen_us[1] : car[6];
@@ -120,7 +122,7 @@ static void check(void) {
 static void see_throttle(uint16_t us) {
     if (fast() ? us >= 40 && us <= 980 : us >= 800 && us <= 2200) { /* else it is no pulse */
         seen_us[1] = us;
-        seen_ms[1] = now_ms;
+        seen_before_ms[1] = seen_ms[1], seen_ms[1] = now_ms;
         at_rest = abs(us - car[6]) <= 32 ? at_rest + 1 : 0;
         if (!at_rest) forget_wiggle();
         away = abs(us - rest_us[1]) > 32 ? away + 1 : 0;
@@ -134,7 +136,7 @@ static void pass(uint32_t ms) { /* as the sketch's loop does */
         clock_wraps += !++now_ms;
         if (signal_on && now_ms % 21 == 0) {
             seen_us[0] = stick_us[0];
-            seen_ms[0] = now_ms;
+            seen_before_ms[0] = seen_ms[0], seen_ms[0] = now_ms;
             for (int side = 0; side < 2; side++)
                 if (side ? seen_us[0] >= car[2] + 200 : seen_us[0] <= car[2] - 200) {
                     sides[side] = true, sides_ms[side] = now_ms;
@@ -169,10 +171,10 @@ static void let_go(void) { stick_us[0] = car[2], stick_us[1] = car[6]; }
 static void drives(const uint16_t *other) {
     if (other == car) return;
     car = other;
-    seen_ms[0] = seen_ms[1] = now_ms - 1000;
+    seen_ms[0] = seen_ms[1] = seen_before_ms[0] = seen_before_ms[1] = now_ms - 1000;
     forget_wiggle();
     throttle_may_pass = false;
-    at_rest = 0, was_lost = true;
+    at_rest = 0, was_awaited = true;
     let_go();
 }
 
@@ -265,10 +267,10 @@ static void start(void) { /* a reset: of the board alone */
     reader = (struct reader){0};
     now_ms = rnd(2) ? UINT32_MAX - rnd(10000) : rnd(1u << 31) * 2;
     vehicle.sequence = rnd(2) ? UINT32_MAX - rnd(300000) : rnd(1u << 31) * 2;
-    seen_ms[0] = seen_ms[1] = now_ms - 1000;
+    seen_ms[0] = seen_ms[1] = seen_before_ms[0] = seen_before_ms[1] = now_ms - 1000;
     forget_wiggle();
     throttle_may_pass = wanted = false;
-    at_rest = 0, was_lost = true;
+    at_rest = 0, was_awaited = true;
     lowered_us = UINT32_MAX;
     before_state = 0;
 }

@@ -1,5 +1,6 @@
 """Other cars, in virtual time: what the firmware takes of them, and who drives them."""
 
+import zlib
 from pathlib import Path
 
 import needs
@@ -92,7 +93,20 @@ def test_a_lost_signal_stops(armed):
 # ---- being told
 
 
-def test_a_board_that_was_not_told_drives_by_its_default():
+def test_a_board_that_keeps_no_car_does_nothing_before_it_is_told():
+    board = NativeArduino()
+    board.start(None)
+    assert set(board.run(500)) == {(0, 0)}
+    assert board.hello.car == zlib.crc32(bytes(18))
+    assert board.status.missing == "s"
+    assert [board.command("A"), board.command("D", 0, 0), board.command("L", 1500)] == ["c", "i", "r"]
+    assert not board.may_keep
+    assert board.command("C", *CRAWLER.numbers) == "k"
+    assert set(board.run(1)) == {(1500, 1500)}
+    assert board.may_keep
+
+
+def test_a_board_that_keeps_the_default_need_not_be_told_of_it():
     board = NativeArduino()
     assert set(board.run(50)) == {(1456, 120)}
     assert board.hello.car == Car().id
@@ -101,6 +115,17 @@ def test_a_board_that_was_not_told_drives_by_its_default():
     assert board.command("A") == "c"
     board.car = Car()
     assert board.command("A") == "k"
+
+
+def test_the_car_is_kept_only_while_it_rests(armed):
+    assert not armed.may_keep
+    armed.sticks[STEERING] += 120
+    armed.run(400)
+    assert armed.status.state is State.MANUAL
+    assert armed.may_keep
+    armed.sticks[THROTTLE] += 60
+    armed.run(50)
+    assert not armed.may_keep
 
 
 def test_no_other_car_while_armed(armed):

@@ -1,6 +1,5 @@
 """Policies that must not drive, each through a whole `rover run`: nothing that a user sees may ask to drive them."""
 
-import json
 import re
 
 import numpy as np
@@ -10,9 +9,11 @@ from policies import TINY, lerobot_policy, trainer_content
 from recorded import real_recordings
 from test_odd_policies import run_here
 
+from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.formula import OLD
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.describe import runs
 from rover_lib.workshop.run.run_report import PAGE, text, write, write_card
@@ -25,17 +26,12 @@ DRIVES = re.compile(
 )
 
 
-def in_old_units(recordings, folder):
-    """Write the recordings without their pulses, as a trainer takes them to which 0.1687 is stopped."""
-    for source in sorted(recordings.glob("episode_*")):
-        (folder / source.name).mkdir(parents=True)
-        (folder / source.name / "frames").symlink_to(source / "frames")
-        content = json.loads((source / "episode_data.json").read_text())
-        for row in content["control_samples"]:
-            for name in [name for name in row if name.endswith("_us")]:
-                del row[name]
-        (folder / source.name / "episode_data.json").write_text(json.dumps(content))
-    return folder
+def in_old_units(actions):
+    """The actions, (n, 2), as an older firmware wrote them: a stopped car is 0.1687."""
+    now = PwmCalibration()
+    duties = [c.neutral_pct + c.span_pct * actions[:, i] for i, c in enumerate((now.steering, now.throttle))]
+    lines = [(duty - OLD[name].neutral_pct) / OLD[name].span_pct for name, duty in zip(OLD, duties, strict=True)]
+    return np.stack(lines, 1)
 
 
 def learned(path, samples, change=(), of=lambda s: s.chunk):
@@ -64,17 +60,16 @@ def learned(path, samples, change=(), of=lambda s: s.chunk):
     torch.save(content, path)
 
 
-def make(kind, path, tmp_path):
+def make(kind, path):
     """Write the policy of that kind to `path`."""
     recordings = real_recordings()
     if kind == "random":
         torch.save(trainer_content(lerobot_policy({"observation.images.cam_front": (36, 64)}, **TINY)), path)
-    elif kind == "in old units":
-        learned(path, load_recordings(in_old_units(recordings, tmp_path / "old")).samples)
     else:
         samples = load_recordings(recordings).samples
         mean = np.concatenate([s.chunk for s in samples]).mean(0)
         answer = {
+            "in old units": lambda s: in_old_units(s.chunk),
             "collapsed": lambda s: np.broadcast_to(mean, s.chunk.shape),
             "straight ahead": lambda s: s.chunk * np.array([0, 1], np.float32),
         }
@@ -88,7 +83,7 @@ KINDS = ("of all six", "in old units", "collapsed", "copies its state", "straigh
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.release] * (k not in KINDS[1:3])) for k in KINDS])
 def test_what_is_not_ready_is_never_asked_to_drive(kind, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "runs" / "bad"
-    make(kind, tmp_path / "best_model.pth", tmp_path)
+    make(kind, tmp_path / "best_model.pth")
     given = {"checkpoint": str(tmp_path / "best_model.pth"), "episodes": str(real_recordings())}
     run_here(folder, **given, held_out_frames=60)
     judged = write(folder)["metrics"]

@@ -217,7 +217,7 @@ def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old
     with pytest.raises(type(error)):
         run_with(monkeypatch, one_notebook, old_run, ends_early)
     assert contents(old_run) == before
-    kept = contents(old_run.parent / ".mine.unfinished")
+    kept = contents(old_run.parent / ".mine.new")
     assert kept["policy_static.pt"] == "new" and sorted(p.name for p in old_run.parent.iterdir())[1:] == ["mine"]
     # the same command goes on there, and with another checkpoint it begins anew
     assert run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began again")) == old_run

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import zipfile
 
 import pytest
@@ -16,6 +17,34 @@ def archive(path, **entries):
         for name, data in entries.items():
             z.writestr(f"archive/{name.replace('_DOT_', '.')}", data)
     return path
+
+
+PULLED = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("p.tar.gz", b"\x1f\x8b\x08", "an archive; unpack it"),
+        ("p.tar", b"p/config.json".ljust(257, b"\0") + b"ustar", "an archive; unpack it"),
+        ("best_model.pth", PULLED, "a Git LFS pointer, not the file that it stands for; git lfs pull"),
+        ("model.safetensors", PULLED, "a Git LFS pointer"),
+        ("meta/info.json", b"{}", "a part of a LeRobotDataset; give its folder, {there}"),
+        ("000002/training_state/training_step.json", b"{}", "give its folder, {there}/000002"),
+        ("000002/training_state/optimizer_state.safetensors", b"", "give its folder, {there}/000002"),
+    ],
+)
+def test_parts_archives_and_pointers_are_refused_with_what_to_do(tmp_path, name, data, says):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    wrong = path if path.suffix != ".json" else path.parent  # a folder that is a part, too
+    with pytest.raises(KindError, match=re.escape(says.format(there=os.path.relpath(tmp_path)))):
+        check_kind(wrong, "checkpoint")
+
+
+def test_a_zipped_folder_is_an_archive(tmp_path):
+    assert kinds_of(archive(tmp_path / "p.zip", config_DOT_json=b"{}")) == ("packed",)
 
 
 @pytest.mark.parametrize(

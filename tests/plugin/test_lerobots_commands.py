@@ -318,7 +318,7 @@ def take_over(process, board):
 
 
 @pytest.mark.emulated
-@pytest.mark.slow
+@(pytest.mark.slow if ENDING else pytest.mark.release)  # .ci/run sees it with the newest LeRobot
 @needs.simavr
 @needs.real_time
 def test_from_recordings_to_pins(eyes, plugin, tmp_path, monkeypatch):

@@ -24,16 +24,30 @@ def test_while_one_is_in_it_another_is_refused(tmp_path):
         assert not list(folder.iterdir())
 
 
-def test_what_a_killed_process_left_goes_first(tmp_path):
+@pytest.mark.parametrize(
+    ("asked", "then", "kept"),
+    [
+        ("", "", set()),
+        ("", "this", set()),
+        ("this", "other", set()),
+        ("this", "", set()),
+        ("this", "this", {"sub", "link"}),
+    ],
+)
+def test_what_a_killed_process_left_goes_first_unless_the_same_is_asked(tmp_path, asked, then, kept):
     lines = (
         "import os, sys, pathlib", "from rover_lib.workshop.swap_folder import lock_folder",
-        "with lock_folder(pathlib.Path(sys.argv[1])) as folder:", "    (folder / 'sub').mkdir()",
-        "    (folder / 'link').symlink_to('/nowhere')", "    os.kill(os.getpid(), 9)",
+        "with lock_folder(pathlib.Path(sys.argv[1]), sys.argv[2]) as folder:", "    (folder / 'sub').mkdir()",
+        "    (folder / 'link').symlink_to('/nowhere')", "    (folder / '.half').touch()",
+        "    os.kill(os.getpid(), 9)",
     )  # fmt: skip
-    assert subprocess.run([sys.executable, "-c", "\n".join(lines), tmp_path / ".mine.new"]).returncode == -9
-    assert {p.name for p in (tmp_path / ".mine.new").iterdir()} == {"sub", "link"}
-    with lock_folder(tmp_path / ".mine.new") as folder:
-        assert not list(folder.iterdir())
+    new = tmp_path / ".mine.new"
+    assert subprocess.run([sys.executable, "-c", "\n".join(lines), new, asked]).returncode == -9
+    assert {p.name for p in new.iterdir()} >= {"sub", "link", ".half"}
+    with lock_folder(new, then) as folder:
+        assert {p.name for p in folder.iterdir()} - {alone.ASKED} == kept
+        (folder / alone.ASKED).unlink(missing_ok=True)
+    assert not new.exists()
 
 
 def test_a_folder_that_vanishes_while_it_is_taken_is_made_again(tmp_path, monkeypatch):

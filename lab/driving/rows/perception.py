@@ -4,12 +4,15 @@ There are no rows about time stamps that are old or stand still, as a FIFO has n
 tests those.
 """
 
+import signal
+
 import numpy as np
 
 from lab.driving.bench import DrivingBench
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
 from lab.driving.policy import PLAIN, SIZE, pictures
 from lab.driving.row import FaultKind
+from rover_lib.onboard.car.csi import PROGRAM
 from rover_lib.onboard.car.picture import decode_jpeg
 
 FAULTS = FaultKind("perception")
@@ -119,6 +122,25 @@ def _frames_late(bench: DrivingBench) -> None:
 )
 def _no_frames(bench: DrivingBench) -> None:
     bench.feed.pause()
+
+
+@FAULTS.add("rpicam-vid killed", STOPPED, "rpicam-vid has ended", "SIGKILL to its stand-in", start="csi")
+def _kill_rpicam(bench: DrivingBench) -> None:
+    bench.signal_children(signal.SIGKILL, PROGRAM)
+
+
+@FAULTS.add(
+    "rpicam-vid stopped",
+    CONTINUES,
+    "no new frame came",
+    "SIGSTOP to its stand-in",
+    start="csi",
+    watch_s=2.0,
+    until_limit=True,
+    exit_code=3,
+)
+def _stop_rpicam(bench: DrivingBench) -> None:
+    bench.signal_children(signal.SIGSTOP, PROGRAM)
 
 
 @FAULTS.add("camera black at the start", REFUSED, "picture is black", "black pictures since before the drive")

@@ -11,11 +11,6 @@ from lab.driving.row import FaultKind
 FAULTS = FaultKind("policy")
 
 
-def _signal_children(bench: DrivingBench, number: int) -> None:
-    for pid in bench.drive.children():
-        os.kill(pid, number)
-
-
 def _by_picture(name: str, instruction: int, message: str) -> None:
     FAULTS.add(name, STOPPED, message, "the picture tells the policy to")(lambda bench: bench.show(instruction))
 
@@ -27,7 +22,7 @@ _by_picture("inference returns out of range", OUT_OF_RANGE, "outside the range")
 
 @FAULTS.add("inference process killed", STOPPED, r"process ended \(SIGKILL\)", "SIGKILL to the child of rover drive")
 def _kill_inference(bench: DrivingBench) -> None:
-    _signal_children(bench, signal.SIGKILL)
+    bench.signal_children(signal.SIGKILL)
 
 
 @FAULTS.add(
@@ -107,4 +102,4 @@ def _hide(bench: DrivingBench) -> None:
     exit_code=3,
 )
 def _stop_inference(bench: DrivingBench) -> None:
-    _signal_children(bench, signal.SIGSTOP)
+    bench.signal_children(signal.SIGSTOP)

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rover_lib.onboard.car.csi import is_csi, read_csi
 from rover_lib.onboard.car.picture import (
     LEAST,
     MOST_BYTES,
@@ -32,7 +33,7 @@ from rover_lib.onboard.car.picture import (
     decode_jpeg,
     is_squeezed,
 )
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CameraError
 
 FIRST_FRAME_S = 5.0
 CLOSE_S = 1.0
@@ -53,10 +54,6 @@ NEAR_S = 600.0  # a time stamp further from a clock than this does not come from
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
 Reader = Generator[Read, None, None]
-
-
-class CameraError(RoverError):
-    """A camera that is missing, has stopped, or delivers something different than before."""
 
 
 def size_like(width: int, height: int) -> tuple[int, int]:
@@ -99,10 +96,10 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg file with one JPEG
-    after another. size: (width, height) to request from a V4L2 camera. rate_hz: frames per second to request, and the
-    rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time stamps may come
-    from. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg
+    file with one JPEG after another. size: (width, height) to request from a camera. rate_hz: frames per second to
+    request, and the rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time
+    stamps may come from. Any thread may call any method.
     """
 
     def __init__(
@@ -333,6 +330,8 @@ def path_of(source: str, dev: Path = Path("/dev")) -> Path:
 def _reader(
     source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event, begun: threading.Event
 ) -> Reader:
+    if is_csi(source):
+        return read_csi(source, size, rate_hz, closing)
     path = path_of(source)
     source = str(path)
     try:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,12 +185,15 @@ def benchmark(
         _set_threads(policies, threads_before)
 
     artifacts = {name: run.metrics_of(name, cores) for name in names}
-    for name, metrics in artifacts.items():
-        path = getattr(policies[name], "path", None)
-        if options.memory_alone and path:
-            metrics["peak_memory_mb"] = peak_memory_alone_mb(path, threads=threads)
-        if reference is not None:
+    if reference is not None:
+        for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
+    if options.memory_alone:
+        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
+        with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
+            peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
+            for name, peak_mb in zip(paths, peaks, strict=True):
+                artifacts[name]["peak_memory_mb"] = peak_mb
     top = {k: v for k, v in artifacts[main].items() if not k.startswith("speedup")}
     process_mb = host.process_peak_memory_mb()
     if top["peak_memory_mb"] is None:

@@ -26,6 +26,7 @@ import numpy as np
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import car_file, this_car
+from rover_lib.onboard.car.csi import is_csi
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.ports import find_port, list_ports
 from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
@@ -270,7 +271,7 @@ def camera_rate(
 
     seen: (width, height) of the pictures that the policy was made with. The camera is asked for that shape.
     """
-    if not Path(source).exists():
+    if not is_csi(str(source)) and not Path(source).exists():
         yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
         return
     users = users_of(source, proc_root)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rover_lib.onboard.artifact.manifest import Artifact, car_of, seen_size
-from rover_lib.onboard.car.camera import Camera, CameraError, check_shape, path_of, size_like
+from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime, default_log, default_view
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
@@ -40,7 +40,7 @@ from rover_lib.onboard.drive.watch import (
     find_unfinished_drive,
     stop_on_signals,
 )
-from rover_lib.onboard.errors import DriveFault, ParamsError, TakenOver, sentence_of
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, TakenOver, sentence_of
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import About, Controls, read_car_of, read_controls
 from rover_lib.onboard.recording.recorder import Recorder, room_for

@@ -44,7 +44,7 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
-from rover_lib.onboard.stage import open_plain, plain
+from rover_lib.onboard.stage import FILE_BYTES, plain, read_plain
 
 SCHEMA = 1
 QUEUE_TICKS = 2048  # the disk may stall for a minute at 30 Hz; 1 MB
@@ -137,9 +137,9 @@ def log_limits() -> tuple[int, int]:
     """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError if they are not a size and a count."""
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
-    if not is_number(max_mb) or not is_whole(keep):
+    if not is_number(max_mb) or max_mb * 1e6 > FILE_BYTES or not is_whole(keep):
         raise ParamsError(
-            "flight_log: max_mb must be a number, and keep a whole one",
+            f"flight_log: max_mb must be a number up to {FILE_BYTES / 1e6:g}, and keep a whole one",
             found=f"{max_mb!r} and {keep!r}",
             remedy="see params.yml",
         )
@@ -558,7 +558,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     """
     path = Path(path)
     try:
-        files = [_bytes_of(p) for p in (*_older(path), path)]
+        files = [read_plain(p) for p in (*_older(path), path)]
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
     drives: list[_Drive] = []
@@ -609,11 +609,6 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         drives=len(drives),
         damaged=damaged,
     )
-
-
-def _bytes_of(path: Path) -> bytes:
-    with open_plain(path, LogError(f"{path}: cannot be read (not a file)", remedy=NAME_A_LOG)) as file:
-        return file.read()
 
 
 def _row(line: bytes) -> list[Any] | Event | dict[str, Any] | None:

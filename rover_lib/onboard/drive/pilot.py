@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from rover_lib.onboard.car.camera import Camera, CameraError, Frame
+from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
-from rover_lib.onboard.errors import DriveFault, PolicyError
+from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError
 from rover_lib.onboard.recording.episode import Controls
 
 FIRST_PLAN_S = 10.0

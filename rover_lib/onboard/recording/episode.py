@@ -19,7 +19,6 @@ import json
 import math
 import os
 import shutil
-import stat
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import FileIO
@@ -33,7 +32,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.stage import atomic_path, plain
+from rover_lib.onboard.stage import atomic_path, open_plain, plain, read_plain
 
 CHANNELS = ("steering", "throttle")
 CONTROL_FIELDS = (
@@ -377,7 +376,7 @@ def find_killed(folder: Path) -> list[Path]:
 
 def _is_recording(part: Path) -> bool:
     try:
-        with (part / "control.rows").open("rb") as file:
+        with open_plain(part / "control.rows", OSError("not a plain file")) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
@@ -599,9 +598,7 @@ def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
 def _data_of(path: Path) -> bytes:
     """Return a data file's bytes; none if it cannot be read, or is larger than any drive's."""
     try:
-        status = path.stat()
-        # a pipe is not opened: that would wait for ever
-        return path.read_bytes() if stat.S_ISREG(status.st_mode) and status.st_size <= DATA_BYTES else b""
+        return read_plain(path, DATA_BYTES)
     except OSError:
         return b""
 

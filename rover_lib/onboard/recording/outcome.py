@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import HIT, MISSED
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.recording.episode import DATA_BYTES, HIT, MISSED
+from rover_lib.onboard.stage import atomic_path, read_plain
 
 NONE = "none"
 CHOICES = (HIT, MISSED, NONE)
@@ -46,7 +46,7 @@ def relabel(episode: Path, outcome: str) -> tuple[Path, bytes]:
             raise EpisodeError(
                 f"{episode}: no episode with an {DATA} of its own", found=found, remedy="give each episode's folder"
             )
-        data = path.read_bytes()
+        data = read_plain(path, DATA_BYTES)
     except OSError as error:
         raise EpisodeError(f"{path}: cannot be read ({error.strerror})", remedy="use sudo on a rover") from None
     try:

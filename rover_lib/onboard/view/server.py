@@ -40,6 +40,7 @@ from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import is_listened_at, throttled_means
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import read_plain
 from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
 PORT = 8470
@@ -115,7 +116,7 @@ def new_token() -> str:
 def read_token(path: Path) -> str:
     """Read the token from a file. Raises ViewError if it cannot be read, or if the token could be guessed."""
     try:
-        token = path.read_text(errors="replace").strip()
+        token = read_plain(path, 4096).decode(errors="replace").strip()
     except OSError as error:
         raise ViewError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
     if not re.fullmatch(r"[A-Za-z0-9_-]{16,128}", token, re.ASCII):

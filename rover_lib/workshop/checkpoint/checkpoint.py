@@ -180,7 +180,8 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     whose config and weights do not agree, and for a policy that this project cannot run.
     """
     path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
-    if path.is_dir():
+    refuse_part(path)
+    if path.is_dir() or path.name == "last":
         path, notes = lerobot_folder(path) or (path, [])
         found = _check_policy(path, read_lerobot(path))
         return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
@@ -190,7 +191,6 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
             f"{path}: {what}",
             remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
-    refuse_part(path)
     return _check_policy(path, read_trainer(path))
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.contents import (
@@ -63,6 +64,11 @@ def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
         if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
             return path / inner, []
+    for last in (path, path / "last", path / "checkpoints" / "last"):
+        if last.name == "last" and last.is_file():  # Git writes a link as its text where it makes no links
+            named = last.parent / last.read_bytes()[:64].decode("utf-8", "replace").strip() / PRETRAINED
+            if (named / "config.json").is_file():
+                return named, []
     for steps in (path / "checkpoints", path):
         if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
             if len(found) == 1:
@@ -123,8 +129,10 @@ def read_lerobot(folder: Path) -> Contents:
 
     Raises CheckpointError for missing or damaged files, and for policies that this project cannot run.
     """
-    raw = _act_config(folder)
     file = folder / "model.safetensors"
+    if not any((folder / name).exists() for name in ("config.json", ADAPTER)):
+        _refuse_shards(folder, file)
+    raw = _act_config(folder)
     _refuse_shards(folder, file)
     state = _read_safetensors(file)
     buffers = {}
@@ -415,6 +423,7 @@ def _of_folder(path: Path, most_bytes: int | None = None) -> Path:
         raise CheckpointError(
             f"{path}: {reason}", remedy="a LeRobot folder has config.json and model.safetensors"
         ) from None
+    refuse_pointer(path, CheckpointError)
     if not stat.S_ISREG(status.st_mode):
         raise CheckpointError(f"{path}: not a file", remedy="a LeRobot folder has config.json and model.safetensors")
     if most_bytes is not None and status.st_size > most_bytes:

@@ -27,6 +27,8 @@ from rover_lib.onboard.car.servo_link import REASONS
 from rover_lib.onboard.drive.flight_log import Flight, LogError, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.recording.episode import DATA_BYTES
+from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 if TYPE_CHECKING:
@@ -196,8 +198,8 @@ def pictures_of(episode: Path) -> list[tuple[float, Path]]:
     list of pictures cannot be read.
     """
     try:
-        with (episode / "frame_data.csv").open(newline="") as file:
-            rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(file)]
+        lines = read_plain(episode / "frame_data.csv", DATA_BYTES).decode("utf-8-sig").splitlines()
+        rows = [(float(row["timestamp"]), episode / row["image_path"]) for row in csv.DictReader(lines)]
         inside = episode.resolve()
         rows = [(t_s, path) for t_s, path in rows if math.isfinite(t_s) and path.resolve().is_relative_to(inside)]
     except (OSError, KeyError, ValueError, TypeError, csv.Error) as error:  # ValueError: also a zero byte in a path

@@ -37,6 +37,9 @@ FLOAT_PER_INT8 = 4.2
 # frames of other episodes they were up to twice as bad: docs/quantization.md has how often, and by how much.
 CLIPPING_PAYS = 0.8  # times the error of what clips less: what clips more must be better than that
 USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are odd frames
+# Odd frames far above the others in every tensor lose their plans by narrow ranges, and widening one tensor mends
+# nothing while the next one clips. So all but the odd frames are also tried with every range wider, by these shares:
+ALL_WIDER = (0.9, 0.8, 0.7, 0.5, 0.3)
 # Then, where odd frames reach furthest beyond the usual ones, ranges are widened, as long as that pays:
 WIDENED = 8  # this many tensors,
 WIDER = 0.2  # by this share of the way at a time,
@@ -119,21 +122,26 @@ class Chooser:
         """Quantize with each observer; the one whose worse action has the least error wins.
 
         One that clips must win clearly: its error is at most CLIPPING_PAYS of that of min-max, or of `frames` with more
-        frames left, or these are taken. `frames` is tried only where there are odd frames, and its ranges are then
-        widened tensor by tensor.
+        frames left, or these are taken. `frames` is tried only where there are odd frames, also with all ranges wider,
+        and the ranges are then widened tensor by tensor.
         """
         tried = {name: replace(scheme, observer=name) for name in observers if name != "frames"}
         if "frames" in observers and (share := odd_share(self.calibration.frames)):
             all_but_odd = round(100 * (1 - share), 1)
             for pct in sorted({*USUAL_PCT, all_but_odd}, reverse=True):
                 tried[f"frames {pct:g}"] = replace(scheme, observer="frames", usual_pct=pct)
+            for by in ALL_WIDER:
+                wider = tuple((place, by) for place in self.calibration.frames)
+                name = f"frames {all_but_odd:g}, all {by:g} wider"
+                tried[name] = replace(scheme, observer="frames", usual_pct=all_but_odd, wider=wider)
         table = {}
         for name in progress(tried, desc="observers"):
             module = quantize(self.checkpoint, tried[name], self.calibration).module
             table[name] = self.error(module)
         best = min(table, key=lambda name: _worst(table[name]))
-        for name in tried:  # of these, what clips less comes first
-            if name.startswith(("minmax", "frames")) and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
+        for name, how in tried.items():  # of these, what clips less comes first
+            rival = how.observer in ("minmax", "frames") and not how.wider
+            if rival and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
                 best = name
                 break
         if tried[best].observer != "frames":
@@ -155,14 +163,15 @@ class Chooser:
             return mae_pct(errors, self.weights, self.action_range), _worst(of_usual)
 
         error, usually = judge(scheme)
-        best, wider = scheme, dict[str, float]()
+        best, wider, touched = scheme, dict(scheme.wider), set[str]()
         for step in progress(range(WIDENING_ROUNDS), desc="widening"):
-            for place in (p for p in places if not step or p in wider):
-                more = wider | {place: wider.get(place, 0.0) + WIDER}
+            for place in (p for p in places if not step or p in touched):
+                more = wider | {place: min(wider.get(place, 0.0) + WIDER, 1.0)}
                 trial = replace(scheme, wider=tuple(more.items()))
                 found, of_usual = judge(trial)
                 if _worst(found) <= WIDENING_PAYS * _worst(error) and of_usual <= WIDENING_COSTS * usually:
                     best, wider, error = trial, more, found
+                    touched.add(place)
         return best, error
 
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:

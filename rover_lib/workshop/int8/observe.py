@@ -30,7 +30,7 @@ from torch.ao.quantization.quantize_fx import prepare_fx
 from torch.fx import GraphModule, Node
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.stage import atomic_path, open_plain
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
@@ -167,7 +167,8 @@ class Calibration:
     def load(cls, path: Path | str) -> "Calibration":
         """Read what save() wrote. Raises QuantizeError if the file is missing or not a calibration."""
         try:
-            return cls(**torch.load(path, weights_only=True))
+            with open_plain(path, OSError("not a plain file")) as file:
+                return cls(**torch.load(file, weights_only=True))
         except FileNotFoundError:
             raise QuantizeError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
         except Exception as e:  # torch wraps what it meets in many types

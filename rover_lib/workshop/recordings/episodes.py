@@ -162,6 +162,11 @@ def load_recordings(
             remedy="give the folder with episode_* in it, a LeRobotDataset's (with meta/info.json), or "
             "user/name@revision of the Hub",
         ) from None
+    if {"data", "meta"} <= {p.name for p in folders}:
+        raise EpisodeError(f"{root}: a LeRobotDataset without meta/info.json", remedy=lerobot_dataset.COPY_AGAIN)
+    if several := [p.name for p in folders if lerobot_dataset.is_dataset(p)]:
+        remedy = "give one of them, or merge them (lerobot-edit-dataset)"
+        raise EpisodeError(f"{root}: holds LeRobotDatasets, each by itself", found=quote_all(several), remedy=remedy)
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:

@@ -6,6 +6,7 @@ The meaning of its numbers is read from the names of its features, or given by t
 never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
+import codecs
 import io
 import json
 import math
@@ -21,6 +22,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
+from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
 from rover_lib.workshop import hub
@@ -238,7 +240,13 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     try:
         if path.stat().st_size > INFO_BYTES:
             raise _broken(f"{path}: is larger than any that LeRobot writes")
-        info = json.loads(path.read_bytes())
+        refuse_pointer(path, EpisodeError)
+        content = path.read_bytes()
+        info = json.loads(content)
+        if content.startswith(codecs.BOM_UTF8):
+            raise EpisodeError(
+                f"{path}: begins with a byte order mark, which LeRobot does not read", remedy="save it without one"
+            )
     except (OSError, ValueError, RecursionError) as e:
         raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
@@ -373,14 +381,18 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
                 f"{root}: its {key} is not LeRobot's", found=quote(info[key]), remedy=f"write {template}"
             )
     size = 0
-    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+    files = [path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")]
+    for path in files:
+        if path.is_dir() and path.is_symlink():  # rglob does not look into it, but LeRobot does
+            raise EpisodeError(f"{path}: a link to a folder", remedy="put the files themselves there")
         if not path.is_dir() and not path.is_file():
             raise _broken(f"{path}: not a plain file")
         size += path.stat().st_size
+        refuse_pointer(path, EpisodeError)
         if path.suffix == ".json" and path.stat().st_size > INFO_BYTES:
             raise _broken(f"{path}: is larger than any that LeRobot writes")
     rows = values = unpacked = 0
-    for path in root.rglob("*.parquet"):
+    for path in (path for path in files if path.suffix == ".parquet"):
         with _said_of(path, "LeRobot cannot read it"):
             footer = parquet.read_metadata(path)
         groups = [footer.row_group(i) for i in range(footer.num_row_groups)]

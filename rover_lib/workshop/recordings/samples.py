@@ -21,6 +21,7 @@ from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.recordings.formula import Formula
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
+LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
@@ -173,9 +174,6 @@ def car_of(samples: Iterable[Any]) -> Car:
         names = ", ".join(sorted(car.name for car in cars))
         raise EpisodeError("the recordings are of several cars", found=names, remedy="use those of one car")
     return cars[0] if cars else Car()
-
-
-LEAST_RATED = 10  # frames; fewer do not show a rate
 
 
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:

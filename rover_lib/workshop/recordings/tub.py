@@ -27,6 +27,7 @@ from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
+from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture
 from rover_lib.workshop.recordings.samples import (
@@ -42,7 +43,6 @@ from rover_lib.workshop.untrusted import quote
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
-THROTTLES = "as-recorded", "negated"
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class _Record:
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
     """Read all usable records as samples of two actions.
 
-    throttle: one of THROTTLES, None if the tub does not need it. Raises EpisodeError for what is no tub or has no
-    record, and for one in which three in four throttles are negative, if `throttle` is None.
+    throttle: "as-recorded" or "negated", None if the tub does not need it. Raises EpisodeError for what is no tub or
+    has no record, and for one in which three in four throttles are negative, if `throttle` is None.
     """
     tub = Path(tub)
     faults = Faults(tub)
@@ -149,7 +149,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
     manifest = tub / "manifest.json"
     if manifest.is_file():
         paths, deleted = _read_manifest(manifest)
-        for name in paths:
+        for name in dict.fromkeys(paths):  # each once
             if Path(name).name != name or not (tub / name).is_file():
                 faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
                 continue
@@ -168,10 +168,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
 
 def _read(path: Path) -> str:
     try:
-        size = path.stat().st_size
-        if not path.is_file() or size > DATA_BYTES:
-            raise EpisodeError(f"{path}: no file of a tub", found=f"{size / 1e6:.0f} MB", remedy="copy it again")
-        return path.read_text(errors="replace")
+        return read_plain(path, DATA_BYTES).decode(errors="replace")
     except OSError as e:
         raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy="copy it again") from None
 

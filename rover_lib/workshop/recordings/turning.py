@@ -4,13 +4,15 @@ print(measure_sides(recordings).words())
 """
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from rover_lib.onboard.recording.turning import LEAST_SPREAD, SURE, Turning, measure_turning
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, pick_evenly
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,10 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
     if layout.action_names != ACTION_NAMES or len(layout.cameras) > 1:
         return Sides(())
     episodes = pick_evenly(recordings.episodes, most or len(recordings.episodes))
-    bar = progress(episodes, desc="which way it steers", total=len(episodes))
-    return Sides(
-        tuple(measure_turning(e.id, np.array([s.chunk[0, 0] for s in e.samples], float), e.samples) for e in bar)
-    )
+
+    def measure(e: Episode) -> Turning:
+        return measure_turning(e.id, np.array([s.chunk[0, 0] for s in e.samples], float), e.samples)
+
+    # OpenCV releases the interpreter's lock, so threads help.
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        return Sides(tuple(progress(pool.map(measure, episodes), desc="which way it steers", total=len(episodes))))

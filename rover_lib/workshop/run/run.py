@@ -30,7 +30,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import LOG_VARIABLE, TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.swap_folder import build_beside
+from rover_lib.workshop.swap_folder import ASKED, build_beside
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -94,8 +94,8 @@ def run(
     full-size policy. Only a run's own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of
     other hosts stay.
 
-    Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C, the old run
-    is as it was, and what the finished notebooks made waits in .<name>.unfinished: the same command continues there.
+    Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C or kill -9,
+    the old run is as it was, and what the finished notebooks made waits in .<name>.new: the same command continues.
     Raises ArtifactError at once for root, who may not load artifacts, and RoverError while another process makes a run
     of that name.
     """
@@ -108,47 +108,28 @@ def run(
     if unknown := sorted(set(overrides) - known):
         raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
-    with build_beside(folder, files_of_a_run) as new:
+    texts = [s.read_text() for s in sources]
+    asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
+    with build_beside(folder, files_of_a_run, asked) as new:
         given["run_dir"] = str(new)
+        finished = {path.name for path in new.glob("*.ipynb")}
         others = _benchmarks_of_other_hosts(folder)
         for path in others:  # notebook 05 shows them
             shutil.copy2(path, new)
         executed = sources if timed else sources[:-1]
-        asked = json.dumps([given, params(), [s.read_text() for s in sources]], sort_keys=True, default=str)
-        with _kept_if_unfinished(folder, new, asked) as finished:
+        try:
             for source in progress(executed, desc="notebooks", total=len(executed)):
                 if source.name not in finished:
                     known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
                     _execute(source, new, known_to_it, progress is not silent)
+        except BaseException:
+            if {path.name for path in new.glob("*.ipynb")} <= finished:  # the next one shall not fail there again
+                (new / ASKED).unlink(missing_ok=True)
+            raise
         for path in others:
             (new / path.name).unlink()
         _say_final_paths(new, folder)
     return folder
-
-
-@contextmanager
-def _kept_if_unfinished(folder: Path, new: Path, asked: str) -> Iterator[set[str]]:
-    """Keep what `new` holds, in .<name>.unfinished, if the block ends early after it finished a notebook.
-
-    Yield the notebooks that an earlier run has left finished there and in `new` now, if it was asked the same. What a
-    continued run cannot go on from is not kept a second time. asked: all that decides what the notebooks make.
-    """
-    kept, note = folder.with_name(f".{folder.name}.unfinished"), "asked.json"
-    if kept.is_dir() and (kept / note).is_file() and (kept / note).read_text() == asked:
-        for path in kept.iterdir():
-            path.rename(new / path.name)
-        (new / note).unlink()
-    shutil.rmtree(kept, ignore_errors=True)
-    finished = {path.name for path in new.glob("*.ipynb")}
-    try:
-        yield finished
-    except BaseException:
-        if {path.name for path in new.glob("*.ipynb")} > finished:
-            kept.mkdir()
-            for path in new.iterdir():
-                path.rename(kept / path.name)
-            (kept / note).write_text(asked)
-        raise
 
 
 def files_of_a_run(folder: Path) -> list[Path]:
@@ -170,7 +151,8 @@ def _say_final_paths(new: Path, folder: Path) -> None:
         text = path.read_text()
         final = text.replace(str(new), str(folder)).replace(json.dumps(str(new))[1:-1], json.dumps(str(folder))[1:-1])
         if final != text:
-            path.write_text(final)
+            with atomic_path(path) as temporary:  # if we are killed here, the next one takes them for finished
+                temporary.write_text(final)
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:

@@ -4,13 +4,17 @@ A 50 Hz servo and speed controller with reverse, and a car with the pulses of th
 """
 
 import random
+import struct
+import zlib
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import needs
 import pytest
-from uno import LINE_IN, RESET, Uno, pulses, widths
+from uno import EEPROM_BYTES, LINE_IN, RESET, Uno, pulses, widths
 
+from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
@@ -18,6 +22,7 @@ CARS = Path(__file__).parents[3] / "lab" / "cars"
 pytestmark = [pytest.mark.emulated, needs.simavr]
 
 CRAWLER, INVERTED = (read_car(CARS / f"{name}.yml") for name in ("crawler", "inverted"))
+ALL_CARS = [Car(), *(read_car(path) for path in sorted(CARS.glob("*.yml")))]
 EDGE_US = 0.3
 STEP_US = ARDUINO_STEP_US + EDGE_US
 ANSWER_MS = 25
@@ -170,7 +175,7 @@ def test_the_human_takes_over_within_50_ms(armed, steering_us, throttle_us):
     assert latest <= TAKEOVER_MS * 1000
 
 
-@pytest.mark.parametrize("how", ["hang", "reset"])
+@pytest.mark.parametrize("how", ["hang", "reset", "power"])
 def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
     """A watchdog's reset in a drive gave the default's neutral, 120 us at 984 Hz, to a speed controller of 50 Hz."""
     armed.drive(*fastest(armed), 297)
@@ -193,6 +198,115 @@ def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
     assert (armed.status.state, armed.status.result) == ("M", "c")
     told(armed, armed.car)
     arm(armed)
+
+
+# ---- the car that it keeps
+
+
+@pytest.mark.parametrize("car", ALL_CARS, ids=lambda car: car.name)
+@pytest.mark.parametrize("signals", [False, True])
+def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car, signals):
+    """Before, they had 120 us at 984 Hz until a host opened the port, whatever the car was."""
+    board = Uno(eeprom=b"")
+    board.run_ms(60)
+    told(board, car)
+    board.run_ms(150)
+    assert board.eeprom[2:] == eeprom_of(car)[2:]
+    start_us = board.now_us
+    board.power()
+    if signals:
+        board.transmitter(car.numbers[2], car.numbers[6] + 100, steering_period_us=car.numbers[0],
+                          throttle_period_us=car.numbers[4])  # fmt: skip
+    board.run_ms(300)
+    for pin, at in (("steering", 0), ("throttle", 4)):
+        seen = pulses(board.events, pin, start_us)
+        print(f"{pin} after {seen[0].at_us - start_us:.0f} us")
+        assert seen[0].at_us - start_us < 1500
+        assert all(abs(e.pulse_us - car.numbers[at + 2]) <= ARDUINO_STEP_US / 2 + EDGE_US for e in seen)
+        assert all(abs(e.period_us - car.numbers[at]) <= EDGE_US for e in seen[1:])
+    assert any(line.endswith(f" p {car.id}") for line in board.lines)
+    assert board.status.state == "M"
+    board.close()
+
+
+def spoilt():
+    """EEPROMs without a car: erased, of another version, cut short, and with one bit of each byte flipped."""
+    good = eeprom_of(CRAWLER)
+    yield from (b"", eeprom_of(CRAWLER, version=0), good[: EEPROM_BYTES - 1], eeprom_of(Car())[:10] + good[10:])
+    for at in range(2, EEPROM_BYTES):
+        yield good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :]
+    beyond = (*CRAWLER.numbers[:8], 119)  # the cap
+    yield eeprom_of(SimpleNamespace(numbers=beyond, id=zlib.crc32(struct.pack("<9H", *beyond))))
+
+
+def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
+    for eeprom in spoilt():
+        board = Uno(eeprom=eeprom)
+        board.transmitter(1700, 500)
+        events = board.run_ms(90)
+        assert not [e for e in events if e.channel >= 0], eeprom.hex()
+        assert (board.status.missing, board.status.steering_us, board.status.throttle_us) == ("s", 0, 0)
+        board.close()
+    for car in ALL_CARS:
+        board = Uno(eeprom=b"")
+        board.run_ms(random.Random(car.id).uniform(40, 70))
+        board.command("A")
+        board.run_ms(ANSWER_MS)
+        assert board.status.result == "c"
+        told(board, car)
+        board.run_ms(100)
+        board.neutral = SimpleNamespace(steering=car.numbers[2], throttle=car.numbers[6])
+        is_neutral(board, board.events)
+        board.car = car
+        sticks(board, board.neutral.steering + 4, board.neutral.throttle + 4)
+        arm(board)
+        board.close()
+
+
+def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
+    """Cut in each of its writes: before it, after it, and with anything in the cell that was being written."""
+    board = Uno(eeprom=eeprom_of(INVERTED))
+    board.run_ms(60)
+    board.command("C", *CRAWLER.numbers)
+    images = [board.eeprom]
+    while images[-1][2:] != eeprom_of(CRAWLER)[2:]:
+        board.run_ms(0.5)
+        if board.eeprom != images[-1]:
+            images.append(board.eeprom)
+        assert board.now_us < 250_000
+    board.run_ms(100)
+    assert board.eeprom == images[-1]  # and no more
+    board.close()
+    rng = random.Random(6)
+    between = {
+        before[:at] + bytes([byte]) + before[at + 1 :]
+        for before, after in pairwise(images)
+        for at in range(EEPROM_BYTES)
+        if before[at] != after[at]
+        for byte in (0xFF, 0, before[at] & after[at], rng.randrange(256))
+    }
+    found = []
+    for eeprom in sorted({*images, *between}):
+        board = Uno(eeprom=eeprom)
+        pins = {(e.channel, round(e.pulse_us)) for e in board.run_ms(25)}
+        found.append(int(board.lines[0].split()[-1]))
+        car = next((car for car in (INVERTED, CRAWLER) if car.id == found[-1]), None)
+        assert pins == ({(0, car.numbers[2]), (1, car.numbers[6])} if car else set()), eeprom.hex()
+        board.close()
+    assert len(images) > 12
+    assert found.count(zlib.crc32(bytes(18))) > len(images)
+
+
+def test_what_it_keeps_already_is_not_written_again():
+    board = Uno(eeprom=eeprom_of(CRAWLER))
+    board.run_ms(60)
+    for _ in range(5):
+        told(board, CRAWLER)
+    board._c.uno_eeprom(board._uno, b"\0" * EEPROM_BYTES, EEPROM_BYTES, True)  # what was written would show
+    for _ in range(5):
+        told(board, CRAWLER)
+    assert not any(board.eeprom)
+    board.close()
 
 
 def test_told_of_another_car_no_pulse_is_cut():

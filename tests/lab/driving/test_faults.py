@@ -465,15 +465,16 @@ def test_a_fault_that_is_none():
 @pytest.mark.emulated
 @needs.simavr
 def test_some_faults_on_the_pins(tmp_path):
-    """One of each kind, and one whose line only the next start writes; `make faults` has all."""
+    """One of each kind, one whose line only the next start writes, and a recording's replay; `make faults` has all."""
     names = [
         "camera frozen",
         "SIGKILL",
         "human takes over by steering",
         "old line replayed",
     ]
-    outcome = faults.run_faults(names)
+    outcome = faults.run_faults([*names, "bytes"])
     assert outcome.wrong == []
+    assert outcome.bytes["steering_steps"] == outcome.bytes["throttle_steps"] == outcome.bytes["steps"]
     content = outcome.write(tmp_path / "faults.json")
     rows = {row["fault"]: row for row in content["metrics"]["faults"]}
     assert set(rows) == set(names)

@@ -1,6 +1,7 @@
 """What `make pi-fast` makes of what it sees, without a Pi."""
 
 import os
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from balloon_world.simulated_arduino import PinEvent
 from lab import debian
 from lab.params import lab_params
-from lab.pi import container, container_run, emulation, playbooks
+from lab.pi import container, container_run, cut_plays, emulation, playbooks
 from lab.pi.container_run import run_container
 from lab.pi.emulation import EmulationError
 from lab.pi.pulses import moving, stopped
@@ -56,6 +57,37 @@ def test_the_inventory_is_the_users_with_other_rovers(tmp_path):
     assert "rover1.local" not in text and "rover2 ansible_host=127.0.0.1 ansible_port=2222" in text
     assert "ansible_pipelining=true" in text and "ControlPersist" in text  # as in inventory.ini
     assert text.index("rover1 ") < text.index("rover2 ") < text.index("[rovers:vars]")
+
+
+LOSES = """
+- hosts: rovers
+  connection: local
+  gather_facts: false
+  tasks:
+    - {name: First, ansible.builtin.command: {cmd: touch FOLDER/first, creates: FOLDER/first}, notify: Tell systemd}
+    - {name: Nothing, ansible.builtin.meta: noop}
+    - {name: Second, ansible.builtin.command: {cmd: touch FOLDER/second, creates: FOLDER/second}}
+  handlers:
+    - {name: Tell systemd, ansible.builtin.command: touch FOLDER/told}
+"""
+
+
+@pytest.mark.slow  # four plays
+def test_what_a_killed_play_leaves_undone_is_found(tmp_path, monkeypatch):
+    (tmp_path / "ansible").mkdir()
+    (tmp_path / "ansible" / "provision.yml").write_text(LOSES.replace("FOLDER", str(tmp_path)))
+    (tmp_path / "handlers.yml").write_text("[{name: Tell systemd}, {name: Restart the view}]")
+    monkeypatch.setattr(playbooks, "REPOSITORY", tmp_path)
+    monkeypatch.setattr(cut_plays, "HANDLERS", tmp_path / "handlers.yml")
+
+    def show(*command):
+        return SimpleNamespace(stdout=f"NeedDaemonReload={'yes' if 'view' in command[-1] else 'no'}\n")
+
+    pi = SimpleNamespace(name="rover1", port=22, key=tmp_path / "key", inside=show)
+    found = cut_plays.provision_in_pieces(pi, folder=tmp_path, variables={"ansible_python_interpreter": sys.executable})
+    assert found["cut_after"] == ["First", "Second"] and found["changed_after"] == 0
+    assert found["undone"] == ["Tell systemd"] and not (tmp_path / "told").exists()
+    assert found["stale"] == ["rover-view.service"]
 
 
 # Another machine's settings

@@ -155,11 +155,13 @@ def test_limits_that_make_no_sense(path, bad):
         FlightLog(path, header=HEADER, **LIMITS | bad)
 
 
-@pytest.mark.parametrize("bad", ["max_mb: '8'", "max_mb: .nan", "max_mb: null", "keep: 1.5", "keep: many"])
+@pytest.mark.parametrize(
+    "bad", ["max_mb: '8'", "max_mb: .nan", "max_mb: null", "max_mb: 51", "keep: 1.5", "keep: many"]
+)
 def test_limits_of_params_that_make_no_sense(tmp_path, monkeypatch, bad):
     (tmp_path / "params.yml").write_text(f"flight_log: {{{bad}}}")
     monkeypatch.setenv("ROVER_PARAMS", str(tmp_path / "params.yml"))
-    with pytest.raises(ParamsError, match="flight_log: max_mb must be a number, and keep a whole one, found"):
+    with pytest.raises(ParamsError, match="flight_log: max_mb must be a number up to 50, and keep a whole one, found"):
         telemetry.log_limits()
 
 

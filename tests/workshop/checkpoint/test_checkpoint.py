@@ -20,6 +20,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.kinds import kinds_of
 from rover_lib.workshop.act import ACT, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
@@ -736,12 +737,17 @@ def test_what_lerobot_train_leaves_is_found(tmp_path):
     other = shutil.copytree(folder.parent, folder.parents[1] / "000010")
     with pytest.raises(CheckpointError, match="does not say which of its checkpoints is the last, found 000010, 00002"):
         load_checkpoint(tmp_path / "out")
+    assert kinds_of(tmp_path / "out/checkpoints") == ("pretrained",)
     shutil.rmtree(other)
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
     assert lerobot_folder(tmp_path) is None
     for place in ("out", "out/checkpoints", "out/checkpoints/last", "out/checkpoints/last/pretrained_model"):
         assert lerobot_folder(tmp_path / place)[0].resolve() == folder
-    checkpoint = load_checkpoint(tmp_path / "out")
+    (tmp_path / "out/checkpoints/last").unlink()
+    (tmp_path / "out/checkpoints/last").write_text("000020")  # what Git makes of a link on Windows
+    for place in ("out", "out/checkpoints", "out/checkpoints/last"):
+        assert lerobot_folder(tmp_path / place)[0] == folder
+    checkpoint = load_checkpoint(tmp_path / "out/checkpoints/last")
     check_is(checkpoint, policy, inner, outer)
     words = checkpoint.report["normalisation"]
     assert words["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"

@@ -125,6 +125,12 @@ def test_what_does_not_drive_is_not_deployed(demo):
     assert "train longer" in judged["failed"][0]["remedies"][0] and "record" in " ".join(commands(judged))
 
 
+def test_fewer_worlds_ask_for_fewer_balloons(demo):
+    for mode in (demo["compare"]["fp32"], *demo["compare"]["modes"].values()):
+        mode["hits"] = mode["trials"] = 4
+    assert judge(demo)["deploy"] == "static"
+
+
 def test_what_ignores_its_camera_is_not_deployed(demo):
     looking = demo["compare"]["looking"]
     looking |= {f"{a}_by_picture_pct": 0.0 for a in ("steering", "throttle")}

@@ -102,10 +102,20 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
         (features(), "has no meta/tasks.parquet"),
+        ("version https://git-lfs.github.com/spec/v1", "info.json: a Git LFS pointer, not the file that it stands for"),
+        ("\ufeff" + json.dumps(info()), "begins with a byte order mark"),
     ],
 )
 def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
     assert says in refused(written(tmp_path, content))
+
+
+def test_a_folder_of_datasets_and_one_without_its_info_are_told_apart(tmp_path):
+    written(tmp_path / "a", info())
+    assert "holds LeRobotDatasets, each by itself, found a; give one" in refused(tmp_path)
+    (tmp_path / "a/meta/info.json").unlink()
+    (tmp_path / "a/data").mkdir()
+    assert "a LeRobotDataset without meta/info.json" in refused(tmp_path / "a")
 
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):

@@ -1,0 +1,110 @@
+"""A Raspberry Pi camera through rpicam-vid: against a stand-in that speaks its protocol, as no machine here has one."""
+
+import os
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from lab.driving import rpicam_vid
+from rover_lib.onboard.car.camera import Camera, CameraError
+from rover_lib.onboard.car.csi import command, is_csi
+from rover_lib.onboard.care.doctor import camera_rate
+
+SIZE = 96, 64
+
+
+@pytest.fixture
+def csi(tmp_path, monkeypatch):
+    """Make a stand-in on PATH, with a fault; return Camera for it."""
+    rng = np.random.default_rng(0)
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for i in range(40):
+        picture = rng.integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8)
+        cv2.imwrite(str(pictures / f"{i:03}.jpg"), picture)
+    monkeypatch.setenv("PATH", str(rpicam_vid.install(tmp_path)), prepend=os.pathsep)
+    monkeypatch.setenv("ROVER_CSI", str(pictures))
+
+    def make(fault="", source="csi", rate_hz=60.0):
+        monkeypatch.setenv("ROVER_CSI_FAULT", fault)
+        return Camera(source, size=SIZE, rate_hz=rate_hz)
+
+    return make
+
+
+def test_the_command_has_size_rate_and_exposure():
+    line = command("csi:1,shutter=8000,gain=4.5", (640, 360), 30.0, "/proc/self/fd/7")
+    assert line[:3] == ["rpicam-vid", "--nopreview", "--flush"]
+    for option in ("camera=1", "width=640", "height=360", "framerate=30.0", "shutter=8000", "gain=4.5",
+                   "exposure=sport", "metadata=/proc/self/fd/7", "timeout=0"):  # fmt: skip
+        assert f"--{option}" in line
+    assert "--camera=0" in command("csi,exposure=normal", (640, 360), 30.0, "7")
+    for wrong in ("csi:x", "csi:", "csi,output=/etc/passwd", "csi,gain=1 --output=x", "csi,gain"):
+        assert is_csi(wrong)
+        with pytest.raises(CameraError, match="not understood"):
+            command(wrong, (640, 360), 30.0, "7")
+    assert not is_csi("csi.mjpeg")
+
+
+def test_frames_have_the_sensors_time_stamps(csi):
+    with csi() as camera:
+        frame = camera.latest()
+        for _ in range(20):
+            before, frame = frame, camera.wait(frame.number, 1.0)
+            age_s = time.monotonic() - frame.captured_s
+            assert 0.004 < age_s < 0.3
+            assert before.captured_s < frame.captured_s
+        assert camera.time_stamps == "monotonic"
+        assert frame.image.shape == (SIZE[1], SIZE[0], 3)
+        assert frame.jpeg is not None
+        assert frame.repeats == 0
+
+
+def test_a_picture_that_was_cut_costs_two_frames_and_shifts_no_time_stamp(csi):
+    with csi("cut 12") as camera:
+        frame = camera.latest()
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            frame = camera.wait(frame.number, 1.0)
+            age_s = time.monotonic() - frame.captured_s
+        assert 0.004 < age_s < 0.015 + 1 / 60  # one picture's time more, if it were another's
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [
+        ("gone", "rpicam-vid has ended: ERROR: .* no cameras available"),
+        ("silent", "no frame within"),
+        ("die 20", "rpicam-vid has ended: ERROR: .* failed to write"),
+    ],
+)
+def test_what_goes_wrong_is_said(csi, monkeypatch, fault, sentence):
+    monkeypatch.setattr("rover_lib.onboard.car.camera.FIRST_FRAME_S", 2.0)
+    with pytest.raises(CameraError, match=sentence), csi(fault) as camera:
+        while True:
+            camera.wait(camera.frames, 0.1)
+
+
+def test_a_frozen_one_gives_no_new_frame_and_is_ended(csi):
+    with csi("freeze 20") as camera:
+        end = time.monotonic() + 3
+        while camera.wait(camera.frames, 0.3) and time.monotonic() < end:
+            pass
+        assert time.monotonic() < end
+        start = time.monotonic()
+    assert time.monotonic() - start < 1.0
+
+
+def test_without_the_program_it_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(CameraError, match="rpicam-apps"):
+        Camera("csi").open()
+
+
+def test_the_doctor_measures_it(csi):
+    csi()
+    (check,) = camera_rate("csi", rate_hz=30.0)
+    assert check.verdict == "ok", str(check)
+    assert f"csi: {SIZE[0]}x{SIZE[1]}, monotonic time stamps" in check.found
