@@ -111,10 +111,10 @@ def _policies(root: Path) -> list[Row]:
 
 def _fit(root: Path) -> list[Row]:
     """What the fit found that one of each takes."""
-    instruction, near, far = _metrics(root / "results" / "clock", "clock")["fit"]["ns"]
+    cycle, near, far = _metrics(root / "results" / "clock", "clock")["fit"]["ns"]
     return [
         ("what", "ns", "that is"),
-        ("an instruction", f"{instruction:.3f}", f"{1 / (GHZ * instruction):.1f} a cycle at {GHZ} GHz"),
+        ("a cycle", f"{cycle:.3f}", f"{GHZ * cycle:.2f} of the clock's at {GHZ} GHz"),
         ("a near line", f"{near:.2f}", f"{GHZ * near:.1f} cycles, most of its way hidden"),
         ("a far line", f"{far:.2f}", f"{LINE / far:.1f} GB/s"),
     ]
@@ -127,6 +127,13 @@ def _judged(root: Path) -> list[Row]:
     for n, found in metrics["judged"].items():
         shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
         rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
+    for n, found in metrics["judged_without_odd"].items():
+        if n != "1":
+            shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
+            rows.append((f"{n} threads, Arm's GoogLeNet not judged", *shown, ""))
+    for n in ("1", "4"):
+        shown = (f"{metrics['choice'][n][key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
+        rows.append((f"{n} thread{'s' * (n != '1')}, form chosen without it too", *shown, ""))
     for runtime, found in metrics["other_runtime"].items():
         shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
         rows.append((f"4 threads, all of {runtime} left out", *shown, ""))

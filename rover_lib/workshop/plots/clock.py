@@ -38,7 +38,7 @@ def _published(ax: Axes, networks: Sequence[Mapping[str, Any]], measured: Sequen
             label = f"{runtime}, {threads} thread{'s' * (threads > 1)}"
             ax.errorbar(x, y, yerr=far, fmt="o", ms=4, color=colour, mfc=face, elinewidth=0.6, label=label)
     for row in networks:
-        if row["not_judged"]:
+        if row["odd"]:
             ax.annotate(row["name"], (row["published_ms"], row["predicted_ms"]), (4, -9), textcoords="offset points",
                         fontsize=8)  # fmt: skip
     if measured:

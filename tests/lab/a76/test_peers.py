@@ -95,18 +95,6 @@ def counted(chunks: np.ndarray, steady: int = 3_000_000) -> Counted:
         60.0,
         chunks,
         versions,
-        (5, 4, steady),
-        2_000_000,
-        1_000_000,
-        2e6,
-        500,
-        200,
-        {"k": (steady, 2, 1)},
-        70.0,
-        80.0,
-        60.0,
-        chunks,
-        versions,
     )
 
 
