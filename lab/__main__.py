@@ -228,6 +228,22 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
     ctx.exit(1 if survived else 0)
 
 
+@main.command("real")
+@click.argument("recordings", type=FILE)
+@click.argument("output", type=FILE, required=False)
+@click.option("--run", "runs", type=FILE, multiple=True, help="What `rover run` left on them; several times for more.")
+@click.option("--elsewhere", type=FILE, help="A run of the same policy on other recordings, for its calibration.")
+def real(recordings: Path, output: Path | None, runs: tuple[Path, ...], elsewhere: Path | None) -> None:
+    """Tell what real RECORDINGS say, how far off guesses are on each, and policies on them. Nobody drives."""
+    from lab.repository.real_recordings import tell_of
+    from rover_lib.onboard.stage import write_stage
+
+    metrics = tell_of(recordings, {path.name: path for path in runs}, elsewhere, terminal_bar())
+    if output:
+        write_stage(output, "recordings", params={}, metrics=metrics, inputs={})
+    show(metrics, False)
+
+
 @main.command("kills")
 @click.argument("output", type=FILE, required=False)
 @click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")

@@ -8,7 +8,8 @@ A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end 
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,37 @@ def _networks(root: Path) -> list[Row]:
         any_row = next(iter(by_threads.values()))
         table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
     return table
+
+
+def _guessed(root: Path) -> list[Row]:
+    """How far off guesses are on real recordings, each held out once."""
+    found = _metrics(root / "results" / "real", "recordings")["guesses_pct"]
+    rows: list[Row] = [("held out", *next(iter(found.values())))]
+    for episode, guesses in found.items():
+        when = datetime.strptime(episode, "episode_%Y%m%d_%H%M%S")
+        rows.append((f"{when:%-d %B, %H:%M}", *(_slashed(errors.values()) for errors in guesses.values())))
+    return rows
+
+
+def _real(root: Path) -> list[Row]:
+    """What policies plan on real recordings."""
+    header = "policy", "FP32 off the driver, %", "best guess, %", "static INT8, %", "of the plans' spread, %", "verdict"
+    rows: list[Row] = [header]
+    for name, found in _metrics(root / "results" / "real", "recordings")["policies"].items():
+        guesses = found["against_driver"]["guesses"].values()
+        best = min((g["errors_pct"] for g in guesses), key=lambda errors: sum(errors.values()))
+        lines = {name: found["static"]}
+        if "calibrated_elsewhere" in found:
+            lines[f"{name}, calibrated in the balloon world"] = found["calibrated_elsewhere"]
+        for said, errors in lines.items():
+            of = (_slashed(v for k, v in errors.items() if k.endswith(end)) for end in ("_mae_pct", "_of_spread_pct"))
+            off = _slashed(found["against_driver"]["errors_pct"].values(), ".1f")
+            rows.append((said, off, _slashed(best.values(), ".1f"), *of, found["verdict"].partition(";")[0]))
+    return rows
+
+
+def _slashed(values: Iterable[float], how: str = ".2f") -> str:
+    return " / ".join(format(value, how) for value in values)
 
 
 def span_of(row: Mapping[str, Any]) -> str:
@@ -316,6 +348,8 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "policies": _policies,
     "fit": _fit,
     "judged": _judged,
+    "guessed": _guessed,
+    "real": _real,
     "networks": _networks,
 }
 

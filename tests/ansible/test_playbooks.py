@@ -256,7 +256,7 @@ def left_in_var_tmp(before: set[Path]) -> set[Path]:
     return left
 
 
-@pytest.mark.parametrize("name", ["episode_20251007_144013", ".episode_20251007_144013.part"])
+@pytest.mark.parametrize("name", ["--remove-files", ".episode_20251007_144013.part"])  # one like an option of tar
 def test_an_episode_comes_home_and_leaves_the_rover(tmp_path, name):
     picture = tmp_path / "rover" / name / "frames" / "frame_000001.jpg"
     picture.parent.mkdir(parents=True)

@@ -78,7 +78,7 @@ def save_artifact(
     buffer = io.BytesIO()
     torch.jit.save(module, buffer, _extra_files=_extra(path, manifest, parity))
     with atomic_path(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
+        temporary.write_bytes(buffer.getvalue())
     return content_hash(path)
 
 

@@ -47,7 +47,7 @@ INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
-NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index")
+NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
 SUCCESS = "next.success"
 REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
@@ -169,6 +169,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     number = columns["episode_index"]
     _check_episodes(root, dataset, number)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
+    _check_order(root, columns, starts, info)
     exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
     _check_numbers(root, columns, layout, exported.car)
     episodes = []
@@ -179,7 +180,15 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
-    return Recordings(root, tuple(episodes), faults, source, layout)
+    return Recordings(root, tuple(episodes), (*faults, *_odd_stats(dataset.meta.stats)), source, layout)
+
+
+def _odd_stats(stats: Mapping[str, Mapping[str, Any]] | None) -> Iterator[Fault]:
+    """Yield a fault if LeRobot's trainer could not normalise by the dataset's statistics. We compute our own."""
+    odd = [f"{k}'s {name}" for k, s in (stats or {}).items() for name, v in s.items() if not np.isfinite(v).all()]
+    if odd:
+        note = f"{quote(odd[0])} is not a number: lerobot-train would learn nothing from it; write them again"
+        yield Fault("meta/stats.json", "odd_statistics", len(odd), note)
 
 
 @dataclass(frozen=True)
@@ -584,6 +593,26 @@ def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -
             f"{root}: meta/episodes and the frames in data do not belong together",
             f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
         )
+
+
+def _check_order(root: Path, columns: Mapping[str, np.ndarray], starts: np.ndarray, info: Mapping[str, Any]) -> None:
+    """Raise EpisodeError for rows that are not the frames in their order, each once, with times from each start on.
+
+    LeRobot believes meta/info.json's number of frames, and finds a picture in a video by its time.
+    """
+    count = len(columns["index"])
+    if (said := info.get("total_frames", count)) != count:
+        raise _broken(f"{root}: {INFO} says {quote(said)} frames", f"{count} in data")
+    row = np.arange(count)
+    within = row - np.repeat(starts, np.diff([*starts, count]))
+    for key, right in (("index", row), ("frame_index", within)):
+        if len(wrong := np.flatnonzero(columns[key] != right)):
+            raise _broken(
+                f"{root}: its frames are not in their order", f"{key} {columns[key][wrong[0]]} in row {wrong[0]}"
+            )
+    begin_s = columns["timestamp"][starts]
+    if len(late := np.flatnonzero(~(np.abs(begin_s) * info["fps"] < 1))):
+        raise _broken(f"{root}: the times of an episode begin at 0", f"{begin_s[late[0]]:g} s in episode {late[0]}")
 
 
 def _episode(

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import os
 import re
 import shlex
@@ -309,6 +310,12 @@ def column(name, value=...):
     return change
 
 
+def later(path):
+    """All times two seconds late, so that LeRobot would show other pictures."""
+    table = pandas.read_parquet(path)
+    table.assign(timestamp=(table["timestamp"] + 2).astype("float32")).to_parquet(path)
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -353,6 +360,11 @@ def cut(path):
           for change, says in MERGED),
         ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4",
          lambda p: shutil.copy(p, p.with_name("file-009.mp4")), "file-009.mp4, which no episode uses"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=32)), "says 32 frames, found 33"),
+        *(("video", "data/chunk-000/file-000.parquet", column(*change), says)
+          for change, says in ((("index", 5), "not in their order, found index 5 in row 0"),
+                               (("frame_index", 1), "not in their order, found frame_index 1 in row 0"))),
+        ("video", "data/chunk-000/file-000.parquet", later, "times of an episode begin at 0, found 2 s in episode 0"),
         ("image", "meta/tasks.parquet",
          lambda p: pandas.DataFrame({"number": [0]}, index=["drive"]).to_parquet(p), "cannot be read (KeyError"),
     ],
@@ -367,6 +379,18 @@ def edit(path, change):
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
+
+
+@pytest.mark.slow
+def test_statistics_that_are_no_numbers_are_a_fault(copied):
+    root = copied()
+    edit(root / "meta/stats.json", lambda c: c["action"].update(std=[math.nan, 1.0]))
+    (fault,) = load_recordings(root, CHUNK).faults
+    assert (fault.kind, fault.count, fault.handled) == (
+        "odd_statistics",
+        1,
+        "left out",
+    ) and "action's std" in fault.note
 
 
 @pytest.mark.slow
