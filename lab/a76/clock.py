@@ -113,11 +113,18 @@ def leave_out(rows: Sequence[Row]) -> tuple[list[dict[str, float]], list[float]]
     off = off_left_out(rows)
     predicted = []
     for row, own in zip(rows, off, strict=True):
-        others = [
-            o for o, r in zip(off, rows, strict=True) if r.threads == row.threads and r.architecture != row.architecture
-        ]
-        predicted.append(told(spread(row.ms * math.exp(-own), reach(others))))
+        others = [(r, o) for r, o in zip(rows, off, strict=True) if r.architecture != row.architecture]
+        predicted.append(told(spread(row.ms * math.exp(-own), reach_of(others, row.threads))))
     return predicted, off
+
+
+def reach_of(rows: Iterable[tuple[Row, float]], threads: int) -> float:
+    """Return the `reach` of architectures, each by its row that is furthest off: what is new is an architecture."""
+    worst: dict[str, float] = {}
+    for row, off in rows:
+        if row.threads == threads:
+            worst[row.architecture] = max(worst.get(row.architecture, 0.0), abs(off))
+    return reach(worst.values())
 
 
 def off_left_out(rows: Sequence[Row]) -> list[float]:
@@ -191,7 +198,7 @@ def tell_time(
         Row(n, threads, Work.of(counts[n.key]), counts[n.key]["instructions_g"]) for n in networks for threads in n.ms
     ]
     predicted, off = leave_out(judged)
-    wide = {n: reach(o for o, row in zip(off, judged, strict=True) if row.threads == n) for n in (1, THREADS)}
+    wide = {n: reach_of(zip(judged, off, strict=True), n) for n in (1, THREADS)}
     fitted: dict[str, Any] = {"ns": fit(judged), "off": {str(n): reached for n, reached in wide.items()}}
     fitted["gmac_per_s"] = _gmac_per_s(counts, fitted)
     rows = []
