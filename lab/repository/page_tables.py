@@ -146,13 +146,10 @@ def _networks(root: Path) -> list[Row]:
     rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
     for row in _metrics(root / "results" / "clock", "clock")["networks"]:
         rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
-    table: list[Row] = [
-        ("network", "10^9 instructions", *(f"{n}: published, computed" for n in ("1 thread", "4 threads")))
-    ]
+    table: list[Row] = [("network", *(f"{n}: published / computed" for n in ("1 thread", "4 threads")))]
     for (runtime, name, precision), by_threads in rows.items():
         cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
-        any_row = next(iter(by_threads.values()))
-        table.append((f"{runtime} {name}, {precision}", f"{any_row['instructions_g']:.3g}", *cells))
+        table.append((f"{runtime} {name}, {precision}", *cells))
     return table
 
 
@@ -195,7 +192,7 @@ def span_of(row: Mapping[str, Any]) -> str:
 def _against(row: Mapping[str, Any]) -> str:
     computed, low, high = (row[f"predicted{end}_ms"] for end in ("", "_low", "_high"))
     outside = "" if low <= row["published_ms"] <= high else " *"
-    return f"{row['published_ms']:.3g}, {computed:.3g}{outside}"
+    return f"{row['published_ms']:.3g}/{computed:.3g}{outside}"
 
 
 def shape_of(row: Mapping[str, Any]) -> str:

@@ -30,8 +30,8 @@ def tell_of(
 ) -> dict[str, Any]:
     """Return the metrics of recordings.json.
 
-    runs: name -> folder that `rover run` left on these recordings. elsewhere: a run on other recordings: if it is of the
-    same checkpoint, its static artifact, calibrated there, is held against FP32 here too. Raises what reading them raises.
+    runs: name -> folder that `rover run` left on these recordings. elsewhere: a run on other recordings: if it is of
+    the same checkpoint, its static artifact, calibrated there, is held against FP32 here too. Raises as reading does.
     """
     read = load_recordings(recordings, progress=progress)
     sides = measure_sides(read, progress)

@@ -193,7 +193,7 @@ def test_rows_are_drawn(made):
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
     work, hits, errors = plots.frontier(rows, "fast").axes
     assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
-    assert {"12 to 20", "53.8 to 90"} <= {text.get_text() for text in work.texts}
+    assert {"10.3 to 20", "46.2 to 90"} <= {text.get_text() for text in work.texts}
     assert "2, 20 ms late" in {text.get_text() for text in hits.texts} and len(errors.patches) == 8
     rows = [row | {"computed_ms": None, "recorded_throttle_pct": None} for row in rows]
     work, _, errors = plots.frontier(rows, "fast").axes
