@@ -22,7 +22,7 @@ def draw_clock(clock: Mapping[str, Any], measured: Sequence[Mapping[str, Any]] =
     _ours(axes[0, 1], clock["policies"], measured)
     held = clock["judged"]
     shares = " and ".join(f"{held[n]['held_pct']:.0f} % on {n}" for n in held)
-    claim(fig, f"Of published times that the fit did not know, the interval holds {shares} threads.")
+    claim(fig, f"Of times unknown to the fit, the interval holds {shares} threads.")
     return fig
 
 
