@@ -98,7 +98,7 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 
 @main.command()
 @click.argument("output", type=FILE, required=False)
-@click.option("--ncnn", "graphs", type=FILE, help="benchmark/models of a copy of ncnn, for what is not counted yet.")
+@click.option("--ncnn", "graphs", type=FILE, help="benchmark in a copy of ncnn (tag 20240102), to count.")
 @click.pass_context
 def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
     """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
