@@ -59,7 +59,7 @@ def test_random_and_mutated_lines(count):
         ("other car", "vehicle.c", "|| command->car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
         ("raised cap", "vehicle.c", "car.cap_us < vehicle->lowered_us ?", "true ?"),
         ("old signal", "vehicle.c", "received->period_us)) continue;", "received->period_us) || true) continue;"),
-        ("old rest", "vehicle.c", "        vehicle->throttle_free = false;\n        vehicle->throttle_off_rest = 0xFF;", ""),
+        ("old rest", "vehicle.c", "throttle_free = false;\n        vehicle->throttle_off_rest = 0xFF;", "car = car;"),
         ("slew", "vehicle.c", "ms * STEERING_SLEW_US_PER_MS", "ms * 5"),
         ("credit", "vehicle.c", "        vehicle->slewed_ms = now_ms;", "        vehicle->slewed_ms = now_ms - 1;"),
         ("rest", "vehicle.c", "vehicle->throttle_free ?", "true ?"),

@@ -123,9 +123,9 @@ def test_sequence_numbers_go_on_where_the_arduino_was():
     [
         (
             "<H 5 5.0.0 something else",
-            r"firmware 5\.0\.0 \(protocol 5\), this program knows 4\.1\.0 \(protocol 4\); .*make",
+            r"firmware 5\.0\.0 \(protocol 5\), this program knows 4\.1\.1 \(protocol 4\); .*make",
         ),
-        ("<H 2 2.1.0 7 0 e", r"firmware 2\.1\.0 \(protocol 2\), this program knows 4\.1\.0"),
+        ("<H 2 2.1.0 7 0 e", r"firmware 2\.1\.0 \(protocol 2\), this program knows 4\.1\.1"),
         ("<H 1 1.0.0 7 0 e", r"firmware 1\.0\.0 \(protocol 1\)"),
     ],
 )
