@@ -41,7 +41,7 @@ STATISTICS: dict[str, tuple[str, float] | None] = {  # which norm gets them, how
     "layer2": ("layer2.1.bn1", 60.0),
     "layer3": ("layer3.1.bn1", 60.0),
     "layer4": ("layer4.1.bn1", 60.0),
-    "layer4, 400 times": ("layer4.1.bn1", 400.0),  # the next convolution mixes that down to some 80 times
+    "layer4, most": ("layer4.1.bn1", 400.0),  # batch norm's eps allows no more
 }
 CHANGED = 0.5  # of the norm's channels
 NEAR_SHARE = 0.07  # of the frames show the nearest balloons
@@ -118,7 +118,7 @@ def _weights(recordings: Recordings, folder: Path, seed: int, name: str, recipe:
     return bring_statistics(weights, SIZE, pick_evenly(parts.calibration, FITTED), *where)
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def bring_statistics(
     weights: dict[str, Tensor], config: ActConfig, samples: Sequence[Sample], norm: str, times: float
 ) -> dict[str, Tensor]:
@@ -149,7 +149,7 @@ def bring_statistics(
     given.weight[chosen] = 1.0
     given.bias[chosen] = 0.0
     given.running_mean[chosen] = usually[chosen]
-    given.running_var[chosen] = (beyond[chosen].clamp(min=1e-3) / (times * usual_answer)) ** 2
+    given.running_var[chosen] = (beyond[chosen].clamp(min=1e-3) / (times * usual_answer)) ** 2  # + batch norm's eps
     weights |= {f"backbone.{name}": tensor for name, tensor in net.state_dict().items()}
 
     after, _ = _features(net, norm, pictures)

@@ -11,7 +11,7 @@ from rover_lib.workshop.int8.observe import calibrate
 
 def test_brought_statistics_make_a_few_frames_odd_by_the_products_own_measure(tiny):
     """And in float the policy plans nearly as before, so that INT8 alone is judged."""
-    norm, times = STATISTICS["layer4, 400 times"]
+    norm, times = STATISTICS["layer4, most"]
     samples = memory_samples(60)
     changed = bring_statistics(tiny.weights, tiny.config, samples, norm, times)
     assert not torch.equal(changed[f"backbone.{norm}.running_mean"], tiny.weights[f"backbone.{norm}.running_mean"])
