@@ -34,12 +34,12 @@ from rover_learn.training import Resumable
 from rover_lib.onboard.errors import CheckpointError, DistillError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.stage import atomic_path, write_stage
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.files import find_written
+from rover_lib.workshop.checkpoint.files import find_written, save_torch
 from rover_lib.workshop.checkpoint.lerobot import read_origin
 from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.frames import describe_odd
@@ -309,8 +309,7 @@ def _start(work: _Work, lessons: Lessons, backbone: dict[str, Tensor], folder: P
             pictures = work.progress(lessons.each_once(), desc="channels", total=lessons.blocks)
             shown = (torch.from_numpy(block) for block in pictures)
             weights, thinner = without_channels(weights, work.config, work.share, shown, work.rng("channels"))
-        with atomic_path(path) as temporary:
-            torch.save((weights, {"backbone": thinner, "feed_forward": narrowed}), temporary)
+        save_torch(path, (weights, {"backbone": thinner, "feed_forward": narrowed}))
     return _read_phase(path)
 
 
@@ -331,8 +330,7 @@ def _train_rounded(work: _Work, room: _Room, policy: BatchedPolicy, saved: Resum
     path, student = folder / "ranges.pt", _checkpoint(work, policy.weights())  # as it was before this phase
     if not path.exists():
         calibration, scheme = _calibrate(work, student)
-        with atomic_path(path) as temporary:
-            torch.save({"calibration": calibration.__dict__, "scheme": asdict(scheme)}, temporary)
+        save_torch(path, {"calibration": calibration.__dict__, "scheme": asdict(scheme)})
     kept = _read_phase(path)
     rounded = RoundedPolicy(student, Scheme.of(kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)

@@ -59,7 +59,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import trainer_config
+from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -230,8 +230,7 @@ def train(
                 rate_hz=int(rate_hz),
             )
             # It must be on the disk before the unfinished training, which it comes from, is removed.
-            with atomic_path(folder / "best_model.pth") as temporary:
-                torch.save({**trained, "config": config}, temporary)
+            save_torch(folder / "best_model.pth", {**trained, "config": config})
 
     made = cache_folder("checkpoint", key, make) / "best_model.pth"
     shutil.rmtree(unfinished, ignore_errors=True)

@@ -25,8 +25,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
-from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY
+from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY, save_torch
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -250,8 +249,7 @@ class Resumable:
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             "losses": self.losses[phase],
         }
-        with atomic_path(file) as temporary:
-            torch.save(content, temporary)
+        save_torch(file, content)
 
     def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Stateful]) -> int:
         try:

@@ -11,7 +11,7 @@ extern "C" {
 #endif
 
 #define PROTOCOL_VERSION 4
-#define FIRMWARE_VERSION "4.1.0" /* rover_lib/onboard/car/servo_link.py drives no other: change both */
+#define FIRMWARE_VERSION "4.1.1" /* rover_lib/onboard/car/servo_link.py drives no other: change both */
 
 enum {
     HOST_LINE_MAX = 87,     /* the longest line of the host without its end: two numbers of ten digits, nine of five */

@@ -62,8 +62,16 @@ def write_trainer(
         "best_val_loss": np.float64(best_val_loss),
         "config": trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
     }
-    with atomic_path(path) as temporary:
-        torch.save(content, temporary)
+    save_torch(path, content)
+
+
+def save_torch(path: Path, content: Any) -> None:
+    """Write what torch.load reads, atomically. The same content gives the same bytes: torch would name it by the file.
+
+    Raises as `atomic_path`.
+    """
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        torch.save(content, file)
 
 
 def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], origin: dict[str, Any]) -> None:

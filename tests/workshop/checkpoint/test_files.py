@@ -11,10 +11,9 @@ from policies import TINY, lerobot_policy, memory_samples
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_lerobot, write_trainer
+from rover_lib.workshop.checkpoint.files import save_torch, write_lerobot, write_trainer
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.recordings.samples import Layout
 
@@ -79,7 +78,7 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     [
         lambda path, config, weights: write_trainer(path, config, weights, 0.1, {}, **SETTINGS),
         lambda path, config, weights: write_lerobot(path, config, weights, {}),
-        lambda path, config, weights: _saved(path, weights),
+        lambda path, config, weights: save_torch(path, weights),
     ],
     ids=["trainer's", "LeRobot's", "a training's"],
 )
@@ -93,9 +92,11 @@ def test_a_full_disk_is_one_sentence(config, weights, tmp_path, write):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def _saved(path, weights):
-    with atomic_path(path) as temporary:
-        torch.save(weights, temporary)
+def test_the_same_weights_give_the_same_bytes(config, weights, tmp_path):
+    """So that policies made of them have one hash, however often they are made."""
+    for name in ("one", "other"):
+        write_trainer(tmp_path / name / "best_model.pth", config, weights, 0.1, {}, **SETTINGS)
+    assert len({path.read_bytes() for path in tmp_path.glob("*/best_model.pth")}) == 1
 
 
 def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):
