@@ -303,7 +303,6 @@ class _Training:
     rng: np.random.Generator
     saved: Resumable
     plan: dict[str, tuple[int, int]]
-    seen: Callable[[Tensor], Tensor]
 
     @property
     def device(self) -> torch.device:
@@ -346,12 +345,8 @@ def _train(
     seed: int,
     device: torch.device,
     saved: Resumable,
-    seen: Callable[[Tensor], Tensor] = lambda pictures: pictures,
 ) -> dict[str, Any]:
-    """Train, and return everything in the checkpoint except its config.
-
-    seen: what the frozen statistics are measured on, of normalised pictures (n, 3, h, w).
-    """
+    """Train, and return everything in the checkpoint except its config."""
     p = params()["calibration"]
     parts = split(recordings, p["held_out_share"], p["seed"])
     rng = np.random.default_rng([seed, 77])
@@ -375,7 +370,7 @@ def _train(
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
         judges_first = frames_of(judging, *first.image_sizes[0])
-        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan, seen)
+        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan)
         _train_backbone(training)
         _train_transformer(training)
         last = "all together"
@@ -473,7 +468,7 @@ def _train_backbone(training: _Training) -> None:
         norm.momentum = None  # torch then takes the plain mean over the batches below
     for _ in training.steps("statistics", backbone=live):
         with torch.no_grad():
-            live(training.seen(training.batch(recipe.batch)[IMAGE]))
+            live(training.batch(recipe.batch)[IMAGE])
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 
