@@ -49,6 +49,9 @@ def test_troubleshooting_names_lines_that_the_doctor_has():
 
 SOURCES = [*ROOT.glob("rover_*/**/*.py"), *ROOT.glob("balloon_world/**/*.py"), *ROOT.glob("lerobot_robot_rover/*.py")]
 PLAYS = [*ROOT.glob("ansible/**/*.yml"), *ROOT.glob("ansible/**/*.j2")]
+# An option alone: code of a page, or behind a word of a remedy.
+ALONE = re.compile(r"^`(--[a-z][a-z-]+)(?=[ `=])|(?:: |or |and |by |with |\()(--[a-z][a-z-]+)(?=[ ,;)]|$)")
+OF_OTHERS = {"--ask-become-pass", "--check", "--limit", "--resume"}  # Ansible's, and lerobot-train's
 PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python -m [\w.]+"
 
 
@@ -109,6 +112,11 @@ def refusal_of(group: click.Command, words: list[str], whole: bool) -> str:
     return ""
 
 
+def options_of(group: click.Command) -> set[str]:
+    own = {option for p in group.params for option in (*p.opts, *p.secondary_opts)}
+    return own.union(*map(options_of, group.commands.values())) if isinstance(group, click.Group) else own
+
+
 def test_every_command_that_we_print_is_one():
     """All that the pages, the program and its playbooks show, by the parser of the program that is named."""
     from lab.__main__ import main as lab
@@ -117,6 +125,7 @@ def test_every_command_that_we_print_is_one():
     targets = set(" ".join(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.M)).split())
     variables = set(re.findall(r"^ +(\w+):", (ROOT / "ansible/roles/rover/meta/argument_specs.yml").read_text(), re.M))
     variables |= {"ansible_user", "ansible_host", "ansible_ssh_private_key_file"}
+    options = options_of(rover) | options_of(lab) | OF_OTHERS
     seen: Counter[str] = Counter()
     refused = []
     for path in [
@@ -125,6 +134,10 @@ def test_every_command_that_we_print_is_one():
         *PLAYS,
         *ROOT.glob("notebooks/*.ipynb"),
     ]:
+        for match in (match for text in texts(path) if path not in PLAYS for match in ALONE.finditer(text)):
+            seen["option"] += 1
+            if (option := match[1] or match[2]) not in options:
+                refused.append(f"{path.relative_to(ROOT)}: no command has {option}")
         for program, words, whole in commands(path):
             wrong = ""
             if program == "python -m lab":
@@ -145,6 +158,7 @@ def test_every_command_that_we_print_is_one():
                 refused.append(f"{path.relative_to(ROOT)}: {program} {' '.join(words)}: {wrong}")
     assert not refused, "\n".join(refused)
     assert seen["rover"] > 300 and seen["make"] > 40 and seen["ansible"] > 15 and seen["lab"] > 10, seen
+    assert seen["option"] > 40, seen
 
 
 def test_readme_says_how_to_begin_in_few_words():
