@@ -174,13 +174,13 @@ def _artifact_of(run_dir: Path) -> Path:
 
 
 def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cache lines."""
+    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cycles."""
     if not (path := run_dir / "arm.json").is_file():
         return None
     arm = read_stage(path, "arm")
     same = arm["inputs"].get(ARTIFACT) == sha256_of(run_dir / ARTIFACT)
     row = arm["metrics"]["artifacts"].get(Path(ARTIFACT).stem, {})
-    return row if same and "far_lines_g" in row else None
+    return row if same and "cycles_g" in row else None
 
 
 def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:

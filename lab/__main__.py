@@ -98,7 +98,7 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
 
 @main.command()
 @click.argument("output", type=FILE, required=False)
-@click.option("--ncnn", "graphs", type=FILE, help="benchmark/models of a copy of ncnn, for what is not counted yet.")
+@click.option("--ncnn", "graphs", type=FILE, help="benchmark in a copy of ncnn (tag 20240102), to count.")
 @click.pass_context
 def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
     """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
@@ -247,9 +247,13 @@ def real(recordings: Path, output: Path | None, runs: tuple[Path, ...], elsewher
 @main.command("kills")
 @click.argument("output", type=FILE, required=False)
 @click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")
+@click.option("--only", multiple=True, metavar="NAME", help="Only this work, such as train; several times for more.")
 @click.pass_context
-def kill_commands(ctx: click.Context, output: Path | None, each: int) -> None:
-    """Kill what writes files at random moments, and fill its disk (as root). Exit code 1 if anything is lost."""
+def kill_commands(ctx: click.Context, output: Path | None, each: int, only: tuple[str, ...]) -> None:
+    """Kill what writes files at random moments, do it twice at once, and fill its disk (as root).
+
+    The exit code is 1 if anything is lost or half-written.
+    """
     import tempfile
 
     from lab.repository import kills
@@ -258,8 +262,10 @@ def kill_commands(ctx: click.Context, output: Path | None, each: int) -> None:
     metrics: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         inputs = kills.make_inputs(Path(folder))
-        for work in kills.WORKS:
+        for work in (work for work in kills.WORKS if not only or work.name in only):
             metrics[f"{work.name}_killed"] = kills.kill_randomly(work, inputs, each)
+            if work.name != "record":  # two recordings have two names
+                metrics[f"{work.name}_twice"] = kills.do_twice(work, inputs, max(1, each // 10))
             if os.geteuid() == 0:
                 metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
     if output:

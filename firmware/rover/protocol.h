@@ -13,9 +13,9 @@ extern "C" {
 #define PROTOCOL_VERSION 4
 /* rover_lib/onboard/car/servo_link.py drives no other: change both. */
 #ifdef HUMAN_GAMEPAD
-#define FIRMWARE_VERSION "4.1.0-gamepad"
+#define FIRMWARE_VERSION "4.1.1-gamepad"
 #else
-#define FIRMWARE_VERSION "4.1.0"
+#define FIRMWARE_VERSION "4.1.1"
 #endif
 
 enum {

@@ -138,13 +138,17 @@ static bool see_throttle(struct vehicle *vehicle, uint16_t pulse_us) {
     return pulses >= (throttle_may_err(vehicle) ? FAST_MOVED_PULSES : 1);
 }
 
+/* Whether the car's transmitter may send this. */
+static bool is_pulse(const struct car *car, enum channel channel, uint16_t pulse_us, uint16_t period_us) {
+    uint16_t nominal = car->servos[channel].period_us;
+    bool fast = channel == THROTTLE && throttle_is_fast(car);
+    return within(pulse_us, fast ? FAST_PULSE_MIN_US : PULSE_MIN_US, fast ? FAST_PULSE_MAX_US : PULSE_MAX_US) &&
+           nominal && distance(period_us, nominal) <= nominal / 4;
+}
+
 void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pulse_us, uint16_t period_us,
                       uint32_t now_ms) {
-    uint16_t nominal = vehicle->car.servos[channel].period_us;
-    if (channel == THROTTLE && throttle_is_fast(&vehicle->car) ? !within(pulse_us, FAST_PULSE_MIN_US, FAST_PULSE_MAX_US)
-                                                               : !within(pulse_us, PULSE_MIN_US, PULSE_MAX_US))
-        return;
-    if (!nominal || distance(period_us, nominal) > nominal / 4) return;
+    if (!is_pulse(&vehicle->car, channel, pulse_us, period_us)) return;
     judge_signal(vehicle, now_ms); /* before this pulse hides that the signal was lost */
     struct received *received = &vehicle->received[channel];
     uint8_t pulses = signal_pulses(vehicle, channel);
@@ -247,7 +251,7 @@ static enum result lower_cap(struct vehicle *vehicle, uint32_t throttle_us) {
     return DONE;
 }
 
-/* With another car, nothing counts any more that was seen of the transmitter and of the human at it. */
+/* With another car, the gesture counts no more, and signals count that are this car's too: who drives by hand goes on. */
 static char take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     struct car car;
     memcpy(&car, numbers, sizeof car);
@@ -258,17 +262,23 @@ static char take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     if (vehicle->state == AUTONOMOUS) return IGNORED;
     uint32_t id = car_id(&car);
     bool same = id == vehicle->car_id;
-    if (!same && vehicle->state == MANUAL && has_signal(vehicle) && vehicle->throttle_off_rest) return THROTTLE_AT_REST;
+    if (!same && vehicle->state == MANUAL && vehicle->throttle_free && vehicle->throttle_off_rest) return THROTTLE_AT_REST;
     vehicle->car_told = true;
     if (same) return DONE;
     vehicle->car = car;
     vehicle->car_id = id;
     vehicle->cap_us = car.cap_us < vehicle->lowered_us ? car.cap_us : vehicle->lowered_us;
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
-        vehicle->received[channel] = (struct received){0};
-        forget_signal(vehicle, &vehicle->received[channel]);
+        struct received *received = &vehicle->received[channel];
+        if (is_pulse(&car, (enum channel)channel, received->pulse_us, received->period_us)) continue;
+        *received = (struct received){0};
+        forget_signal(vehicle, received);
     }
-    enter(vehicle, (enum state)vehicle->state, (enum reason)vehicle->reason);
+    forget_wiggle(vehicle);
+    if (distance(vehicle->received[THROTTLE].pulse_us, neutral_us(vehicle, THROTTLE)) > THROTTLE_DEAD_BAND_US) {
+        vehicle->throttle_free = false;
+        vehicle->throttle_off_rest = 0xFF;
+    }
     return DONE;
 }
 

@@ -3,44 +3,49 @@
     tell_time("results/clock/clock.json")      # what `python -m lab clock` does
 
 `rover_lib.onboard.care.pi5` has the model. Here it is fitted, and each network is predicted by a fit that knew none of
-its architecture, our policies by a fit of all.
+its architecture, our policies by a fit of all. The model's form was chosen, and `judge_choice` judges that too.
 """
 
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lab.a76.core import A76, CountError, prepare
+from lab.a76.core import A76, GUEST, PLUGIN, prepare
 from lab.a76.network_counts import (
+    EXECUTORCH,
     NCNN,
     POLICIES,
     SOURCES,
     THREADS,
+    TOO_SLOW,
+    TORCHVISION,
     Published,
     Shape,
-    count_executorch,
-    count_ncnn,
+    count_network,
     count_policy,
     read_published,
 )
-from rover_lib.onboard.care.pi5 import CORES, FITTED, Span, Work, predict_ms, spread, time_ms
+from rover_lib.onboard.care.pi5 import CORES, FITTED, OVERLAP, Span, Work, predict_ms, spread, time_ms
 from rover_lib.onboard.columns import align
 from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.progress import Progress, silent
 
 OUTPUT = Path(__file__).parents[2] / "results" / "clock" / "clock.json"
 HELD = 0.9  # the share of times that an interval is to hold
 GENTLE = 0.05  # a relative error below it weighs by its square, above it more and more by its size
-STEPS, START = 60, (150.0, 2000.0, 6000.0)  # of the fit, and where it begins
-NOT_JUDGED = {  # rows that are predicted but neither fitted nor judged, and why
-    "executorch/googlenet/int8": "its time is that of one thread, in INT8 and in FP32",
-}
+STEPS, START = 60, (300.0, 1000.0, 6000.0)  # of the fit, and where it begins, in ps
+FORMS = tuple(product(("cycles_g", "instructions_g"), (OVERLAP, 1)))  # that the model was chosen from; the first is it
+ODD = {"executorch/googlenet/int8": "as long as one thread takes"}  # what is off by more than a gate, and how
+JOBS = 2  # how many networks are counted at a time
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class Row:
     network: Published
     threads: int
     work: Work
+    instructions_g: float = 0.0
+    power: int = OVERLAP
 
     @property
     def architecture(self) -> str:
@@ -63,18 +70,23 @@ class Row:
     def terms(self) -> tuple[float, float, float]:
         return self.work.terms(self.threads)
 
+    def in_form(self, own: str, power: int) -> "Row":
+        """Return it as another form of the model sees it. own: what a core's own time is counted in."""
+        cycles_g = self.instructions_g if own == "instructions_g" else self.work.cycles_g
+        return replace(self, work=replace(self.work, cycles_g=cycles_g), power=power)
+
 
 def fit(rows: Sequence[Row]) -> tuple[float, ...]:
-    """Return what an instruction, a near line and a far line take, in ns, so that relative errors are small.
+    """Return what a cycle, a near line and a far line take, in ns, so that relative errors are small.
 
     Gauss-Newton steps on errors whose weights fall with their size, so that a few odd networks do not decide.
     """
     terms, ms = np.array([row.terms for row in rows]), np.array([row.ms for row in rows])
-    ns = np.array(START) / 1e3
+    ns, p = np.array(START) / 1e3, rows[0].power
     for _ in range(STEPS):
         own, shared = 1e3 * terms[:, :2] @ ns[:2], 1e3 * terms[:, 2] * ns[2]
-        found = np.hypot(own, shared)
-        slopes = 1e3 * terms * np.stack([own, own, shared], 1) / (found * ms)[:, None]
+        found = (own**p + shared**p) ** (1 / p)
+        slopes = 1e3 * terms * (np.stack([own, own, shared], 1) / found[:, None]) ** (p - 1) / ms[:, None]
         off = found / ms - 1
         weight = 1 / np.sqrt(np.abs(off) + GENTLE)
         step = np.linalg.lstsq(slopes * weight[:, None], -off * weight, rcond=None)[0]
@@ -84,7 +96,7 @@ def fit(rows: Sequence[Row]) -> tuple[float, ...]:
 
 def off_of(row: Row, ns: Sequence[float]) -> float:
     """Return the natural logarithm of published by predicted time."""
-    return math.log(row.ms / time_ms(row.terms, ns))
+    return math.log(row.ms / time_ms(row.terms, ns, row.power))
 
 
 def reach(off: Iterable[float]) -> float:
@@ -98,17 +110,60 @@ def leave_out(rows: Sequence[Row]) -> tuple[list[dict[str, float]], list[float]]
 
     The interval is as wide as such fits were off on the other architectures, for as many threads.
     """
-    parts = {a: [row for row in rows if row.architecture != a] for a in {row.architecture for row in rows}}
-    fits = {a: fit(others) for a, others in parts.items()}
-    off = [off_of(row, fits[row.architecture]) for row in rows]
+    off = off_left_out(rows)
     predicted = []
-    for row in rows:
-        others = [
-            o for o, r in zip(off, rows, strict=True) if r.threads == row.threads and r.architecture != row.architecture
-        ]
-        span = spread(time_ms(row.terms, fits[row.architecture]), reach(others))
-        predicted.append(told(span))
+    for row, own in zip(rows, off, strict=True):
+        others = [(r, o) for r, o in zip(rows, off, strict=True) if r.architecture != row.architecture]
+        predicted.append(told(spread(row.ms * math.exp(-own), reach_of(others, row.threads))))
     return predicted, off
+
+
+def reach_of(rows: Iterable[tuple[Row, float]], threads: int) -> float:
+    """Return the `reach` of architectures, each by its row that is furthest off: what is new is an architecture."""
+    worst: dict[str, float] = {}
+    for row, off in rows:
+        if row.threads == threads:
+            worst[row.architecture] = max(worst.get(row.architecture, 0.0), abs(off))
+    return reach(worst.values())
+
+
+def off_left_out(rows: Sequence[Row]) -> list[float]:
+    """Return `off_of` each row for a fit that knew nothing of its architecture."""
+    architectures = {row.architecture for row in rows}
+    fits = {a: fit([row for row in rows if row.architecture != a]) for a in architectures}
+    return [off_of(row, fits[row.architecture]) for row in rows]
+
+
+def judge_choice(rows: Sequence[Row]) -> dict[str, Any]:
+    """Judge the choice of a form: each architecture is predicted by the form that was best on all of the others.
+
+    Best is the least mean `off_left_out`, of either number of threads alike. Returns the median and the worst error in
+    percent by threads, and how often each of FORMS was chosen.
+    """
+    in_forms = {form: [row.in_form(*form) for row in rows] for form in FORMS}
+    chosen: dict[str, tuple[str, int]] = {}
+    off: dict[int, list[float]] = {}
+    for left_out in sorted({row.architecture for row in rows}):
+
+        def mean_off(form: tuple[str, int], left_out: str = left_out) -> float:
+            others = [row for row in in_forms[form] if row.architecture != left_out]
+            sizes = list(zip(map(abs, off_left_out(others)), others, strict=True))
+            return sum(float(np.mean([s for s, row in sizes if row.threads == n])) for n in (1, THREADS))
+
+        form = chosen[left_out] = min(FORMS, key=mean_off)
+        ns = fit([row for row in in_forms[form] if row.architecture != left_out])
+        for row in in_forms[form]:
+            if row.architecture == left_out:
+                off.setdefault(row.threads, []).append(off_of(row, ns))
+    forms = list(chosen.values())
+    return {str(n): _errors(found) for n, found in sorted(off.items())} | {
+        "chosen": {f"{own}, {power}": forms.count((own, power)) for own, power in FORMS}
+    }
+
+
+def _errors(off: Iterable[float]) -> dict[str, float]:
+    errors = [100 * abs(math.exp(-o) - 1) for o in off]
+    return {"n": len(errors), "median_pct": float(np.median(errors)), "worst_pct": max(errors)}
 
 
 def told(span: Span) -> dict[str, float]:
@@ -122,14 +177,8 @@ def judge(rows: Sequence[tuple[Row, Mapping[str, float], float]]) -> dict[str, f
 
     rows: each with its prediction and its `off_of`.
     """
-    errors = [100 * abs(math.exp(-off) - 1) for _, _, off in rows]
     held = [span["predicted_low_ms"] <= row.ms <= span["predicted_high_ms"] for row, span, _ in rows]
-    return {
-        "n": len(rows),
-        "median_pct": float(np.median(errors)),
-        "worst_pct": max(errors),
-        "held_pct": 100 * sum(held) / len(held),
-    }
+    return _errors(off for _, _, off in rows) | {"held_pct": 100 * sum(held) / len(held)}
 
 
 def tell_time(
@@ -137,38 +186,42 @@ def tell_time(
 ) -> dict[str, Any]:
     """Count what is not counted yet, fit, predict, and write `output` and what the rover knows of the fit.
 
-    graphs: benchmark/models of a copy of ncnn's repository, which only counting ncnn's networks needs. limits: `clock`
-    of lab/params.yml. metrics: see lab/README.md.
+    graphs: benchmark in a copy of ncnn's repository at its tag 20240102, which only counting ncnn's networks needs.
+    limits: `clock` of lab/params.yml. metrics: see lab/README.md.
     """
-    output = Path(output)
-    known = read_stage(output, "clock")["metrics"]["counts"] if output.is_file() else {}
-    counts = _count(known, output, graphs, progress)
+    output, counting = Path(output), counted_by()
+    content = read_stage(output, "clock") if output.is_file() else {}
+    same = content and content["params"].get("counting") == counting
+    counts = _count(content["metrics"]["counts"] if same else {}, counting, graphs, progress)
     networks = [n for n in read_published() if n.key in counts]
-    every = [Row(n, threads, Work.of(counts[n.key])) for n in networks for threads in n.ms]
-    judged = [row for row in every if row.network.key not in NOT_JUDGED]
+    judged = [
+        Row(n, threads, Work.of(counts[n.key]), counts[n.key]["instructions_g"]) for n in networks for threads in n.ms
+    ]
     predicted, off = leave_out(judged)
-    wide = {n: reach(o for o, row in zip(off, judged, strict=True) if row.threads == n) for n in (1, THREADS)}
+    wide = {n: reach_of(zip(judged, off, strict=True), n) for n in (1, THREADS)}
     fitted: dict[str, Any] = {"ns": fit(judged), "off": {str(n): reached for n, reached in wide.items()}}
     fitted["gmac_per_s"] = _gmac_per_s(counts, fitted)
-    left_out = dict(zip(((r.network.key, r.threads) for r in judged), predicted, strict=True))
     rows = []
-    for row in every:
+    for row, span in zip(judged, predicted, strict=True):
         n = row.network
         says = {"name": n.name, "runtime": n.runtime, "precision": n.precision, "threads": row.threads}
-        says |= {"published_ms": row.ms, "source": SOURCES[n.runtime]} | counts[n.key]
-        says |= left_out.get((n.key, row.threads)) or told(predict_ms(row.work, row.threads, fitted))
-        rows.append(says | {"not_judged": NOT_JUDGED.get(n.key)})
+        says |= {"published_ms": row.ms, "source": SOURCES[n.runtime]} | counts[n.key] | span
+        rows.append(says | {"odd": ODD.get(n.key)})
     with atomic_path(FITTED) as temporary:
         temporary.write_text(json.dumps(fitted, indent=1) + "\n")
     found = {}
     for threads in (1, THREADS):
         chosen = [told for told in zip(judged, predicted, off, strict=True) if told[0].threads == threads]
         found[str(threads)] = judge(chosen)
+    ordinary = [(row.threads, o) for row, o in zip(judged, off, strict=True) if row.network.key not in ODD]
+    without_odd = {str(n): _errors(o for threads, o in ordinary if threads == n) for n in (1, THREADS)}
     metrics = {
         "networks": rows,
         "policies": _policies(counts, fitted),
         "fit": fitted,
         "judged": found,
+        "judged_without_odd": without_odd,
+        "choice": judge_choice(judged),
         "other_runtime": {runtime: _other_runtime(judged, runtime) for runtime in SOURCES},
         "not_counted": [n.key for n in read_published() if n.key not in counts],
         "counts": counts,
@@ -183,35 +236,49 @@ def tell_time(
         for n, own in limits["gates"].items()
         for key, limit in own.items()
     ]
-    return write_stage(output, "clock", params={"cpu": A76, "ncnn": NCNN, "held": HELD}, metrics=metrics, inputs={})
+    return write_stage(
+        output,
+        "clock",
+        params={"cpu": A76, "ncnn": NCNN, "held": HELD, "counting": counting},
+        metrics=metrics,
+        inputs={},
+    )
 
 
-def _count(known: Mapping[str, Any], output: Path, graphs: Path | None, progress: Progress) -> dict[str, Any]:
-    """Return the counts by key: those that are known, and new ones of what is not known and can be counted here."""
-    counts, published = dict(known), read_published()
-    new = [n for n in published if n.key not in known]
-    ncnn = [n for n in new if n.runtime == "ncnn" and graphs]
-    others = [n for n in new if n.runtime == "executorch"]
-    policies = [shape for shape in POLICIES if key_of_policy(shape) not in known]
-    if not known and not graphs:
-        raise CountError(
-            f"{output}: has no counts yet, and ncnn's graphs are not given",
-            remedy="--ncnn benchmark/models of a copy of ncnn's repository",
+def counted_by() -> str:
+    """Return a key of what counts: with another one, everything is counted anew."""
+    packages = [NCNN, *EXECUTORCH.packages, *EXECUTORCH.guest_packages, TORCHVISION]
+    return key_of({"packages": packages}, PLUGIN, GUEST / "network.py")
+
+
+def _count(known: Mapping[str, Any], counting: str, graphs: Path | None, progress: Progress) -> dict[str, Any]:
+    """Return the counts by key: those that are known, and the others from the cache or counted now."""
+    networks = {n.key: n for n in read_published() if n.key not in TOO_SLOW}
+    policies = {key_of_policy(shape): shape for shape in POLICIES}
+    new = [key for key in (*networks, *policies) if key not in known]
+    counts = {key: known[key] for key in (*networks, *policies) if key in known}
+    if not new:
+        return counts
+    core = prepare(progress)
+
+    def count(key: str) -> dict[str, Any]:
+        def make(folder: Path) -> None:
+            network = networks.get(key)
+            work = count_network(core, network, graphs) if network else count_policy(core, policies[key])
+            (folder / "work.json").write_text(json.dumps(work))
+
+        return json.loads(
+            (cache_folder("clock-count", key_of({"by": counting, "key": key}), make) / "work.json").read_text()
         )
-    steps = iter(progress(range(len(ncnn) + len(others) + len(policies)), desc="networks, emulated"))
 
-    def done(network: Published, work: dict[str, Any]) -> None:
-        counts[network.key] = work
-        next(steps, None)
-
-    if ncnn or others or policies:
-        core = prepare(progress)
-        count_ncnn(core, ncnn, graphs or Path(), done)
-        count_executorch(core, others, done)
-        for shape in policies:
-            counts[key_of_policy(shape)] = count_policy(core, shape)
-            next(steps, None)
-    return counts
+    with ThreadPoolExecutor(JOBS) as pool:
+        started = {pool.submit(count, key): key for key in new}
+        try:
+            for future in progress(as_completed(started), desc="networks, emulated", total=len(new)):
+                counts[started[future]] = future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return {key: counts[key] for key in (*networks, *policies)}
 
 
 def key_of_policy(shape: Shape) -> str:
@@ -238,12 +305,7 @@ def _gmac_per_s(counts: Mapping[str, Any], fitted: Mapping[str, Any]) -> float:
 def _other_runtime(rows: Sequence[Row], runtime: str) -> dict[str, float]:
     """Return how far off a runtime's times on four threads are for a fit that knows only the other runtime's."""
     ns = fit([row for row in rows if row.network.runtime != runtime])
-    errors = [
-        100 * abs(math.exp(-off_of(row, ns)) - 1)
-        for row in rows
-        if row.network.runtime == runtime and row.threads == THREADS
-    ]
-    return {"n": len(errors), "median_pct": float(np.median(errors)), "worst_pct": max(errors)}
+    return _errors(off_of(row, ns) for row in rows if row.network.runtime == runtime and row.threads == THREADS)
 
 
 def table(content: Mapping[str, Any]) -> str:

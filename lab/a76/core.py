@@ -82,7 +82,9 @@ SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
 SILENCE_S = 1200  # of processor time: loading the full policy in FP32 prints nothing for five minutes
 WAITING = 6  # by the clock the silence may be that many times longer, as the machine may have more to do
 
-BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot")])  # as in count.c
+BLOCK = np.dtype(
+    [(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")]
+)  # as in count.c
 
 
 class CountError(RoverError):
@@ -216,6 +218,10 @@ class Emulation:
         """Return how many instructions, or "simd" or "sdot" ones, were executed in a section."""
         blocks = self.sections[section]
         return int((blocks["entered"] * blocks[what]).sum())
+
+    def cycles(self, section: int) -> float:
+        """Return the cycles that a section takes a Cortex-A76 that waits for nothing: `quarters_of` in count.c."""
+        return self.total(section, "quarters") / 4
 
     def near_lines(self, section: int) -> int:
         """Return how many lines of 64 bytes the loads of a section had to fetch into its core's first cache."""

@@ -63,7 +63,8 @@ class Counted:
     inferences: tuple[int, ...]  # instructions of each
     simd: int  # SIMD instructions of the steady inference
     sdot: int  # SDOT instructions of the steady inference
-    near_lines: int  # of the steady inference, see Emulation
+    cycles: float  # of the steady inference, see Emulation, as are
+    near_lines: int
     far_lines: int
     kernels: dict[str, tuple[int, int, int]]  # (instructions, SIMD, SDOT) of the steady inference by function
     peak_mb: float
@@ -128,6 +129,7 @@ def count_artifact(
             inferences=tuple(done.total(i) for i in range(1, counted + 1)),
             simd=done.total(STEADY, "simd"),
             sdot=done.total(STEADY, "sdot"),
+            cycles=done.cycles(STEADY),
             near_lines=done.near_lines(STEADY),
             far_lines=done.far_lines(STEADY),
             kernels=by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text())),

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,11 +39,14 @@ SOURCES = {  # of a runtime's times; read in November 2026
     "ncnn": "ncnn's benchmark/README.md, a Raspberry Pi 5 at 2.4 GHz, least of 10; read 2026-11",
     "executorch": "Arm's model cards and ExecuTorch course, XNNPACK on a Raspberry Pi 5, median; read 2026-11",
 }
-NCNN = "ncnn==1.0.20261020"
+NCNN = "ncnn==1.0.20240102"  # the release after its times on a Pi 5 were published, on 12 December 2023
+TOO_SLOW = ("ncnn/vgg16/fp16", "ncnn/vision_transformer/fp16")  # the emulator has no FP16 of its own: many minutes each
 (EXECUTORCH,) = [engine for engine in peers.ENGINES if engine.name == "executorch"]
 TORCHVISION = "torchvision==0.25.0"  # the one for the torch that ExecuTorch's tools come with
-SIZE = 224  # of the pictures of torchvision's networks
 THREADS = 4
+TRACING = threading.Lock()  # two policies cannot be traced at once: torch.fx patches modules for the whole process
+SECTION = 1  # of the one network that guest/network.py runs
+GRAPHS = "--ncnn FOLDER: benchmark in a copy of ncnn's repository at its tag 20240102"
 
 
 @dataclass(frozen=True)
@@ -79,53 +82,37 @@ def read_published() -> list[Published]:
 # --- networks ---------------------------------------------------------------------------------------------------------
 
 
-def count_ncnn(
-    core: Core, networks: Iterable[Published], graphs: Path, done: Callable[[Published, dict[str, Any]], None]
-) -> None:
-    """Count networks in ncnn, first in one thread and then in four, and call `done` with each network's counts.
+def count_network(core: Core, network: Published, graphs: Path | None) -> dict[str, float]:
+    """Count a network of ncnn in one thread and in four, or make one for ExecuTorch and count it in one.
 
-    graphs: the folder of ncnn's own .param files. Raises CountError if one is not there.
+    graphs: the folder of ncnn's own .param files. Raises CountError if the network's is not there.
     """
-    networks = list(networks)
-    if missing := [n.name for n in networks if not (graphs / f"{n.name}.param").is_file()]:
+    if network.runtime == "executorch":
+        ran = _emulate(core, network, _program(network), packages=peers.packages_there(EXECUTORCH), watch="memory=0")
+        # All of these networks run in XNNPACK, which divides them into small tiles.
+        return _work_of(ran) | {"alone": 0.0}
+    graph = (graphs or Path()).resolve() / f"{network.name}.param"
+    if not graphs or not graph.is_file():
         raise CountError(
-            f"{graphs}: no {missing[0]}.param in it", remedy="give benchmark/models of a copy of ncnn's repository"
+            f"{network.name}: ncnn's graph of it is needed to count it", found=graphs or "no folder", remedy=GRAPHS
         )
 
     def make(folder: Path) -> None:
         fetch_wheels(folder, *FOR_GUEST, NCNN)
 
     packages = cache_folder("arm-ncnn", key_of({"packages": NCNN, "for": FOR_GUEST}), make)
-    given = [f"{n.px}:{(graphs / f'{n.name}.param').resolve()}" for n in networks]
-
-    def emulate(threads: int, watch: str, folder: str) -> Emulation:
-        arguments = ["ncnn", threads, *given]
-        return emulate_script(
-            core, GUEST / "network.py", arguments, Path(folder), packages=packages, threads=threads, watch=watch
-        )
-
-    with tempfile.TemporaryDirectory(prefix="rover-clock-") as one, tempfile.TemporaryDirectory() as four:
-        alone, together = emulate(1, "memory=0", one), emulate(THREADS, "threads=1", four)
-    for section, network in enumerate(networks, 1):
-        busiest, *others = together.by_thread(section)
-        share = busiest / (busiest + sum(others))
-        # The thread that calls has the largest part of what is divided too, so this share holds what is uneven in that.
-        done(network, _work_of(alone, section) | {"alone": max(0.0, (THREADS * share - 1) / (THREADS - 1))})
+    alone = _emulate(core, network, graph, packages=packages, watch="memory=0")
+    together = _emulate(core, network, graph, packages=packages, watch="threads=1", threads=THREADS)
+    busiest, *others = together.by_thread(SECTION)
+    share = busiest / (busiest + sum(others))
+    # The thread that calls has the largest part of what is divided too, so this share holds what is uneven in that.
+    return _work_of(alone) | {"alone": max(0.0, (THREADS * share - 1) / (THREADS - 1))}
 
 
-def count_executorch(
-    core: Core, networks: Iterable[Published], done: Callable[[Published, dict[str, Any]], None]
-) -> None:
-    """Make networks for ExecuTorch, count them in one thread, and call `done` with each network's counts."""
-    packages = peers.packages_there(EXECUTORCH)
-    for network in networks:
-        with tempfile.TemporaryDirectory(prefix="rover-clock-") as scratch:
-            arguments = ["executorch", 1, f"{SIZE}:{_program(network)}"]
-            ran = emulate_script(
-                core, GUEST / "network.py", arguments, Path(scratch), packages=packages, watch="memory=0"
-            )
-        # All of these networks run in XNNPACK, which divides them into small tiles.
-        done(network, _work_of(ran, 1) | {"alone": 0.0})
+def _emulate(core: Core, network: Published, path: Path, *, threads: int = 1, **options: Any) -> Emulation:
+    with tempfile.TemporaryDirectory(prefix="rover-clock-") as scratch:
+        given = [network.runtime, threads, f"{network.px}:{path}"]
+        return emulate_script(core, GUEST / "network.py", given, Path(scratch), threads=threads, **options)
 
 
 def _program(network: Published) -> Path:
@@ -145,9 +132,9 @@ def _program(network: Published) -> Path:
     return cache_folder("peer-network", key, make) / "network.pte"
 
 
-def _work_of(ran: Emulation, section: int) -> dict[str, float]:
-    counts = {"instructions": ran.total(section), "simd": ran.total(section, "simd")}
-    counts |= {"near_lines": ran.near_lines(section), "far_lines": ran.far_lines(section)}
+def _work_of(ran: Emulation) -> dict[str, float]:
+    counts = {"instructions": ran.total(SECTION), "simd": ran.total(SECTION, "simd"), "cycles": ran.cycles(SECTION)}
+    counts |= {"near_lines": ran.near_lines(SECTION), "far_lines": ran.far_lines(SECTION)}
     return {f"{name}_g": count / 1e9 for name, count in counts.items()}
 
 
@@ -202,13 +189,14 @@ def count_policy(core: Core, shape: Shape) -> dict[str, Any]:
     noise: Any = [_Noise(np.zeros(2, np.float32), rng.integers(0, 256, (height, width, 3), np.uint8)) for _ in range(2)]
 
     def make(folder: Path) -> None:
-        weights = random_weights(shape.config, shape.backbone_channels)
-        checkpoint = Checkpoint(folder / "none", "trainer", shape.config, weights, "0" * 64, {})
-        calibration = None if shape.mode == "fp32" else observe.calibrate(checkpoint, noise)
-        policy: Any = ACT(shape.config, weights)
-        if calibration:
-            policy = quantize.quantize(checkpoint, Scheme(shape.mode), calibration)
-        export.export(policy, checkpoint, folder / "policy.pt", noise, calibration)
+        with TRACING:
+            weights = random_weights(shape.config, shape.backbone_channels)
+            checkpoint = Checkpoint(folder / "none", "trainer", shape.config, weights, "0" * 64, {})
+            calibration = None if shape.mode == "fp32" else observe.calibrate(checkpoint, noise)
+            policy: Any = ACT(shape.config, weights)
+            if calibration:
+                policy = quantize.quantize(checkpoint, Scheme(shape.mode), calibration)
+            export.export(policy, checkpoint, folder / "policy.pt", noise, calibration)
 
     key = key_of({"shape": repr(shape)}, act, observe, quantize, export)
     path = cache_folder("clock-policy", key, make) / "policy.pt"

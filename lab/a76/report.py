@@ -76,7 +76,7 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
 def work_of(counted: Counted) -> dict[str, float]:
     """Return what an artifact's steady inference executes, as `pi5.Work.of` reads it."""
     kernels = {name: row[0] for name, row in counted.kernels.items()}
-    counts = {"instructions": counted.steady, "simd": counted.simd}
+    counts = {"instructions": counted.steady, "simd": counted.simd, "cycles": counted.cycles}
     counts |= {"near_lines": counted.near_lines, "far_lines": counted.far_lines}
     return {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels)}
 

@@ -94,7 +94,7 @@ def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dic
     by address. For a library that was stripped of names, blocks with an SDOT are listed apart from the rest.
     """
     executed: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
-    for address, entered, *counts in blocks.tolist():
+    for address, entered, *counts, _ in blocks.tolist():
         name = functions[address]
         if name.startswith("[") and counts[2]:
             name = f"{name} loops with SDOT"

@@ -30,8 +30,8 @@ def tell_of(
 ) -> dict[str, Any]:
     """Return the metrics of recordings.json.
 
-    runs: name -> folder that `rover run` left on these recordings. elsewhere: a run of the same checkpoint on other
-    recordings: its static artifact, calibrated there, is held against FP32 here too. Raises what reading them raises.
+    runs: name -> folder that `rover run` left on these recordings. elsewhere: a run on other recordings: if it is of
+    the same checkpoint, its static artifact, calibrated there, is held against FP32 here too. Raises as reading does.
     """
     read = load_recordings(recordings, progress=progress)
     sides = measure_sides(read, progress)
@@ -65,10 +65,10 @@ def _policy(folder: Path, elsewhere: Path | None, progress: Progress) -> dict[st
     compared, run = (read_stage(Path(folder) / f"{name}.json", name)["metrics"] for name in ("compare", "run"))
     static = compared["modes"]["static"]
     told = {"verdict": run["headline"], "against_driver": compared["guesses"], "static": _errors(static)}
-    if elsewhere:
+    fp32 = load_policy(Path(folder) / "policy_fp32.pt")
+    other = {"static": load_policy(Path(elsewhere) / "policy_static.pt")} if elsewhere else {}
+    if other and other["static"].manifest["checkpoint"] == fp32.manifest["checkpoint"]:
         again = open_run(folder)
-        fp32 = load_policy(Path(folder) / "policy_fp32.pt")
-        other = {"static": load_policy(Path(elsewhere) / "policy_static.pt")}
         frames = pick_evenly(again.parts.held_out, FRAMES)
         report = fidelity(fp32, other, frames, again.recordings.action_range(), progress)
         told["calibrated_elsewhere"] = _errors(report.summary("static"))

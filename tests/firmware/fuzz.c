@@ -31,7 +31,10 @@ static const uint16_t CARS[][9] = {
     {20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100},
     {20000, 1100, 1480, 1900, 14000, 1000, 1000, 2000, 60},
     {3003, 1050, 1550, 2100, 1010, 100, 100, 500, 80},
+    {21316, 950, 1500, 2050, 1010, 130, 130, 711, 90}, /* its transmitter may be the first's */
+    {21316, 950, 1500, 2050, 1010, 160, 160, 711, 118},
 };
+enum { CAR_COUNT = sizeof CARS / sizeof *CARS };
 /* And some that may not be: each differs in one number from the one above of the same index modulo four. */
 static const uint16_t BAD_CARS[][9] = {
     {21316, 900, 1456, 2012, 1016, 120, 120, 711, 119},
@@ -59,7 +62,8 @@ static bool sides[2], wiggled;    /* the steering stick was there, with the thro
 static uint32_t sides_ms[2], wiggled_ms;
 static void forget_wiggle(void) { sides[0] = sides[1] = wiggled = false; }
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
-static bool throttle_may_pass, was_awaited;
+static bool throttle_may_pass;
+static bool awaited[2];           /* a signal is not there before two of its pulses within 100 ms */
 static uint32_t wanted_us[2];     /* of the last drive that must count */
 static uint32_t wanted_since_ms, wanted_heard_ms;
 static bool wanted;
@@ -85,14 +89,15 @@ static bool on_the_way(int before, int now, int wanted_there, uint32_t most) {
 
 static void check(void) {
     bool neutral = vehicle.steering_us == car[2] && vehicle.throttle_us == car[6];
+    for (int i = 0; i < 2; i++) { /* pulses of the other count while it is awaited, its own from before do not */
+        bool old = now_ms - seen_before_ms[i] > 100;
+        if (old && !awaited[i]) at_rest = 0, seen_ms[i] = now_ms - 1000;
+        awaited[i] = old;
+    }
     bool lost = now_ms - seen_ms[0] > 100 || now_ms - seen_ms[1] > 100;
     if (!neutral && lost) fail("no signal, and not neutral");
     if (lost) forget_wiggle();
     if (lost) throttle_may_pass = false;
-    /* Pulses of the one signal count while the other is awaited: as soon as two within 100 ms, a signal, are not there. */
-    bool awaited = now_ms - seen_before_ms[0] > 100 || now_ms - seen_before_ms[1] > 100;
-    if (awaited && !was_awaited) at_rest = 0;
-    was_awaited = awaited;
     if (vehicle.state == MANUAL && before_state != MANUAL) throttle_may_pass = at_rest >= 8;
     if (vehicle.state == MANUAL) {
         uint16_t throttle_us = throttle_may_pass ? seen_us[1] : car[6];
@@ -167,14 +172,17 @@ static uint32_t half_ms;
 
 static void let_go(void) { stick_us[0] = car[2], stick_us[1] = car[6]; }
 
-/* What the pins do, and what counts as a pulse, is another car's from here on. */
+/* What the pins do, and what counts as a pulse, is another car's from here on; signals that are this car's too stay. */
 static void drives(const uint16_t *other) {
     if (other == car) return;
+    for (int i = 0; i < 2; i++) {
+        bool lets_slow = seen_us[i] >= 800 && seen_us[i] <= 2200, lets_fast = seen_us[i] >= 40 && seen_us[i] <= 980;
+        bool stays = 4 * abs(car[4 * i] - other[4 * i]) <= other[4 * i] && (other[4 * i] < 3000 ? lets_fast : lets_slow);
+        if (!stays) seen_ms[i] = seen_before_ms[i] = now_ms - 1000;
+    }
     car = other;
-    seen_ms[0] = seen_ms[1] = seen_before_ms[0] = seen_before_ms[1] = now_ms - 1000;
     forget_wiggle();
-    throttle_may_pass = false;
-    at_rest = 0, was_awaited = true;
+    if (abs(seen_us[1] - car[6]) > 32) throttle_may_pass = false, at_rest = 0;
     let_go();
 }
 
@@ -207,7 +215,7 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
             vehicle_command(&vehicle, &command, now_ms);
             if (!genuine && vehicle.sequence != sequence) fail("a line that nobody sent was taken");
             if (genuine && command.kind == COMMAND_CAR && before != AUTONOMOUS && vehicle.result != 't')
-                for (int i = 0; i < 4; i++)
+                for (int i = 0; i < CAR_COUNT; i++)
                     if (!memcmp(command.numbers, CARS[i], 18)) told = true, drives(CARS[i]), cars++;
             sequence_wraps += vehicle.sequence < sequence;
             if (vehicle.state == AUTONOMOUS && before != AUTONOMOUS) {
@@ -268,9 +276,10 @@ static void start(void) { /* a reset: of the board alone */
     now_ms = rnd(2) ? UINT32_MAX - rnd(10000) : rnd(1u << 31) * 2;
     vehicle.sequence = rnd(2) ? UINT32_MAX - rnd(300000) : rnd(1u << 31) * 2;
     seen_ms[0] = seen_ms[1] = seen_before_ms[0] = seen_before_ms[1] = now_ms - 1000;
+    awaited[0] = awaited[1] = true;
     forget_wiggle();
     throttle_may_pass = wanted = false;
-    at_rest = 0, was_awaited = true;
+    at_rest = 0;
     lowered_us = UINT32_MAX;
     before_state = 0;
 }
@@ -292,9 +301,9 @@ int main(int argc, char **argv) {
         if (!rnd(600)) genuine.kind = COMMAND_LOWER;
         if (!rnd(300)) {
             genuine.kind = COMMAND_CAR;
-            memcpy(genuine.numbers, rnd(4) ? CARS[rnd(4)] : BAD_CARS[rnd(sizeof BAD_CARS / sizeof *BAD_CARS)], 18);
+            memcpy(genuine.numbers, rnd(4) ? CARS[rnd(CAR_COUNT)] : BAD_CARS[rnd(sizeof BAD_CARS / sizeof *BAD_CARS)], 18);
         }
-        if (!rnd(40)) genuine.car = id_of(CARS[rnd(4)]);
+        if (!rnd(40)) genuine.car = id_of(CARS[rnd(CAR_COUNT)]);
         int length = print_command(text, &genuine);
         unsigned kind = rnd(8);
         kinds[kind]++;

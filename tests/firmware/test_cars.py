@@ -139,15 +139,16 @@ def test_no_other_car_while_armed(armed):
     assert armed.run(1) == [(1456, 120)]
 
 
-def test_another_car_forgets_the_gesture_and_the_signal():
+@pytest.mark.parametrize(("numbers", "missing"), [((*INVERTED.numbers[:8], 60), "w"), (CRAWLER.numbers, "s")])
+def test_another_car_forgets_the_gesture_and_signals_that_are_not_its(numbers, missing):
     board = NativeArduino()
     board.run(100)
     board.wiggle()
     assert board.status.missing == "-"
-    assert board.command("C", *INVERTED.numbers[:8], 60) == "k"
-    assert board.status.missing == "s"
-    board.run(400)
-    assert board.status.missing == "w"
+    assert board.command("C", *numbers) == "k"
+    assert board.status.missing == missing
+    board.run(1200)
+    assert board.status.missing == missing
 
 
 def test_the_same_car_again_forgets_nothing():

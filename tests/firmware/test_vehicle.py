@@ -211,9 +211,20 @@ def test_a_request_has_an_age(board, age_ms, result):
 def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_us, result):
     """Throttle and steering went to neutral until there were signals again."""
     drive_by_hand(board, 1600, throttle_us, 300)
-    assert board.command("C", 20000, 1000, 1500, 2000, 20000, 1000, 1500, 2000, 100) == result
-    if result == "t":
-        assert set(board.run(300)) == {(1600, 300)}
+    assert board.command("C", 20000, 1000, 1500, 2000, 1010, 130, 130, 711, 100) == result
+    assert set(board.run(300)) == {(1600, throttle_us)}
+    board.sticks[1] = 300
+    assert board.run(10)[-1] == (1600, 300)
+
+
+def test_a_throttle_that_does_not_pass_keeps_no_car(board):
+    """A board with another neutral than the transmitter's refused the car that has it, until that was switched off."""
+    board.sticks = [0, 0]
+    board.run(200)
+    drive_by_hand(board, 1456, 158, 300)
+    assert board.command("C", 20000, 1000, 1500, 2000, 1010, 150, 150, 711, 100) == "k"
+    drive_by_hand(board, 1456, 158, 20)
+    assert set(board.run(100)) == {(1456, 158)}
 
 
 @pytest.mark.parametrize(("channel", "off", "missing"), [(0, 1.2, "w"), (0, 1.3, "s"), (1, 1.2, "w"), (1, 1.3, "s")])

@@ -2,8 +2,8 @@
  *
  * The guest marks with a system call that does nothing else: getppid(MARK, 1, section) starts a section,
  * getppid(MARK, 0, section) ends it and writes <folder>/<section>.blocks: for every translated block that ran in
- * between five uint64, in this order: its address in the guest, how often it was entered, and how many instructions,
- * SIMD or floating-point instructions, and SDOT instructions it has.
+ * between six uint64, in this order: its address in the guest, how often it was entered, how many instructions, SIMD or
+ * floating-point instructions, and SDOT instructions it has, and the least time on a Cortex-A76, in quarters of a cycle.
  * A section counts from the instruction after the call that starts it to the call that ends it, included.
  *
  * Exact for one running thread: counters are added to without locks, because that makes them cheap enough to be
@@ -57,7 +57,7 @@ static const unsigned sets_of[LEVELS] = {256, 1024, 2048}, ways_of[LEVELS] = {4,
 
 struct block {
     uint64_t entered, entered_at_start; /* `entered` is written by translated code */
-    uint64_t address, instructions, simd, sdot;
+    uint64_t address, instructions, simd, sdot, quarters;
 };
 
 /* Slabs never move: translated code holds pointers into them. A block that QEMU translates again gets a new entry. */
@@ -89,6 +89,61 @@ static int is_simd(uint32_t word) /* Arm ARM C4.1: bits 28:25 are x111 */
 static int is_sdot(uint32_t word) /* of 16 bytes: by vector, or by element */
 {
     return (word & 0xFFE0FC00) == 0x4E809400 || (word & 0xFFC0F400) == 0x4F80E000;
+}
+
+/* What instructions take of a Cortex-A76, by Arm's optimization guide: four dispatched a cycle, two vector pipes, of which
+ * the first alone multiplies integers, converts and divides, two accesses to memory of 16 bytes, one of them a store. */
+struct ports {
+    unsigned dispatched, vector, first, memory, stores;
+};
+
+static unsigned first_pipe(uint32_t word) /* cycles in the first vector pipe, for what no other can do */
+{
+    unsigned q = word >> 30 & 1, of_five = word >> 12 & 31, of_four = word >> 12 & 15;
+    if ((word & 0x9F200C00) == 0x0E200000) /* widening: multiplications have bit 15 */
+        return word >> 15 & 1;
+    if ((word & 0x9F20F400) == 0x0E209400 || (word & 0x9F20FC00) == 0x0E20B400) /* MLA, MLS, MUL; SQDMULH */
+        return 1 + q;
+    if ((word & 0x9F000400) == 0x0F000000) /* by element: of integers, but SDOT */
+        return !(of_four & 1) && of_four != 14;
+    if ((word & 0x9F3E0C00) == 0x0E200800 && of_five >= 0x16) /* conversions, of FP32; between it and FP16 always two */
+        return of_five < 0x18 ? 2 : 1 + q;
+    if ((word & 0x9F7E0C00) == 0x0E780800 && of_five >= 0x18) /* conversions of FP16 */
+        return 2 + 2 * q;
+    if ((word & 0xBFA0FC00) == 0x2E20FC00 || (word & 0xBFE0FC00) == 0x2E403C00 || (word & 0xFF20FC00) == 0x1E201800)
+        return 10; /* divisions */
+    return 0;
+}
+
+static void occupy(struct ports *p, uint32_t word)
+{
+    static const unsigned char registers[16] = {4, 1, 4, 1, 3, 1, 3, 1, 2, 1, 2, 1, 1, 1, 1, 1};
+    unsigned n = 1, vector = word >> 26 & 1;
+    if ((word >> 25 & 5) == 4) { /* a load or a store */
+        unsigned structure = (word & 0xBE000000) == 0x0C000000, many = structure && !(word >> 24 & 1);
+        if (many)
+            n = registers[word >> 12 & 15];
+        else if (vector && (word & 0x3A000000) == 0x28000000 && word >> 30 == 2) /* a pair of 16 bytes each */
+            n = 2;
+        if (structure && (!many || !(word >> 12 & 3))) /* interleaved, or to all lanes */
+            p->vector += n;
+        unsigned literal = (word & 0x3B000000) == 0x18000000, more = !vector && (word & 0x38800000) == 0x38800000;
+        p->stores += literal || more || word >> 22 & 1 ? 0 : n;
+        p->memory += n;
+    } else if (is_simd(word)) {
+        unsigned first = first_pipe(word);
+        p->first += first;
+        p->vector += first ? first : 1;
+    }
+    p->dispatched += n;
+}
+
+static uint64_t quarters_of(const struct ports *p) /* the busiest, and one cycle to go on to the next block */
+{
+    uint64_t own[] = {2 * p->vector, 4 * p->first, 2 * p->memory, 4 * p->stores}, most = p->dispatched;
+    for (unsigned i = 0; i < sizeof own / sizeof *own; i++)
+        most = own[i] > most ? own[i] : most;
+    return most + 4;
 }
 
 static void on_memory(unsigned cpu, uint32_t what, uint64_t address, void *unused)
@@ -130,15 +185,18 @@ static void on_translated(qemu_plugin_id_t id, struct qemu_plugin_tb *tb)
     pthread_mutex_unlock(&lock);
     block->address = qemu_plugin_tb_vaddr(tb);
     block->instructions = qemu_plugin_tb_n_insns(tb);
+    struct ports ports = {0};
     for (size_t i = 0; i < block->instructions; i++) {
         uint32_t word;
         memcpy(&word, qemu_plugin_insn_data(qemu_plugin_tb_get_insn(tb, i)), sizeof word);
         block->simd += is_simd(word);
         block->sdot += is_sdot(word);
+        occupy(&ports, word);
         if (with_memory)
             qemu_plugin_register_vcpu_mem_cb(qemu_plugin_tb_get_insn(tb, i), on_memory, NO_REGISTERS, READS_AND_WRITES,
                                              NULL);
     }
+    block->quarters = quarters_of(&ports);
     if (with_threads)
         qemu_plugin_register_vcpu_tb_exec_cb(tb, on_executed, NO_REGISTERS, block);
     qemu_plugin_register_vcpu_tb_exec_inline(tb, QEMU_PLUGIN_INLINE_ADD_U64, &block->entered, 1);
@@ -174,7 +232,8 @@ static void on_syscall(qemu_plugin_id_t id, unsigned cpu, int64_t number, uint64
     for (struct slab *slab = slabs; slab; slab = slab->next)
         for (size_t i = 0; i < slab->used; i++) {
             struct block *b = &slab->blocks[i];
-            uint64_t row[5] = {b->address, b->entered - b->entered_at_start, b->instructions, b->simd, b->sdot};
+            uint64_t row[] = {b->address,      b->entered - b->entered_at_start, b->instructions, b->simd, b->sdot,
+                              b->quarters};
             if (starts)
                 b->entered_at_start = b->entered;
             else if (row[1] && fwrite(row, sizeof row, 1, file) != 1)

@@ -1,11 +1,10 @@
-"""Run published networks with empty or random weights in the emulated Pi, each in a section of its own, 1, 2, ...
+"""Run a published network with empty or random weights in the emulated Pi, in section 1.
 
-    network.py ncnn THREADS SIZE:GRAPH ...             a GRAPH is a .param of ncnn's
-    network.py executorch THREADS SIZE:PROGRAM ...     a PROGRAM is a .pte; one thread only
+    network.py ncnn THREADS SIZE:GRAPH             GRAPH is a .param of ncnn's
+    network.py executorch THREADS SIZE:PROGRAM     PROGRAM is a .pte; one thread only
 
-SIZE is the side of the square picture that a network takes. Of ExecuTorch the second inference is counted, as it packs
-weights in the first; ncnn does so when it loads, and its first inference is like the third. One line for each network
-says that it has run.
+SIZE is the side of the square picture that the network takes. Of ExecuTorch the second inference is counted, as it
+packs weights in the first; ncnn does so when it loads, and its first inference is like the third.
 """
 
 import ctypes
@@ -63,16 +62,14 @@ def executorch(program: str, size: int, threads: int) -> Callable[[], Any]:
 KEPT: list[Any] = []
 
 
-def main(runtime: str, threads: str, *networks: str) -> None:
-    for section, network in enumerate(networks, 1):
-        size, path = network.split(":", 1)
-        run = {"ncnn": ncnn, "executorch": executorch}[runtime](path, int(size), int(threads))
-        if runtime == "executorch":
-            run()
-        mark(True, section)
+def main(runtime: str, threads: str, network: str) -> None:
+    size, path = network.split(":", 1)
+    run = {"ncnn": ncnn, "executorch": executorch}[runtime](path, int(size), int(threads))
+    if runtime == "executorch":
         run()
-        mark(False, section)
-        print(f"ran {path}", flush=True)
+    mark(True, 1)
+    run()
+    mark(False, 1)
     os._exit(0)  # without ncnn's destructors, which abort for allocators that outlive their nets
 
 

@@ -30,7 +30,7 @@ from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
 
 PROTOCOL_VERSION = 4
-FIRMWARE_VERSION = "4.1.0"  # open() accepts no other; firmware/rover/protocol.h has the same
+FIRMWARE_VERSION = "4.1.1"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
 LINE_MAX = 128  # bytes of a line from the Arduino
 SEQUENCES = 1 << 32

@@ -1,11 +1,12 @@
 """What a Raspberry Pi 5 takes for counted work, by the fit that `python -m lab clock` made: computed, never measured.
 
-    predict_ms(Work(instructions_g=1.44, near_lines_g=0.03, far_lines_g=0.005), threads=3)
+    predict_ms(Work(cycles_g=0.69, near_lines_g=0.03, far_lines_g=0.005), threads=3)
 
-The fit has three terms, and each has a meaning. What a core does itself: the instructions of the busiest thread, and
-the lines of 64 bytes that this thread fetches into its core's first cache. What all cores share: the lines between them
-and the memory. The two overlap, so that the time is the root of the sum of their squares. The low and the high end are
-as far off as nine in ten published times were from a fit that did not know them. docs/clock.md shows those.
+The fit has three terms, and each has a meaning. What a core does itself: the cycles that the busiest thread's
+instructions take of a core that waits for nothing, and the lines of 64 bytes that it fetches into its first cache. What
+all cores share: the lines between them and the memory. The two overlap, so that the time is the root of the sum of
+their squares. The low and the high end are as far off as nine in ten architectures were from a fit that did not
+know them. docs/clock.md shows those.
 """
 
 import json
@@ -20,6 +21,7 @@ from rover_lib.onboard.errors import ParamsError
 
 FITTED = Path(__file__).with_name("pi5.json")  # written by `python -m lab clock`
 CORES = 4
+OVERLAP = 2  # of what a core does and what the memory does: 1 if they took turns, more the more they overlap
 DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view
 
 
@@ -35,11 +37,11 @@ class Span(NamedTuple):
 class Work:
     """What one inference executes in one thread, in 10**9.
 
-    near_lines_g, far_lines_g: lines of 64 bytes, as `lab.a76.core.Emulation` counts them.
+    cycles_g, near_lines_g, far_lines_g: cycles, and lines of 64 bytes, as `lab.a76.core.Emulation` counts them.
     alone: the share of the instructions, 0 to 1, that one thread executes while the others wait.
     """
 
-    instructions_g: float
+    cycles_g: float
     near_lines_g: float
     far_lines_g: float
     alone: float = 0.0
@@ -47,17 +49,17 @@ class Work:
     @classmethod
     def of(cls, row: Mapping[str, Any]) -> "Work":
         """Return the work that a row of arm.json or clock.json tells of."""
-        return cls(row["instructions_g"], row["near_lines_g"], row["far_lines_g"], row["alone"])
+        return cls(row["cycles_g"], row["near_lines_g"], row["far_lines_g"], row["alone"])
 
     def terms(self, threads: int) -> tuple[float, float, float]:
-        """Return the busiest thread's instructions and near lines, and the far lines of all, in 10**9.
+        """Return the busiest thread's cycles and near lines, and the far lines of all, in 10**9.
 
         Raises ParamsError for threads that a Pi 5 does not have.
         """
         if not 1 <= threads <= CORES:
             raise ParamsError(f"a Raspberry Pi 5 has {CORES} cores", found=threads, remedy="give 1 to 4 threads")
         part = self.alone + (1 - self.alone) / threads
-        return self.instructions_g * part, self.near_lines_g * part, self.far_lines_g
+        return self.cycles_g * part, self.near_lines_g * part, self.far_lines_g
 
 
 @cache
@@ -66,9 +68,10 @@ def fitted() -> dict[str, Any]:
     return json.loads(FITTED.read_text())
 
 
-def time_ms(terms: Sequence[float], ns: Sequence[float]) -> float:
+def time_ms(terms: Sequence[float], ns: Sequence[float], overlap: int = OVERLAP) -> float:
     """Return the time of one inference from the terms of its work, in 10**9, and what one of each takes."""
-    return 1e3 * math.hypot(terms[0] * ns[0] + terms[1] * ns[1], terms[2] * ns[2])
+    own, shared = terms[0] * ns[0] + terms[1] * ns[1], terms[2] * ns[2]
+    return 1e3 * (own**overlap + shared**overlap) ** (1 / overlap)
 
 
 def predict_ms(work: Work, threads: int = DRIVING, fit: Mapping[str, Any] | None = None) -> Span:

@@ -22,7 +22,7 @@ def draw_clock(clock: Mapping[str, Any], measured: Sequence[Mapping[str, Any]] =
     _ours(axes[0, 1], clock["policies"], measured)
     held = clock["judged"]
     shares = " and ".join(f"{held[n]['held_pct']:.0f} % on {n}" for n in held)
-    claim(fig, f"Of published times that the fit did not know, the interval holds {shares} threads.")
+    claim(fig, f"Of times unknown to the fit, the interval holds {shares} threads.")
     return fig
 
 
@@ -38,7 +38,7 @@ def _published(ax: Axes, networks: Sequence[Mapping[str, Any]], measured: Sequen
             label = f"{runtime}, {threads} thread{'s' * (threads > 1)}"
             ax.errorbar(x, y, yerr=far, fmt="o", ms=4, color=colour, mfc=face, elinewidth=0.6, label=label)
     for row in networks:
-        if row["not_judged"]:
+        if row["odd"]:
             ax.annotate(row["name"], (row["published_ms"], row["predicted_ms"]), (4, -9), textcoords="offset points",
                         fontsize=8)  # fmt: skip
     if measured:

@@ -186,9 +186,12 @@ def load_recordings(
         kinds: dict[str, int] = {}
         for fault in faults.listed():
             kinds[fault.kind] = kinds.get(fault.kind, 0) + fault.count
-        worst = ", ".join(f"{kind} {n} times" for kind, n in sorted(kinds.items(), key=lambda k: (-k[1], k[0]))[:6])
+        most = sorted(kinds, key=lambda kind: (-kinds[kind], kind))[:6]
+        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
+        notes = {fault.kind: fault.note for fault in reversed(faults.listed())}
         raise EpisodeError(
             f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'})",
+            found=next((notes[kind] for kind in ("no_formula", *most) if notes.get(kind)), None),
             remedy="record again, or copy the whole folders, frames included",
         )
     return Recordings(root, episodes, faults.listed(), source)
@@ -404,8 +407,9 @@ def _read_actions(
         duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
     found, duties = np.array(list(recorded.values())), np.array(list(duties_pct.values()))
     agrees = np.abs(found - np.array(list(meant.values()))) <= EXACT
-    if len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS:
-        formula = formula_of(channel, found, duties)
+    # Firmware may have been changed within a recording, so only what disagrees must follow another formula.
+    formula = formula_of(channel, found[~agrees], duties[~agrees])
+    if formula or (len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS):
         first = next(i for i, ok in zip(recorded, agrees, strict=True) if not ok)
         seen = f"control {first}: {recorded[first]:g} recorded, its pulse says {meant[first]:.4f}"
         if formula is None:

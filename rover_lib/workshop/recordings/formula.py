@@ -49,8 +49,11 @@ OLD = {"steering": Formula(7.0, 2.42, -1.0, 1.0), "throttle": Formula(0.0, 70.0,
 def formula_of(channel: Channel, actions: np.ndarray, duties_pct: np.ndarray) -> Formula | None:
     """The formula that recorded actions, (n,), follow at their duties: an old one that is known, or any straight line.
 
-    None if they follow none: fewer than FOLLOWS of them are within EXACT of it.
+    None if they follow none: fewer than FOLLOWS of them are within EXACT of it. Of fewer than LEAST_READINGS, only a
+    formula that is known is recognised.
     """
+    if not len(actions):
+        return None
     known = OLD[channel.name]
     if known.share(actions, duties_pct) >= FOLLOWS:
         return known

@@ -22,7 +22,7 @@ from rover_lib.workshop.act import ACT
 
 ROOT = Path(__file__).parents[3]
 PROMISED = re.compile('20 to 40 ms a plan, "expected 30"|"20 to 30 ms"')  # by the guide that this project began with
-NS = (0.16, 1.8, 7.5)
+NS = (0.42, 1.1, 7.5)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,13 @@ def test_an_interval_holds_nine_in_ten_that_the_fit_did_not_know():
     assert clock.off_of(far, NS) == pytest.approx(1.0)
 
 
+def test_the_choice_of_a_form_is_judged_on_what_it_did_not_see():
+    rows = rows_of(np.random.default_rng(1).normal(0, 0.02, 8))
+    found = clock.judge_choice(rows)
+    assert found["chosen"]["cycles_g, 2"] == 8, "the form that made the times"
+    assert found["1"]["n"] == found["4"]["n"] == 8 and found["1"]["median_pct"] < 5
+
+
 def test_reach_is_the_size_that_nine_in_ten_keep_below():
     assert clock.reach([0.1 * i for i in range(1, 20)]) == pytest.approx(1.8)
     assert clock.reach([-0.3, 0.1]) == 0.3
@@ -79,12 +86,14 @@ def test_the_jsons_gates_are_those_of_today_and_the_misses_are_known(metrics):
         for n, own in limits.items()
         for key, limit in own.items()
     }
-    assert {row["gate"] for row in metrics["gates"] if not row["passed"]} <= {"1 thread, median %"}
+    assert {row["gate"] for row in metrics["gates"] if not row["passed"]} == {
+        "4 threads, worst %"
+    }  # docs/clock.md says why
 
 
 def test_every_published_time_has_source_date_and_count(metrics):
-    judged = [row for row in metrics["networks"] if not row["not_judged"]]
-    assert len(judged) >= 60 and sum(row["runtime"] == "executorch" for row in judged) >= 8
+    assert len(metrics["networks"]) >= 60 and sum(row["runtime"] == "executorch" for row in metrics["networks"]) >= 8
+    assert read_stage(clock.OUTPUT, "clock")["params"]["counting"] == clock.counted_by(), "counted by another program"
     for row in metrics["networks"]:
         assert re.search(r"read 20\d\d-\d\d", row["source"]) and row["instructions_g"] > 0
         assert row["predicted_low_ms"] < row["predicted_ms"] < row["predicted_high_ms"]
@@ -105,9 +114,8 @@ def test_counts_that_are_there_are_not_counted_again(tmp_path, monkeypatch):
     def never(*args, **kwargs):
         raise AssertionError("counted again")
 
-    for name in ("prepare", "count_ncnn", "count_policy"):
+    for name in ("prepare", "count_network", "count_policy"):
         monkeypatch.setattr(clock, name, never)
-    monkeypatch.setattr(clock, "count_executorch", never)
     known = read_stage(clock.OUTPUT, "clock")["metrics"]["counts"]
     monkeypatch.setattr(clock, "read_published", lambda: [n for n in read_published() if n.key in known])
     monkeypatch.setattr(clock, "POLICIES", [s for s in POLICIES if clock.key_of_policy(s) in known])
@@ -118,8 +126,11 @@ def test_counts_that_are_there_are_not_counted_again(tmp_path, monkeypatch):
     assert result.exit_code in (0, 1), result.output
     assert "ours" not in result.output and "median %" in result.output
     assert json.loads((tmp_path / "pi5.json").read_text())["ns"] == pytest.approx(pi5.fitted()["ns"], rel=1e-3)
+    monkeypatch.undo()
+    monkeypatch.setattr(clock, "prepare", lambda progress: None)
+    monkeypatch.setattr(clock, "cache_folder", lambda kind, key, make: make(tmp_path))
     result = CliRunner().invoke(main, ["clock", str(tmp_path / "new.json")])
-    assert result.exit_code and "--ncnn benchmark/models" in result.output
+    assert result.exit_code and "--ncnn FOLDER" in result.output
 
 
 def test_random_weights_have_the_channels_that_were_asked_for():

@@ -81,6 +81,31 @@ def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
     assert done.total(SECTION) == 1 + ROUNDS * len(LOOP) + len(mark(0))
     assert done.total(SECTION, "simd") == 2 * ROUNDS
     assert done.total(SECTION, "sdot") == ROUNDS
+    # A round dispatches four instructions in a cycle, and takes one more to go on to the next.
+    assert done.cycles(SECTION) == pytest.approx(2 * ROUNDS, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("words", "cycles"),
+    [
+        ([0x4E829420] * 6, 3),  # sdot: two a cycle
+        ([0x4EA29C20] * 2, 4),  # mul v0.4s: only the first pipe multiplies integers, in two cycles
+        ([0x4E21D820], 2),  # scvtf v0.4s, v1.4s: the first pipe converts, in two cycles
+        ([0x4F821020] * 4, 2),  # fmla v0.4s by element: two a cycle
+        ([0xAD400560] * 2, 2),  # ldp q0, q1: two accesses each, two a cycle
+        ([0x4C402160] * 2, 4),  # ld1 of four registers
+        ([0x3D800160] * 3, 3),  # str q0: one a cycle
+        ([0x3DC00160] * 4, 2),  # ldr q0: two a cycle
+        ([0xF9400160, 0xF9800160], 1),  # a load, and a prefetch, which is no store
+    ],
+)
+def test_instructions_wait_for_their_ports(plugin_only, tmp_path, words, cycles):
+    first = 0xD10043EB  # sub x11, sp, #16
+    loop = [*words, 0xF1000529, 0x54000001 | (-(len(words) + 1) & 0x7FFFF) << 5]
+    code = [first, *mov(9, ROUNDS), *mark(1), *loop, *mark(0), *mov(8, 93), *mov(0, 0), SVC]
+    done = emulate(plugin_only, [program(tmp_path / "loop", code)], tmp_path)
+    busiest = max(cycles, len(loop) / 4)
+    assert done.cycles(SECTION) == pytest.approx((busiest + 1) * ROUNDS, rel=0.01)
 
 
 READ, WRITE = 0xF8440400 | 11 << 5 | 10, 0xF8040400 | 11 << 5 | 10  # ldr, str x10, [x11], #64
@@ -142,7 +167,7 @@ def test_functions_are_named_by_address(tmp_path):
 
 
 def test_kernels_are_summed_and_the_rest_is_other():
-    rows = [(1, 10, 5, 2, 1), (2, 1, 5, 0, 0), (3, 100, 1, 1, 0), (4, 1, 1, 0, 0)]
+    rows = [(1, 10, 5, 2, 1, 9), (2, 1, 5, 0, 0, 9), (3, 100, 1, 1, 0, 6), (4, 1, 1, 0, 0, 5)]
     names = {1: "_Z3fooi", 2: "_Z3fooi", 3: "bar", 4: "baz"}
     kernels = by_kernel(np.array(rows, BLOCK), names, at_most=2)
     assert kernels == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}

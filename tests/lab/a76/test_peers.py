@@ -82,7 +82,19 @@ def tiny_run(tiny, tmp_path_factory) -> SimpleNamespace:
 def counted(chunks: np.ndarray, steady: int = 3_000_000) -> Counted:
     versions = {"threads": 1}
     return Counted(
-        9, (5, 4, steady), 2_000_000, 1_000_000, 500, 200, {"k": (steady, 2, 1)}, 70.0, 80.0, 60.0, chunks, versions
+        9,
+        (5, 4, steady),
+        2_000_000,
+        1_000_000,
+        2e6,
+        500,
+        200,
+        {"k": (steady, 2, 1)},
+        70.0,
+        80.0,
+        60.0,
+        chunks,
+        versions,
     )
 
 
@@ -155,7 +167,7 @@ def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
     subprocess.run(
         ["gcc", "-shared", "-fPIC", "-fvisibility=hidden", "-s", "-o", tmp_path / "one.so", source], check=True
     )
-    blocks = np.array([(0x5000001100, 2, 8, 4, 4), (0x5000001140, 1, 5, 0, 0)], BLOCK)
+    blocks = np.array([(0x5000001100, 2, 8, 4, 4, 12), (0x5000001140, 1, 5, 0, 0, 9)], BLOCK)
     names = GuestFunctions(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
     assert by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
 

@@ -88,7 +88,7 @@ def test_neutral_before_anything_else(board):
         periods = [e.period_us for e in pulses(events, pin)][1:]
         assert periods
         assert all(abs(p - period_us) <= EDGE_US for p in periods)
-    assert board.lines[0] == f"<H 4 4.1.0 {board.boot} 0 p {car.this_car().id}"
+    assert board.lines[0] == f"<H 4 4.1.1 {board.boot} 0 p {car.this_car().id}"
     status = board.status
     assert (status.state, status.reason, status.result) == ("M", "r", "-")
     assert status.receiver_steering_us == status.receiver_throttle_us == "-"
@@ -250,7 +250,7 @@ def test_lines_of_another_start_never_move_a_pin(armed):
     armed.run_ms(150)
     assert armed.boot == boot + 1
     assert armed.lines[-1].startswith("<S")
-    assert any(body == f"<H 4 4.1.0 {armed.boot} 0 e {car.this_car().id}" for body in armed.lines)
+    assert any(body == f"<H 4 4.1.1 {armed.boot} 0 e {car.this_car().id}" for body in armed.lines)
     for text in old:
         armed.send(text)
     events = armed.run_ms(60)
@@ -353,7 +353,7 @@ def test_a_hung_loop_is_reset_by_the_watchdog(armed):
     assert later
     assert max(later) <= 124 + ARDUINO_STEP_US
     on_pins(events, *REST, after_us=resets[0] + 60_000, within_us=STEP_US)
-    assert any(body == f"<H 4 4.1.0 {armed.boot} 0 w {car.this_car().id}" for body in armed.lines)
+    assert any(body == f"<H 4 4.1.1 {armed.boot} 0 w {car.this_car().id}" for body in armed.lines)
     assert (armed.status.state, armed.status.reason) == ("M", "r")
     arm(armed)
 

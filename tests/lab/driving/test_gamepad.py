@@ -15,20 +15,21 @@ import pytest
 from balloon_world.child_process import Child
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.bench import FaultError
+from lab.driving.priority import boost, boost_priority
 from lab.driving.virtual_gamepad import VirtualGamepad
 
 pytestmark = [pytest.mark.emulated, pytest.mark.slow, needs.simavr]
 STOP_MS = 200
 CAP_US = 238  # of a stick at its end: the cap
 RELAY = """
-import faulthandler, sys, time
-faulthandler.dump_traceback_later(15, repeat=True)
+import sys, time
 from pathlib import Path
+from lab.driving.priority import boost_priority
 from lab.driving.virtual_gamepad import plug_in
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 plug_in(Path(sys.argv[1]))
-with ServoLink(sys.argv[2], car=Car(human="gamepad")) as link:
+with ServoLink(sys.argv[2], car=Car(human="gamepad")) as link, boost_priority():
     print("open", flush=True)
     for line in sys.stdin:
         try:
@@ -47,7 +48,8 @@ with ServoLink(sys.argv[2], car=Car(human="gamepad")) as link:
 
 @pytest.fixture
 def board():
-    with EmulatedArduino(human="gamepad", every_pulse=False, nice=NICE) as board:
+    with EmulatedArduino(human="gamepad", every_pulse=False, nice=NICE) as board, boost_priority():
+        boost(board.pid)
         yield board
 
 

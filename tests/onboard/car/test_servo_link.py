@@ -33,7 +33,7 @@ def test_frame_and_parse():
     assert said == Telemetry(2.5, 7, 1234, 5, "k", State.MANUAL, "r", "w", *pulses, 1, 2, 3, 4)
     assert said.why == "manual: after a reset"
     assert (said.pulses.steering_us, said.pulses.throttle_us) == (1456, 120)
-    assert parse(line(f"<H 4 4.1.0 7 0 w {DEFAULT}")[:-1], 0) == Hello(4, "4.1.0", 7, 0, "watchdog", DEFAULT)
+    assert parse(line(f"<H 4 4.1.1 7 0 w {DEFAULT}")[:-1], 0) == Hello(4, "4.1.1", 7, 0, "watchdog", DEFAULT)
     assert parse(line("<H 5 5.1 whatever comes then")[:-1], 0).protocol == 5
 
 
@@ -47,7 +47,7 @@ def test_frame_and_parse():
         STATUS.replace("1460 21316", "1460 -"),
         STATUS.replace("1456", "-1456"),
         STATUS.replace("1456", "01456"),
-        "<H 4 4.1.0",
+        "<H 4 4.1.1",
         "<H",
         "",
     ],
@@ -72,7 +72,7 @@ def test_a_garbled_status_says_nothing(data):
 def test_a_drive_ends_in_neutral():
     with board_of(answer=obedient) as board:
         with ServoLink(board.port) as link:
-            assert link.hello == Hello(4, "4.1.0", 7, 0, "reset pin", DEFAULT)
+            assert link.hello == Hello(4, "4.1.1", 7, 0, "reset pin", DEFAULT)
             assert link.arm().state is State.AUTONOMOUS
             number = link.send(1500, 200)
             until(lambda: link.latest().sequence == number)
@@ -113,7 +113,7 @@ def test_pulses_out_of_range_are_not_sent(steering_us, throttle_us):
 
 
 def test_sequence_numbers_go_on_where_the_arduino_was():
-    hello = f"<H 4 4.1.0 9 4294967294 e {DEFAULT}"
+    hello = f"<H 4 4.1.1 9 4294967294 e {DEFAULT}"
     with board_of(hello=hello, answer=lambda b, _: b.status("S", "n", boot=9)) as board, ServoLink(board.port) as link:
         assert [link.send(1456, 120) for _ in range(3)] == [4294967295, 0, 1]
 
@@ -123,9 +123,9 @@ def test_sequence_numbers_go_on_where_the_arduino_was():
     [
         (
             "<H 5 5.0.0 something else",
-            r"firmware 5\.0\.0 \(protocol 5\), this program knows 4\.1\.0 \(protocol 4\); .*make",
+            r"firmware 5\.0\.0 \(protocol 5\), this program knows 4\.1\.1 \(protocol 4\); .*make",
         ),
-        ("<H 2 2.1.0 7 0 e", r"firmware 2\.1\.0 \(protocol 2\), this program knows 4\.1\.0"),
+        ("<H 2 2.1.0 7 0 e", r"firmware 2\.1\.0 \(protocol 2\), this program knows 4\.1\.1"),
         ("<H 1 1.0.0 7 0 e", r"firmware 1\.0\.0 \(protocol 1\)"),
     ],
 )
@@ -138,7 +138,7 @@ def test_another_firmware_is_refused(hello, sentence):
 
 def test_an_arduino_that_is_not_reset_is_asked():
     with board_of(hello=None) as board:
-        board.hello = f"<H 4 4.1.0 7 40 p {DEFAULT}"
+        board.hello = f"<H 4 4.1.1 7 40 p {DEFAULT}"
 
         def go_on(board=board):
             for _ in range(60):
@@ -192,7 +192,7 @@ def test_the_arduino_is_told_when_somebody_asked():
         assert next(b for b in board.heard if b.startswith(">A")).split()[4] == str(asked)
         link.request()
         board.status("M", "r", "-", boot=9)
-        board.say(f"<H 4 4.1.0 9 0 w {DEFAULT}")
+        board.say(f"<H 4 4.1.1 9 0 w {DEFAULT}")
         until(lambda: link.resets)
         with pytest.raises(LinkError, match="reset since the car was asked for"):
             link.arm()
@@ -237,8 +237,8 @@ def test_a_status_of_another_start_is_no_answer():
 
 def test_what_waited_in_the_port_is_dropped_and_nobody_else_gets_it():
     with board_of(hello="") as board:
-        board.hello = f"<H 4 4.1.0 7 0 e {DEFAULT}"
-        board.say(f"<H 4 4.1.0 3 99 e {DEFAULT}")  # of before the port was opened
+        board.hello = f"<H 4 4.1.1 7 0 e {DEFAULT}"
+        board.say(f"<H 4 4.1.1 3 99 e {DEFAULT}")  # of before the port was opened
         time.sleep(0.05)
         threading.Timer(0.2, board.greet).start()
         with ServoLink(board.port) as link:
@@ -253,7 +253,7 @@ def test_a_reset_meanwhile_needs_arming_again():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         link.arm()
         link.send(1500, 200)
-        board.hello = f"<H 4 4.1.0 8 0 w {DEFAULT}"
+        board.hello = f"<H 4 4.1.1 8 0 w {DEFAULT}"
         board.say(board.hello)
         until(lambda: link.resets == 1)
         link.send(1500, 200)
@@ -264,7 +264,7 @@ def test_a_reset_meanwhile_needs_arming_again():
 @pytest.mark.slow
 def test_a_reset_whose_hello_was_lost_is_noticed():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
-        board.hello = f"<H 4 4.1.0 8 0 w {DEFAULT}"
+        board.hello = f"<H 4 4.1.1 8 0 w {DEFAULT}"
         until(lambda: board.status(boot=8, sequence=0) or link.resets == 1)
 
 
@@ -343,7 +343,7 @@ def test_the_age_of_what_is_not_acknowledged():
         board.status("A", "a", sequence=second)
         until(lambda: link.unacknowledged_s(clock()) == 0)
         link.send(1500, 200)
-        board.hello = f"<H 4 4.1.0 8 0 w {DEFAULT}"  # another start will never answer
+        board.hello = f"<H 4 4.1.1 8 0 w {DEFAULT}"  # another start will never answer
         board.say(board.hello)
         until(lambda: link.unacknowledged_s(clock()) == 0)
 

@@ -295,7 +295,7 @@ def test_an_arduino(proc, monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
         checks = {c.name: c for c in doctor.arduino(board.port, proc_root=proc, boot_s=2)}
-    assert checks["Arduino"].found == f"{board.port}: firmware 4.1.0, protocol 4"
+    assert checks["Arduino"].found == f"{board.port}: firmware 4.1.1, protocol 4"
     assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven

@@ -460,7 +460,7 @@ def arduino():
         n, said = 40, False
         while not done.wait(0.02):
             if n % 25 == 0 or not said:
-                os.write(master, frame(f"<H 4 4.1.0 7 0 e {Car().id}"))
+                os.write(master, frame(f"<H 4 4.1.1 7 0 e {Car().id}"))
                 said = True
             os.write(master, status(n))
             n += 1

@@ -442,13 +442,17 @@ def test_a_value_that_its_pulse_denies_is_counted(tmp_path):
     assert recordings.faults_by_kind() == {"taken as recorded": {"steering_disagrees_with_pulse": 1}}
 
 
-def rewritten(formulas, wrong=0):
-    """Return a change of a recording: its actions as other formulas of the duty give them, `wrong` of them random."""
+def rewritten(formulas, wrong=0, share=1.0):
+    """Return a change of a recording: its actions, or those of the first `share` of it, as other formulas of the duty
+    give them, `wrong` of them random.
+    """
 
     def change(content):
-        rng = np.random.default_rng(0)
-        for i, row in enumerate(content["control_samples"]):
+        rng, rows = np.random.default_rng(0), content["control_samples"]
+        for i, row in enumerate(rows[: round(share * len(rows))]):
             for name, (neutral, span) in formulas.items():
+                if not row[f"{name}_period_us"]:
+                    continue  # not measured, in real recordings
                 duty = 100 * row[f"{name}_raw_us"] / row[f"{name}_period_us"]
                 low = -1 if name == "steering" else 0
                 said = min(max((duty - neutral) / span, low), 1)
@@ -466,11 +470,14 @@ def rewritten(formulas, wrong=0):
         ({"throttle": (5, 95)}, "throttle = (duty % - 5) / 95"),
     ],
 )
-@pytest.mark.parametrize("wrong", [0, 3])
-def test_actions_of_another_formula_are_recomputed_from_their_pulses(tmp_path, formulas, said, wrong):
-    """A stopped car, 120 us, stood as 0.1687 in most real recordings, and was taken as recorded."""
+@pytest.mark.parametrize(("wrong", "share"), [(0, 1), (3, 1), (0, 0.6)])
+def test_actions_of_another_formula_are_recomputed_from_their_pulses(tmp_path, formulas, said, wrong, share):
+    """A stopped car, 120 us, stood as 0.1687 in most real recordings, and was taken as recorded.
+
+    Of a recording that begins with one formula and ends with the car's own, nothing was usable.
+    """
     whole = [s.chunk.tolist() for s in load(record(tmp_path)).samples]
-    edit(tmp_path / "episode_20260101_120000", rewritten(formulas, wrong))
+    edit(tmp_path / "episode_20260101_120000", rewritten(formulas, wrong, share))
     recordings = load(tmp_path)
     assert np.abs(np.array([s.chunk.tolist() for s in recordings.samples]) - whole).max() <= 1e-4
     assert recordings.recomputed().endswith(f"an older formula: {said}")
@@ -489,8 +496,20 @@ def test_actions_that_follow_no_formula_are_refused(tmp_path, name):
     assert fault.kind == "no_formula" and fault.handled == "left out"
     assert name in fault.note and "its pulse says" in fault.note
     shutil.rmtree(tmp_path / "episode_20260101_120000")
-    with pytest.raises(EpisodeError, match="no_formula 1 times"):
+    with pytest.raises(EpisodeError, match=f"no_formula 1 times.*found {name} follows no formula of its pulses"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.95])
+def test_a_real_recording_that_changed_its_formula_midway(tmp_path, share):
+    """The few readings of one formula among many of another's were taken as recorded, a standing car as 0.1687."""
+    name = "episode_20251007_144013"
+    whole = load(real_recordings() / name).samples
+    shutil.copytree(real_recordings() / name, tmp_path / name)
+    edit(tmp_path / name, rewritten({"steering": (7, 2.42), "throttle": (0, 70)}, share=share))
+    found = load(tmp_path)
+    assert np.abs(np.stack([s.chunk for s in found.samples]) - np.stack([s.chunk for s in whole])).max() <= 1e-3
+    assert found.recomputed()
 
 
 def test_the_real_recordings_have_the_actions_of_their_pulses():
