@@ -76,7 +76,7 @@ def start_relay(board, pad):
 
 
 def hear(child):
-    heard = child.read(30.0).decode().strip()
+    heard = child.read(120.0).decode().strip()
     assert heard, child.errors()
     return heard
 
