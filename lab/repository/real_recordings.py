@@ -9,6 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.drive.pilot import Sight
+from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.errors import CameraError
+from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge.compare import Fidelity, fidelity
@@ -42,9 +47,34 @@ def tell_of(
         "faults": read.faults_by_kind(),
         "side": sides.words(),
         "turnings": {t.episode: {k: getattr(t, k) for k in ("correlation", "sure", "spread")} for t in sides.turnings},
+        "camera": watch_pictures(read, progress),
         "guesses_pct": guess_each(read),
         "policies": {name: _policy(folder, elsewhere, progress) for name, folder in runs.items()},
     }
+
+
+def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[str, Any]:
+    """Show all pictures to the camera's watch as to a car that drives, and count those at which it would stop.
+
+    least: of all pictures, the contrast and the mean, in grey levels. most_equal: pictures in a row.
+    """
+    settings, stops, frames = Settings.of(params()["drive"]), 0, []
+    for episode in progress(recordings.episodes, desc="watching the camera"):
+        camera = Camera(episode.path)
+        sight = Sight(camera, settings)
+        for sample in episode.samples:
+            camera._add(sample.frame_bgr(), sample.time_s, None)
+            if (frame := camera.latest()) is None:
+                continue
+            sight.sent(sample.time_s, settings.throttle_limit)
+            try:
+                sight.watch(frame, sample.time_s)
+            except CameraError:
+                stops += 1
+            frames.append((frame.contrast, frame.mean, frame.repeats + 1))
+    contrasts, means, equal = zip(*frames, strict=True)
+    least = {"contrast": min(contrasts), "mean": min(means)}
+    return {"pictures": len(frames), "stops": stops, "least": least, "most_equal": max(equal)}
 
 
 def guess_each(recordings: Recordings) -> dict[str, dict[str, dict[str, float]]]:

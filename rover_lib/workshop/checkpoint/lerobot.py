@@ -48,6 +48,15 @@ STEPS = {
     POSTPROCESSOR: ("unnormalize_outputs.buffer_", "unnormalizer_processor"),
 }
 BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+# What a config.json of LeRobot 0.4 or 0.6 has, all else than the network's shape without an effect on a trained one.
+KNOWN = {
+    "type", "input_features", "output_features", "n_obs_steps", "chunk_size", "dim_model", "n_heads", "dim_feedforward",
+    "n_encoder_layers", "n_decoder_layers", "normalization_mapping", "vision_backbone", "pre_norm", "license", "tags",
+    "replace_final_stride_with_dilation", "feedforward_activation", "n_action_steps", "temporal_ensemble_coeff",
+    "use_vae", "latent_dim", "n_vae_encoder_layers", "dropout", "kl_weight", "device", "use_amp", "use_peft", "repo_id",
+    "push_to_hub", "private", "pretrained_path", "pretrained_revision", "pretrained_backbone_weights", "optimizer_lr",
+    "optimizer_lr_backbone", "optimizer_weight_decay",
+}  # fmt: skip
 
 
 def _broken(what: str, found: object = None) -> CheckpointError:
@@ -142,19 +151,20 @@ def read_lerobot(folder: Path) -> Contents:
     weights, notes = named_weights(file, state, file.stat().st_size)
     inputs, outputs = (_features(folder, raw, key) for key in ("input_features", "output_features"))
     sizes = _picture_sizes(folder, inputs)
-    if "action" not in outputs:
+    if outputs.get("action", ("",))[0] != "ACTION":
         raise CheckpointError(
-            f"{folder}: the policy has no 'action' output",
+            f"{folder}: the policy has no 'action' output of type ACTION",
             found=quote_all(outputs) or "none",
             remedy="train one that acts",
         )
     one_observation(folder, raw)
+    notes += _unheard(raw)
     keys = ("chunk_size", "dim_model", "n_heads", "dim_feedforward", "n_encoder_layers", "n_decoder_layers")
     chunk, dim, heads, feedforward, n_encoder, n_decoder = (positive(folder, raw, k) for k in keys)
     asked = raw.get("normalization_mapping", dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD"))
     inner = Normaliser(folder, PREPROCESSOR, asked, buffers)
     outer = Normaliser(folder, POSTPROCESSOR, asked, buffers)
-    sees_state = "observation.state" in inputs
+    sees_state = inputs.get("observation.state", ("",))[0] == "STATE"
     states, actions = inputs["observation.state"][1] if sees_state else [], outputs["action"][1]
     seen = _recorded_cameras(inner, sizes)
     config = config_from(
@@ -193,6 +203,19 @@ def read_lerobot(folder: Path) -> Contents:
         "notes": notes,
     }
     return Contents("lerobot", config, weights, sha256_of(file), file.stat().st_size, extra)
+
+
+def _unheard(raw: Mapping[str, Any]) -> list[str]:
+    """Return a note for what the config asks for beyond the network, which is all that is read."""
+    notes = []
+    if raw.get("temporal_ensemble_coeff") is not None:
+        notes.append(
+            f"temporal_ensemble_coeff is {quote(raw['temporal_ensemble_coeff'])}: LeRobot would drive by averages of "
+            "plans; here the car drives by the newest plan alone"
+        )
+    if unknown := sorted(set(raw) - KNOWN):
+        notes.append(f"config.json has what no ACT of LeRobot 0.4 or 0.6 has, not used: {quote_all(unknown)}")
+    return notes
 
 
 def _recorded_cameras(inner: "Normaliser", sizes: Mapping[str, Any]) -> list[str]:
@@ -255,6 +278,13 @@ def _refuse_shards(folder: Path, file: Path) -> None:
         )
 
 
+def _bare(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return a shape without the ones that it begins with, which change nothing."""
+    while len(shape) > 1 and shape[0] == 1:
+        shape = shape[1:]
+    return tuple(shape)
+
+
 class Normaliser:
     """Says how LeRobot normalises each input, or each output, as an Affine.
 
@@ -269,7 +299,7 @@ class Normaliser:
         self.where = folder / file
         self.modes, self.eps = asked, 1e-8
         self.stats: dict[str, Tensor] = {}
-        self.features: list[str] | None = None  # those that the processor's step names; it leaves all others alone
+        self.features: dict[str, Any] | None = None  # which the processor's step names; it leaves all others alone
         self.renames: dict[str, str] = {}  # what the recordings call an observation: what the policy calls it
         prefix, step_name = STEPS[file]
         self.old = not self.where.exists()
@@ -310,7 +340,7 @@ class Normaliser:
                 count += 1
                 self.modes, self.eps = config.get("norm_map", {}), config.get("eps", 1e-8)
                 features = config.get("features")
-                self.features = list(features) if isinstance(features, dict) else []
+                self.features = features if isinstance(features, dict) else {}
                 if config.get("normalize_observation_keys") is not None:
                     raise CheckpointError(
                         f"{self.where}: normalises some of the observations only (normalize_observation_keys)",
@@ -343,12 +373,14 @@ class Normaliser:
         key: the feature's name. kind: its type, for which the config has a mode. size: how many numbers it has.
         inverse: undo the normalisation, as for an output. Raises CheckpointError for missing or wrong statistics.
         """
-        mode = self.modes.get(kind)
+        if not inverse and self.features and isinstance(own := self.features.get(key), dict):
+            kind = own.get("type", kind)  # by which LeRobot chooses the mode, whatever the config says
+        mode = self.modes.get(kind) if isinstance(kind, str) else None
         if mode == "IDENTITY":
             return None
         name = key.replace(".", "_") if self.old else key
         stats = {k.removeprefix(f"{name}."): v for k, v in self.stats.items() if k.startswith(f"{name}.")}
-        left_out = not inverse and self.features is not None and key not in self.features
+        left_out = not inverse and self.features is not None and (key not in self.features or kind == "ACTION")
         if mode is None or not stats or left_out:
             raise self._would_be_raw(key, kind, mode, stats)
         pairs = {
@@ -372,11 +404,10 @@ class Normaliser:
             raise CheckpointError(
                 f"{self.where}: statistics of '{key}' are not floats ({odd})", remedy="compute them again"
             )
+        each = (size, 1, 1) if kind == "VISUAL" else (size,)  # LeRobot would spread another shape over steps or pixels
+        if odd := [f"{p} {list(stats[p].shape)}" for p in pairs[mode] if _bare(stats[p].shape) != _bare(each)]:
+            raise _broken(f"{self.where}: statistics of '{key}' have shapes {', '.join(odd)}, not {list(each)}")
         a, b = (stats[p].double().flatten() for p in pairs[mode])
-        if len(a) != size or len(b) != size:
-            raise _broken(
-                f"{self.where}: statistics of '{key}' have {len(a)} and {len(b)} values, the feature has {size}"
-            )
         if mode == "MEAN_STD":
             scale, shift = (b, a) if inverse else (1 / (b + self.eps), -a / (b + self.eps))
         else:

@@ -10,6 +10,7 @@ import codecs
 import io
 import json
 import math
+import struct
 import warnings
 from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager
@@ -63,6 +64,7 @@ FRAMES_FREE, FRAME_BYTES = 20_000, 20
 MOST_VALUES, MOST_PIXELS = 20_000_000, 20_000_000
 UNPACKED_FREE, PICTURES_FREE, UNPACKED_TIMES = 100_000_000, 1_000_000, 4
 COPY_AGAIN = "copy the whole dataset again"
+TOLERANCE_S = 1e-4  # LeRobot's tolerance_s
 UNEVEN = 0.1  # the time between two frames may differ by this share
 
 
@@ -161,15 +163,15 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     layout, cameras = _layout(root, info, source)
     _check_files(root, info)
     _check_tables(root, info["features"], {*NUMBERS, INTERVENTION, SUCCESS, *(camera.key for camera in cameras)})
-    dataset = _open_local(root)
+    dataset, of_videos = _open_local(root)
     _check_pictures(root, dataset, cameras)
     columns = _columns(root, dataset, layout)
     pictures = _Pictures(dataset, cameras)
     _check_rate(root, columns, float(info["fps"]))
     number = columns["episode_index"]
-    _check_episodes(root, dataset, number)
+    _check_tables_fit(root, dataset, columns)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    _check_order(root, columns, starts, info)
+    _check_order(root, columns, starts, info, video=any(c.key in dataset.meta.video_keys for c in cameras))
     exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
     _check_numbers(root, columns, layout, exported.car)
     episodes = []
@@ -180,14 +182,28 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
-    return Recordings(root, tuple(episodes), (*faults, *_odd_stats(dataset.meta.stats)), source, layout)
+    return Recordings(
+        root, tuple(episodes), (*faults, *of_videos, *_odd_stats(dataset.meta.stats, columns, layout)), source, layout
+    )
 
 
-def _odd_stats(stats: Mapping[str, Mapping[str, Any]] | None) -> Iterator[Fault]:
-    """Yield a fault if LeRobot's trainer could not normalise by the dataset's statistics. We compute our own."""
-    odd = [f"{k}'s {name}" for k, s in (stats or {}).items() for name, v in s.items() if not np.isfinite(v).all()]
+def _odd_stats(stats: Any, columns: Mapping[str, np.ndarray], layout: Layout) -> Iterator[Fault]:
+    """Yield a fault for statistics by which LeRobot's trainer would normalise wrongly. We compute our own."""
+    odd = []
+    for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
+        said, values = (stats or {}).get(key) or {}, columns[key].astype(np.float64)
+        right = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+        within = 1e-3 + 0.01 * (right["max"] - right["min"]).max()
+        for name, expected in right.items():
+            try:
+                found = np.asarray(said[name], np.float64)[list(order)]
+                fits = found.shape == expected.shape and len(said[name]) == len(expected)
+            except (ValueError, TypeError, KeyError, IndexError):
+                fits = False
+            if not (fits and (np.abs(found - expected) <= within).all()):  # written so that NaN does not fit
+                odd.append(f"{key}'s {name}")
     if odd:
-        note = f"{quote(odd[0])} is not a number: lerobot-train would learn nothing from it; write them again"
+        note = f"{odd[0]} is not that of the frames, and lerobot-train would normalise by it; compute them again"
         yield Fault("meta/stats.json", "odd_statistics", len(odd), note)
 
 
@@ -313,6 +329,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
             found = features[key]["shape"] if key in features else quote_all(features)
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=found, remedy="record one")
+        if not str(features[key].get("dtype")).startswith(("float", "int", "uint")):  # LeRobot makes 1 of 0.3 for bool
+            raise _broken(f"{root}: its '{key}' are no numbers by {INFO}", quote(features[key].get("dtype")))
     actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
     states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
     sizes = {camera.name: camera.size for camera in cameras}
@@ -343,6 +361,7 @@ def _name_numbers(
         example = ACTION_NAMES if size == len(ACTION_NAMES) else [f"joint_{i}" for i in range(1, size + 1)]
         raise EpisodeError(
             f"{root}: '{key}' does not name its {size} numbers",
+            found=quote(features[key].get("names")),
             remedy=f"name them in the order of the numbers: --action-names {','.join(example)}",
         )
     if len(names) != size or len(set(names)) != size:
@@ -363,7 +382,7 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
             return ()  # two names for one column
         names = sorted(names, key=names.__getitem__)  # in the order of their columns
     elif isinstance(names, dict) and len(names) == 1:
-        (names,) = names.values()  # {"motors": [...]}
+        return _names({"names": next(iter(names.values()))})  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
         bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
         return bare if set(bare) == set(ACTION_NAMES) else tuple(names)
@@ -371,8 +390,10 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
-    shape = list(feature["shape"])
-    if len(shape) == 3 and 3 in (shape[0], shape[2]) and math.prod(shape) <= 3 * MOST_PIXELS:
+    shape, kind = list(feature["shape"]), feature.get("info")
+    if isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map")):
+        shape = [*shape[:2], "distances"]
+    elif len(shape) == 3 and 3 in (shape[0], shape[2]) and math.prod(shape) <= 3 * MOST_PIXELS:
         return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
     raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
 
@@ -420,13 +441,25 @@ def _check_files(root: Path, info: Mapping[str, Any]) -> None:
 
 
 def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camera, ...]) -> None:
-    """Raise EpisodeError for pictures that are not in the dataset's own tables: a path may lead anywhere."""
+    """Raise EpisodeError for pictures of other sizes, or not in the dataset's own tables: a path may lead anywhere."""
+    from pyarrow import compute
+
     for camera in cameras:
         if camera.key in dataset.meta.video_keys:
             continue
+        row = 0
         for chunk in dataset.hf_dataset.data.column(camera.key).chunks:
-            if chunk.null_count or chunk.field("bytes").null_count:
+            packed = chunk.field("bytes")
+            if chunk.null_count or packed.null_count:
                 raise _broken(f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path")
+            for head in compute.binary_slice(
+                packed, 0, 26
+            ).to_pylist():  # LeRobot writes PNG; others are seen when read
+                if head.startswith(b"\x89PNG"):
+                    width, height, _, kind = struct.unpack(">IIBB", head[16:])
+                    shape = (height, width, {0: 1, 3: 1, 4: 2, 6: 4}.get(kind, 3))
+                    _Pictures._check_size(camera, shape, row, root)
+                row += 1
 
 
 def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> None:
@@ -445,10 +478,15 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
             raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
+        if unknown := [name for name in columns if name not in features]:
+            raise _broken(f"{path}: has columns that {INFO} does not know: {quote_all(unknown)}")
 
 
-def _open_local(root: Path) -> "LeRobotDataset":
-    """Open a local folder by LeRobot's own loader. The loader would fetch missing files; here they are an error."""
+def _open_local(root: Path) -> tuple["LeRobotDataset", list[Fault]]:
+    """Open a local folder by LeRobot's own loader, and return the faults of its videos with it.
+
+    The loader would fetch missing files; here they are an error.
+    """
     # Imported here, because it takes seconds, and our own recordings do not need it.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 
@@ -457,9 +495,10 @@ def _open_local(root: Path) -> "LeRobotDataset":
             raise FileNotFoundError("frames of some of its episodes are not there")
 
     given = {"repo_id": f"local/{root.resolve().name}", "root": root, "revision": "local"}
+    faults = []
     with _said_of(root, "LeRobot cannot read it"):
         meta = LeRobotDatasetMetadata(**given)
-        if meta.total_episodes > len(meta.episodes):  # LeRobot would list as many as the file claims
+        if meta.total_episodes != len(meta.episodes):  # LeRobot would list as many as the file claims
             raise _broken(
                 f"{root}: {INFO} says {quote(meta.total_episodes)} episodes", f"{len(meta.episodes)} in meta/episodes"
             )
@@ -467,14 +506,15 @@ def _open_local(root: Path) -> "LeRobotDataset":
             for number in range(meta.total_episodes):
                 if not (video := root / meta.get_video_file_path(number, key)).is_file():
                     raise _broken(f"{video}: not there")
-            _check_video_times(root, meta, key)
-        return Local(**given, video_backend=BACKEND)
+            faults += _check_video_times(root, meta, key)
+        return Local(**given, video_backend=BACKEND), faults
 
 
-def _check_video_times(root: Path, meta: Any, key: str) -> None:
+def _check_video_times(root: Path, meta: Any, key: str) -> list[Fault]:
     """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode.
 
-    The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
+    Return a fault for each video with more frames than its episodes. The merge of LeRobot 0.4.0 wrote times by which an
+    episode is shown another one's pictures.
     """
     import av  # here, because our own recordings do not need it
 
@@ -482,6 +522,7 @@ def _check_video_times(root: Path, meta: Any, key: str) -> None:
     length, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
     frame_s = 1 / meta.fps
     files: dict[Path, list[int]] = {}
+    faults = []
     for number in range(meta.total_episodes):
         files.setdefault(root / meta.get_video_file_path(number, key), []).append(number)
     wrong = {
@@ -491,6 +532,15 @@ def _check_video_times(root: Path, meta: Any, key: str) -> None:
         with av.open(video) as opened:
             stream = opened.streams.video[0]
             end_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else np.inf
+            frames, rate = stream.frames, float(stream.average_rate or meta.fps)
+        used = int(length[numbers].sum())
+        if 0 < frames < used or rate < (1 - UNEVEN) * meta.fps:
+            raise _broken(
+                f"{video}: has {frames} frames, {rate:.4g} a second", f"{used} frames of {meta.fps:g} a second in data"
+            )
+        if frames > used:
+            note = f"has {frames} frames, {used} of them in data: those are read, by their times"
+            faults.append(Fault(str(video.relative_to(root)), "more_frames", frames - used, note))
         numbers.sort(key=first_s.__getitem__)
         for number, after in zip(numbers, [*numbers[1:], None], strict=True):
             if after is not None and last_s[number] > first_s[after] + frame_s / 2:
@@ -507,6 +557,7 @@ def _check_video_times(root: Path, meta: Any, key: str) -> None:
             else f"{len(wrong)} of {len(length)} episodes; the part of episode {number} {what}",
             remedy="merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again",
         )
+    return faults
 
 
 @contextmanager
@@ -525,7 +576,15 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
-    marks = [key for key in (INTERVENTION, SUCCESS) if _is_mark(dataset.meta.features.get(key))]
+    marks = [key for key in (INTERVENTION, SUCCESS) if key in dataset.meta.features]
+    for key in marks:
+        if not _is_mark(feature := dataset.meta.features[key]):
+            found = f"{quote(feature['dtype'])} of shape {list(feature['shape'])}"
+            raise EpisodeError(
+                f"{root}: its '{key}' is not a yes or no for each frame",
+                found=found,
+                remedy=f"write it as bool of shape [1], or under another name: '{key}' says who drove, or how it ended",
+            )
     with _said_of(root, "its numbers cannot be read"):
         columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
         for key in marks:
@@ -562,7 +621,7 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
 
 def _is_mark(feature: Any) -> bool:
     """Whether a feature has one yes or no for each frame."""
-    return bool(feature) and feature["dtype"] == "bool" and list(feature["shape"]) == [1]
+    return bool(feature["dtype"] == "bool" and list(feature["shape"]) == [1])
 
 
 def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> None:
@@ -577,14 +636,16 @@ def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> No
         )
 
 
-def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -> None:
-    """Raise EpisodeError if the table of episodes does not fit the frames. number: (n,), the frames' episode numbers.
+def _check_tables_fit(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, np.ndarray]) -> None:
+    """Raise EpisodeError if the tables of episodes and of tasks do not fit the frames.
 
-    LeRobot finds an episode's pictures by the table's row of that number, whichever episode the row is for.
+    LeRobot finds an episode's pictures, and a frame's task, by the table's row of that number, whatever the row is for.
     """
+    number, task = columns["episode_index"], columns["task_index"]
     with _said_of(root, "its table of episodes cannot be read"):
-        table = dataset.meta.episodes.select_columns(["episode_index", "length"]).with_format("numpy")[:]
-        index, lengths = (np.asarray(table[key]) for key in ("episode_index", "length"))
+        names = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
+        table = dataset.meta.episodes.select_columns(list(names)).with_format("numpy")[:]
+        index, lengths, first, end = (np.asarray(table[name]) for name in names)
         # Their sum is checked first, because np.repeat makes as many numbers.
         agree = np.array_equal(index, np.arange(len(index))) and lengths.sum() == len(number)
         agree = agree and np.array_equal(number, np.repeat(index, lengths))
@@ -593,9 +654,24 @@ def _check_episodes(root: Path, dataset: "LeRobotDataset", number: np.ndarray) -
             f"{root}: meta/episodes and the frames in data do not belong together",
             f"{len(index)} episodes of {lengths.sum()} frames beside {len(np.unique(number))} of {len(number)}",
         )
+    ends = np.cumsum(lengths)  # LeRobot repeats a plan's last action from there on
+    if len(wrong := np.flatnonzero((end != ends) | (first != ends - lengths))):
+        n = int(wrong[0])
+        raise _broken(
+            f"{root}: meta/episodes gives episode {n} the frames {first[n]} to {end[n]}",
+            f"{ends[n] - lengths[n]} to {ends[n]} in data",
+        )
+    with _said_of(root, "its table of tasks cannot be read"):
+        rows, tasks = list(dataset.meta.tasks["task_index"]), list(dataset.meta.tasks.index)
+    if rows != list(range(len(rows))) or not set(task.tolist()) <= set(rows) or not {str} >= set(map(type, tasks)):
+        table = quote_all(f"{n}: {t}" for n, t in zip(rows, tasks, strict=True))
+        found = f"tasks {task.min()} to {task.max()} beside {table}"
+        raise _broken(f"{root}: meta/tasks.parquet and the frames in data do not belong together", found)
 
 
-def _check_order(root: Path, columns: Mapping[str, np.ndarray], starts: np.ndarray, info: Mapping[str, Any]) -> None:
+def _check_order(
+    root: Path, columns: Mapping[str, np.ndarray], starts: np.ndarray, info: Mapping[str, Any], video: bool
+) -> None:
     """Raise EpisodeError for rows that are not the frames in their order, each once, with times from each start on.
 
     LeRobot believes meta/info.json's number of frames, and finds a picture in a video by its time.
@@ -613,6 +689,12 @@ def _check_order(root: Path, columns: Mapping[str, np.ndarray], starts: np.ndarr
     begin_s = columns["timestamp"][starts]
     if len(late := np.flatnonzero(~(np.abs(begin_s) * info["fps"] < 1))):
         raise _broken(f"{root}: the times of an episode begin at 0", f"{begin_s[late[0]]:g} s in episode {late[0]}")
+    off_s = np.abs(columns["timestamp"].astype(np.float64) - within / info["fps"])
+    if video and len(late := np.flatnonzero(off_s > 2 * TOLERANCE_S)):
+        raise _broken(
+            f"{root}: {len(late)} frames have another time than their picture in the video",
+            f"frame {late[0]} is {off_s[late[0]] * 1e3:.2f} ms off, of which LeRobot takes {TOLERANCE_S * 1e3:g}",
+        )
 
 
 def _episode(
@@ -629,10 +711,9 @@ def _episode(
     meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
     name, keys = f"episode_{number:06d}", [camera.key for camera in pictures.cameras]
-    with _said_of(root, f"where the files of episode {number} lie, and what its task was, cannot be read"):
+    with _said_of(root, f"where the files of episode {number} lie cannot be read"):
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
-        task = meta.tasks.index[meta.tasks["task_index"] == columns["task_index"][first]]
     if not data.is_file():
         raise _broken(f"{data}: not there, and episode {number} is in it")
     index = np.arange(n)[:, None] + np.arange(chunk)
@@ -659,7 +740,7 @@ def _episode(
     return Episode(
         id=name,
         path=root,
-        label=str(task[0]) if len(task) else "",
+        label=meta.tasks.index[columns["task_index"][first]],
         duration_s=samples[-1].time_s,
         frames=n,
         controls=n,

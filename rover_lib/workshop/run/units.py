@@ -5,14 +5,16 @@ Its plans are held against both readings of the recordings: today's actions, and
 better, states and actions are converted by the policy's normalisation, which the artifact's manifest carries.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from rover_lib.onboard.car.car import Car
 from rover_lib.workshop.act import ACT, ActConfig, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation
-from rover_lib.workshop.recordings.formula import Formula
+from rover_lib.workshop.recordings.formula import OLD, Formula
+from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
 FRAMES = 8  # planned twice, in FP32
@@ -20,26 +22,37 @@ BETTER = 0.5  # the files' reading must leave at most this share of the error; o
 
 
 def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequence[Sample]) -> Checkpoint:
-    """Return the policy, in the units of today's actions if it was trained on the recordings' own.
+    """Return the policy, in the units of today's actions if it was trained on others.
 
-    samples: of the recordings, to plan on. Nothing is planned unless some recordings' actions had to be recomputed.
+    These are what the recordings had before they were recomputed. Recordings of the recorded car that follow today's
+    formula may be newer than what the policy learned from: then those of OLD are tried. samples: of the recordings, to
+    plan on; a LeRobotDataset has no other units.
     """
-    formulas: dict[str, Formula] = {n: f for e in recordings.episodes for n, f in e.formulas.items()}
-    if not formulas or policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
+    if policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
         return policy
-    pwm = car_of(recordings.samples).pwm
+    car, few = car_of(recordings.samples), pick_evenly(samples, FRAMES)
+    recorded: dict[str, Formula] = {n: f for e in recordings.episodes for n, f in e.formulas.items()}
+    tried = [recorded] if recorded else []
+    if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
+        tried.append(OLD)
+    best, least = policy, BETTER * _error(policy, few) if tried else 0.0
+    for formulas in tried:
+        converted = _in_units_of(policy, car, formulas)
+        if (error := _error(converted, few)) <= least:
+            best, least = converted, error
+    return best
+
+
+def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) -> Checkpoint:
+    """Return the policy with today's actions outside, and those of the formulas inside."""
     # What a file says is gain * action + offset.
     gains, offsets = [], []
     for name in ACTION_NAMES:
-        channel = pwm.channel(name)
+        channel = car.pwm.channel(name)
         formula = formulas.get(name, Formula.of(channel))
         gains.append(channel.span_pct / formula.span_pct)
         offsets.append((channel.neutral_pct - formula.neutral_pct) / formula.span_pct)
     converted = replace(policy, config=_convert(policy.config, np.array(gains), np.array(offsets)))
-    few = pick_evenly(samples, FRAMES)
-    as_it_is, as_the_files = (_error(each, few) for each in (policy, converted))
-    if as_the_files > BETTER * as_it_is:
-        return policy
     said = ", ".join(f"{name} = {formula}" for name, formula in formulas.items())
     words = normalisation(converted.config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
     return replace(converted, report=policy.report | {"normalisation": words})

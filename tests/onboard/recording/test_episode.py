@@ -32,6 +32,7 @@ from rover_lib.onboard.recording.episode import (
     finish_killed,
     read_controls,
 )
+from rover_lib.onboard.recording.recorder import _new_episode
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 NAME = "episode_20260101_120000"
@@ -73,7 +74,7 @@ def killed(folder, controls=5, frames=3):
     return folder.with_name(f".{folder.name}.part")
 
 
-def test_a_recording_that_was_killed_is_not_lost(tmp_path):
+def test_a_recording_that_was_killed_is_not_lost(tmp_path, caplog):
     """93 frames and 102 rows were, to every command."""
     part = killed(tmp_path / NAME)
     with (part / "control.rows").open("ab") as file:
@@ -85,6 +86,8 @@ def test_a_recording_that_was_killed_is_not_lost(tmp_path):
     write(tmp_path / "episode_2")
     (fault,) = [f for f in load_recordings(tmp_path, chunk=4).faults if f.kind == "killed_recording"]
     assert fault.file == part.name and "--finish" in fault.note
+    _new_episode(tmp_path, 0.0, About()).discard()
+    assert f"1 recordings here were killed; `rover record {tmp_path} --finish`" in caplog.text
     done = CliRunner().invoke(main, ["record", str(tmp_path), "--finish"])
     assert done.output == f"finished: {tmp_path / NAME}\n", done
     about = json.loads((tmp_path / NAME / "episode_data.json").read_text())

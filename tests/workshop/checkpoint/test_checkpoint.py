@@ -179,6 +179,7 @@ def edit(path, change):
         (lambda c: c["input_features"].update(x={"type": "VISUAL", "shape": [1, 8, 8]}), "(3, height, width)"),
         (lambda c: c["input_features"].update(x={"shape": "?"}), "no type and shape"),
         (lambda c: c.update(output_features={}), "'action'"),
+        (lambda c: c["output_features"]["action"].update(type="STATE"), "no 'action' output of type ACTION"),
         (lambda c: c.update(dim_model=None), "dim_model"),
     ],
 )
@@ -574,6 +575,8 @@ def in_step(change):
         (OUTER, in_step(lambda s: s.pop("state_file")), "no statistics of 'action', whose mode is 'MIN_MAX'"),
         (OUTER, lambda c: c["steps"].clear(), "no statistics of 'action', whose mode is 'MEAN_STD'"),
         (OUTER, lambda c: c["steps"].append(c["steps"][0]), "normalises 2 times"),
+        (INNER, in_step(lambda s: s["config"]["features"]["observation.state"].update(type="ACTION")),
+         "'observation.state' is not among the features that it normalises"),
     ],
 )  # fmt: skip
 def test_a_feature_that_would_be_left_raw_is_refused(copied, file, change, says):
@@ -597,6 +600,7 @@ def test_statistics_of_one_feature_missing(copied, feature):
         ("observation.state.std", [0.5, -0.5], "a negative std, which would turn it around, found ["),
         ("action.max", [0.5, 9.0], "'action' have a min above its max, which would turn it around, found ["),
         ("observation.state.mean", [1e300, 0.0], "statistics of 'observation.state' are not finite"),
+        ("action.min", [[0.5], [9.0]], "statistics of 'action' have shapes min [2, 1], not [2]"),
     ],
 )
 def test_statistics_that_nothing_has_are_refused(copied, key, value, says):
@@ -622,6 +626,24 @@ def test_a_state_that_never_changed_is_minus_one(copied, value):
     scale, shift = torch.tensor(norm.scale), torch.tensor(norm.shift)
     assert (same * scale + shift).tolist() == [-1, -1]
     assert ((same + torch.tensor([0, 1])) * scale + shift).tolist() == [-1, 0]
+
+
+def test_the_steps_own_type_of_a_feature_decides_how_it_is_normalised(tmp_path):
+    """LeRobot's step has types and modes of its own, whatever config.json says."""
+    policy = lerobot_policy(**TINY)
+    inner, outer, _ = normalised(policy, "MEAN_STD")
+    for part in (policy, inner, outer):
+        part.save_pretrained(tmp_path)
+    normaliser = next(i for i, s in enumerate(inner.steps) if type(s).__name__ == "NormalizerProcessorStep")
+
+    def change(content):
+        config = content["steps"][normaliser]["config"]
+        config["features"]["observation.state"]["type"] = "ENV"
+        config["norm_map"]["ENV"] = "MIN_MAX"
+
+    edit(tmp_path / INNER, change)
+    theirs = type(inner).from_pretrained(tmp_path, config_filename=INNER)
+    check_is(load_checkpoint(tmp_path), policy, theirs, outer)
 
 
 @pytest.mark.parametrize("missing", [(INNER,), (OUTER,), (INNER, OUTER)])
@@ -686,10 +708,15 @@ def rename(folder, change):
             ),
             None,
         ),
+        (
+            lambda f: edit(f / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01)),
+            "temporal_ensemble_coeff is 0.01: LeRobot would drive by averages",
+        ),
+        (lambda f: edit(f / "config.json", lambda c: c.update(use_film=True)), "0.6 has, not used: use_film"),
     ],
-    ids=["compiled", "in DDP", "in Lightning", "the network alone", "renamed camera"],
+    ids=["compiled", "in DDP", "in Lightning", "the network alone", "renamed camera", "ensembling", "unknown field"],
 )
-def test_a_policy_that_was_saved_from_inside_of_something_is_the_same(tmp_path, damage, says):
+def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(tmp_path, damage, says):
     policy = lerobot_policy(**TINY)
     inner, outer, _ = normalised(policy, "MEAN_STD")
     for part in (policy, inner, outer):

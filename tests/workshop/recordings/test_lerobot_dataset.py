@@ -1,6 +1,7 @@
 """LeRobotDatasets, made by LeRobot's own writer: every number and pixel as its own items have them, or one sentence."""
 
 import functools
+import io
 import json
 import math
 import os
@@ -10,15 +11,18 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from fractions import Fraction
 
+import av
 import numpy as np
 import pandas
 import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
+from PIL import Image
 from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
-from pyarrow import parquet
+from pyarrow import compute, parquet
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -97,8 +101,12 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
             features(state={"dtype": "float32", "shape": [2, 2]}),
             "its 'observation.state' is missing or not a row of numbers",
         ),
-        (features(action=TWO), "'action' does not name its 2 numbers"),
+        (features(action=TWO), "'action' does not name its 2 numbers, found None"),
         (features(state=TWO), "'observation.state' does not name its 2 numbers"),
+        (
+            features(action=TWO | {"names": {"a": ["steering"], "b": ["throttle"]}}),
+            "does not name its 2 numbers, found",
+        ),
         (features(action=TWO | {"names": ["steering"]}), "has 2 numbers, their names are steering"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
@@ -270,6 +278,7 @@ def rows(kept):
     return change
 
 
+DATA = "data/chunk-000/file-000.parquet"
 VIDEO = "videos/observation.images.cam_front/"
 MERGED = [  # what LeRobot 0.4.0 wrote when it merged datasets: one change for each thing that is then wrong
     ((f"{VIDEO}to_timestamp", [0.4, 1.05, 1.65]), "found 1 of 3 episodes; the part of episode 0 is not as long as it"),
@@ -316,6 +325,42 @@ def later(path):
     table.assign(timestamp=(table["timestamp"] + 2).astype("float32")).to_parquet(path)
 
 
+CAM = "observation.images.cam_front"
+
+
+def add(path, name, dtype):
+    """Adds a column of zeros, and its feature."""
+    table = parquet.read_table(path)
+    zeros = pyarrow.array(np.zeros(len(table), dtype))
+    parquet.write_table(table.append_column(name, zeros).replace_schema_metadata(None), path)
+    feature = {"dtype": dtype, "shape": [1], "names": None}
+    edit(path.parents[2] / "meta/info.json", lambda c: c["features"].update({name: feature}))
+
+
+def repainted(paint):
+    """Changes the second frame's picture: of another size, or of other colours."""
+
+    def change(path):
+        table = parquet.read_table(path)
+        pictures, at, packed = table.column(CAM).to_pylist(), table.column_names.index(CAM), io.BytesIO()
+        paint(Image.open(io.BytesIO(pictures[1]["bytes"]))).save(packed, "PNG")
+        pictures[1]["bytes"] = packed.getvalue()
+        parquet.write_table(table.set_column(at, CAM, pyarrow.array(pictures, table.schema.field(CAM).type)), path)
+
+    return change
+
+
+def film(path, frames, fps):
+    """Writes the video again with its first `frames` frames, or its last one until there are so many."""
+    with av.open(path) as source:
+        pictures = [f.to_ndarray(format="rgb24") for f in source.decode(video=0)]
+    with av.open(path, "w") as target:
+        stream = target.add_stream("libx264", rate=Fraction(fps), width=SIZE[1], height=SIZE[0], pix_fmt="yuv420p")
+        for picture in (pictures + pictures[-1:] * frames)[:frames]:
+            target.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        target.mux(stream.encode())
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -352,7 +397,7 @@ def cut(path):
          lambda p: edit(p, lambda c: c.update(total_episodes=10**12)), "says 1000000000000 episodes, found 3 in meta/"),
         ("image", "meta/episodes/chunk-000/file-000.parquet", column("length", 10**12), "do not belong together"),
         ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/chunk_index", None),
-         "where the files of episode 0 lie, and what its task was, cannot be read (TypeError"),
+         "where the files of episode 0 lie cannot be read (TypeError"),
         ("image", "meta/info.json", lambda p: edit(p, lambda c: c.pop("data_path")), "has no 'data_path'"),
         ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/file_index", 7),
          "file-007.parquet: not there, and episode 0 is in it"),
@@ -367,6 +412,32 @@ def cut(path):
         ("video", "data/chunk-000/file-000.parquet", later, "times of an episode begin at 0, found 2 s in episode 0"),
         ("image", "meta/tasks.parquet",
          lambda p: pandas.DataFrame({"number": [0]}, index=["drive"]).to_parquet(p), "cannot be read (KeyError"),
+        # LeRobot takes the row of that number, also the last for -1, and shows another task's name
+        *(("image", "meta/tasks.parquet", lambda p, table=table: pandas.DataFrame(table[0], table[1]).to_parquet(p),
+           "meta/tasks.parquet and the frames in data do not belong together, found tasks 0 to 2 beside")
+          for table in (({"task_index": [2, 0, 1]}, ["a", "b", "c"]), ({"task_index": [0, 1]}, ["a", "b"]),
+                        ({"task_index": [0, 1, 2], "task": ["a", "b", "c"]}, None))),
+        ("image", "data/chunk-000/file-000.parquet", column("task_index", -1), "found tasks -1 to 2 beside"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(total_episodes=2)), "says 2 episodes, found"),
+        ("image", "meta/episodes/chunk-000/file-000.parquet", column("dataset_to_index", 33),
+         "meta/episodes gives episode 0 the frames 0 to 33, found 0 to 10 in data"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"]["action"].update(dtype="bool")),
+         "its 'action' are no numbers by meta/info.json, found 'bool'"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"].pop("index")),
+         "has columns that meta/info.json does not know: index"),
+        ("image", "data/chunk-000/file-000.parquet", lambda p: add(p, "intervention", "int64"),
+         "its 'intervention' is not a yes or no for each frame, found 'int64' of shape [1]"),
+        *(("image", "data/chunk-000/file-000.parquet", repainted(change), f"(72, 128, 3), found {found}")
+          for change, found in ((lambda i: i.resize((64, 36)), "(36, 64, 3)"),
+                                (lambda i: i.convert("L"), "(72, 128, 1)"),
+                                (lambda i: i.convert("RGBA"), "(72, 128, 4)"))),
+        ("video", "data/chunk-000/file-000.parquet", column("timestamp", 0.002),
+         "1 frames have another time than their picture in the video, found frame 0 is 2.00 ms off"),
+        ("video", "meta/info.json",
+         lambda p: edit(p, lambda c: c["features"][CAM].update(info={"is_depth_map": True})), "is not a colour camera"),
+        *(("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p, a=args: film(p, *a), says)
+          for args, says in (((32, FPS), "has 32 frames, 20 a second, found 33 frames of 20"),
+                             ((33, FPS / 2), "has 33 frames, 10 a second, found 33 frames of 20"))),
     ],
 )  # fmt: skip
 def test_damage_is_a_sentence(copied, kind, file, damage, says):
@@ -382,15 +453,65 @@ def edit(path, change):
 
 
 @pytest.mark.slow
-def test_statistics_that_are_no_numbers_are_a_fault(copied):
+@pytest.mark.parametrize(
+    ("kind", "file", "damage", "fault"),
+    [
+        *(("image", "meta/stats.json", lambda p, c=change: edit(p, c), ("odd_statistics", count, f"action's {first}"))
+          for change, count, first in (
+              (lambda c: c["action"].update(std=[math.nan, 1.0]), 1, "std"),
+              (lambda c: c["action"].update(std=None, max="a", min=[1, 1, 1]), 3, "min"),
+              (lambda c: c["action"].update(mean=[50.0, 50.0]), 1, "mean"),
+              (lambda c: c.pop("action"), 4, "min"))),
+        ("image", "meta/stats.json", lambda p: p.unlink(), ("odd_statistics", 8, "observation.state's min is")),
+        ("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p: film(p, 40, FPS),
+         ("more_frames", 7, "has 40 frames, 33 of them in data")),
+    ],
+)  # fmt: skip
+def test_what_only_lerobots_trainer_would_take_wrong_is_a_fault(copied, kind, file, damage, fault):
+    root = copied(kind)
+    damage(root / file)
+    (found,) = load_recordings(root, CHUNK).faults
+    assert (found.kind, found.count) == fault[:2] and found.note.startswith(fault[2]) and found.handled == "left out"
+
+
+def files_of_one_episode(root):
+    """Gives each episode a table of its own, in a chunk of its own, as LeRobot writes with chunks_size 1."""
+    table, episodes = (parquet.read_table(root / f) for f in (DATA, "meta/episodes/chunk-000/file-000.parquet"))
+    for n in range(EPISODES):
+        part = root / f"data/chunk-{n:03d}/file-000.parquet"
+        part.parent.mkdir(exist_ok=True)
+        parquet.write_table(table.filter(compute.equal(table["episode_index"], n)), part)
+        parquet.write_table(episodes.slice(n, 1), root / f"meta/episodes/chunk-000/file-{n:03d}.parquet")
+        column("data/chunk_index", n)(root / f"meta/episodes/chunk-000/file-{n:03d}.parquet")
+    edit(root / "meta/info.json", lambda c: c.update(chunks_size=1, splits={"train": "0:2"}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change",
+    [
+        files_of_one_episode,
+        lambda r: edit(
+            r / "meta/info.json", lambda c: c.update(features=dict(reversed(c["features"].items())), fps=20.0)
+        ),
+        lambda r: parquet.write_table((t := parquet.read_table(r / DATA)).select(t.column_names[::-1]), r / DATA),
+        lambda r: edit(r / "meta/info.json", lambda c: c["features"]["action"].update(dtype="float64")),
+        lambda r: edit(r / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])),
+        lambda r: edit(
+            r / "meta/info.json",
+            lambda c: c["features"]["action"].update(names={"motors": {"steering": 0, "throttle": 1}}),
+        ),
+    ],
+    ids=["files", "feature order", "column order", "float64", "CHW", "nested names"],
+)
+def test_what_is_arranged_otherwise_is_the_same(copied, datasets, change):
     root = copied()
-    edit(root / "meta/stats.json", lambda c: c["action"].update(std=[math.nan, 1.0]))
-    (fault,) = load_recordings(root, CHUNK).faults
-    assert (fault.kind, fault.count, fault.handled) == (
-        "odd_statistics",
-        1,
-        "left out",
-    ) and "action's std" in fault.note
+    change(root)
+    found, expected = load_recordings(root, CHUNK), load_recordings(datasets(), CHUNK)
+    assert not found.faults and len(found.samples) == len(expected.samples)
+    for ours, right in zip(found.samples, expected.samples, strict=True):
+        assert np.array_equal(ours.chunk, right.chunk) and np.array_equal(ours.state, right.state)
+        assert np.array_equal(ours.frame_bgr(), right.frame_bgr())
 
 
 @pytest.mark.slow

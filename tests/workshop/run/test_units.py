@@ -8,6 +8,7 @@ import pytest
 import torch
 from recorded import record_drives
 
+from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -63,6 +64,19 @@ def test_a_policy_of_older_actions_is_converted_once(tiny, old_recordings):
 def test_a_policy_of_todays_actions_stays_as_it_is(tiny, old_recordings, tmp_path):
     today = speaks(tiny, neutral=0.05, gain=1e-3)
     assert in_todays_units(today, old_recordings, old_recordings.samples) is today
-    older = speaks(tiny, neutral=0.2, gain=1e-3)
     never = load_recordings(record_drives(tmp_path / "today"))
-    assert in_todays_units(older, never, never.samples) is older  # nothing says that there ever was another formula
+    assert in_todays_units(today, never, never.samples) is today
+
+
+def test_a_policy_of_older_actions_on_newer_recordings(tiny, tmp_path):
+    """It went on as it was, as nothing in the recordings says that there ever was another formula."""
+    older = speaks(tiny, neutral=0.2, gain=1e-3)
+    newer = load_recordings(record_drives(tmp_path))
+    assert "converted" in in_todays_units(older, newer, newer.samples).report["normalisation"]["units"]
+    another = replace(newer, episodes=tuple(_of_another_car(e) for e in newer.episodes))
+    assert in_todays_units(older, another, another.samples) is older
+
+
+def _of_another_car(episode):
+    car = read_car("lab/cars/crawler.yml")
+    return replace(episode, samples=tuple(replace(s, car=car) for s in episode.samples))
