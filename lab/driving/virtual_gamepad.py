@@ -4,6 +4,7 @@ import contextlib
 import os
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 from rover_lib.onboard.car import servo_link
@@ -87,4 +88,4 @@ def open_virtual(folder: Path) -> Gamepad:
 
 def plug_in(folder: Path) -> None:
     """Make it the gamepad of each ServoLink of this process."""
-    servo_link.open_gamepad = lambda: open_virtual(folder)
+    servo_link.open_gamepad = partial(open_virtual, folder)
