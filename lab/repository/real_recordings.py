@@ -56,12 +56,13 @@ def tell_of(
 def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[str, Any]:
     """Show all pictures to the camera's watch as to a car that drives, and count those at which it would stop.
 
-    least: of all pictures, the contrast and the mean, in grey levels. most_equal: pictures in a row.
+    frozen: of these stops, those at a picture that is the one before it, byte for byte, as the recorded camera, or its
+    program, had stopped. least: of all pictures, the contrast and the mean, in grey levels. most_equal: in a row.
     """
-    settings, stops, frames = Settings.of(params()["drive"]), 0, []
+    settings, stops, frozen, frames = Settings.of(params()["drive"]), 0, 0, []
     for episode in progress(recordings.episodes, desc="watching the camera"):
         camera = Camera(episode.path)
-        sight = Sight(camera, settings)
+        sight, before = Sight(camera, settings), np.empty(0)
         for sample in episode.samples:
             camera._add(sample.frame_bgr(), sample.time_s, None)
             if (frame := camera.latest()) is None:
@@ -71,10 +72,12 @@ def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[
                 sight.watch(frame, sample.time_s)
             except CameraError:
                 stops += 1
+                frozen += np.array_equal(frame.image, before)
+            before = frame.image
             frames.append((frame.contrast, frame.mean, frame.repeats + 1))
     contrasts, means, equal = zip(*frames, strict=True)
     least = {"contrast": min(contrasts), "mean": min(means)}
-    return {"pictures": len(frames), "stops": stops, "least": least, "most_equal": max(equal)}
+    return {"pictures": len(frames), "stops": stops, "frozen": frozen, "least": least, "most_equal": max(equal)}
 
 
 def guess_each(recordings: Recordings) -> dict[str, dict[str, dict[str, float]]]:

@@ -26,6 +26,7 @@ NOISE = [np.ascontiguousarray(np.where(np.arange(128)[:, None] < 64, p // 4, p))
 def test_pictures_at_which_a_driving_car_would_stop(pictures, stops, equal):
     found = watch_pictures(recording_of(*pictures))
     assert (found["stops"] > 0) is stops and found["most_equal"] == equal and found["pictures"] == 60
+    assert found["frozen"] == found["stops"]  # the black ones are equal, too
 
 
 def test_no_real_picture_stops_the_car():
