@@ -26,9 +26,9 @@ def _folder() -> Path:
     return Path(folder)
 
 
-def firmware() -> Path:
+def firmware(human: str = "receiver") -> Path:
     """Return the compiled sketch, an ELF file."""
-    return arduino.build().firmware
+    return arduino.build(human).firmware
 
 
 def compiled(name: str, *arguments: object) -> Path:
@@ -104,10 +104,10 @@ class Uno:
     events: all measurements, in the order in which they ended. lines: all lines that it sent, without their CRC.
     """
 
-    def __init__(self, eeprom: bytes | None = None):
-        """eeprom: its first bytes; None: of a board that has kept the default car."""
+    def __init__(self, eeprom: bytes | None = None, human: str = "receiver"):
+        """eeprom: its first bytes; None: of a board that has kept the default car. human: as the firmware is built."""
         self._c = _library()
-        self._uno = self._c.uno_new(str(firmware()).encode())
+        self._uno = self._c.uno_new(str(firmware(human)).encode())
         assert self._uno, f"simavr cannot load {firmware()}"
         kept = arduino.eeprom_of(car.Car()) if eeprom is None else eeprom
         self._c.uno_eeprom(self._uno, ctypes.create_string_buffer(kept, len(kept) or 1), len(kept), True)

@@ -62,6 +62,13 @@ static bool parse(const char *line, uint8_t length, struct command *command) {
         case COMMAND_LOWER:
             numbers[count++] = &found.throttle_us;
             break;
+#ifdef HUMAN_GAMEPAD
+        case COMMAND_STICKS:
+            numbers[1] = &found.heard_ms;
+            numbers[count++] = &found.steering_us;
+            numbers[count++] = &found.throttle_us;
+            break;
+#endif
         case COMMAND_DRIVE:
             numbers[count++] = &found.heard_ms;
             numbers[count++] = &found.steering_us;

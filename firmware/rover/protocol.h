@@ -11,7 +11,12 @@ extern "C" {
 #endif
 
 #define PROTOCOL_VERSION 4
-#define FIRMWARE_VERSION "4.1.1" /* rover_lib/onboard/car/servo_link.py drives no other: change both */
+/* rover_lib/onboard/car/servo_link.py drives no other: change both. */
+#ifdef HUMAN_GAMEPAD
+#define FIRMWARE_VERSION "4.1.1-gamepad"
+#else
+#define FIRMWARE_VERSION "4.1.1"
+#endif
 
 enum {
     HOST_LINE_MAX = 87,     /* the longest line of the host without its end: two numbers of ten digits, nine of five */
@@ -26,14 +31,15 @@ enum command_kind {
     COMMAND_DRIVE = 'D',
     COMMAND_NEUTRAL = 'N',
     COMMAND_LOWER = 'L', /* the throttle's cap */
-    COMMAND_CAR = 'C'
+    COMMAND_CAR = 'C',
+    COMMAND_STICKS = 'S' /* a gamepad's; only with HUMAN_GAMEPAD, of a board without a receiver */
 };
 
 struct command {
     char kind;
-    uint32_t boot, sequence;           /* not in COMMAND_HELLO */
-    uint32_t heard_ms;                 /* in COMMAND_ARM, COMMAND_DRIVE: time of the newest status that the host read */
-    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, the throttle in COMMAND_LOWER; vehicle.c checks them */
+    uint32_t boot, sequence;           /* not in COMMAND_HELLO; COMMAND_STICKS has no sequence */
+    uint32_t heard_ms;                 /* in COMMAND_ARM, _DRIVE, _STICKS: time of the newest status that the host read */
+    uint32_t steering_us, throttle_us; /* in COMMAND_DRIVE, _STICKS, the throttle in COMMAND_LOWER; vehicle.c checks them */
     uint32_t asked_ms;                 /* in COMMAND_ARM: heard_ms as it was when somebody asked to arm the car */
     uint32_t car;                      /* in COMMAND_ARM: which one the host means */
     uint16_t numbers[CAR_NUMBERS];     /* in COMMAND_CAR: the car, in the order of struct car */

@@ -29,7 +29,7 @@ static bool take(uint8_t byte, uint32_t now_ms) {
         hello_due = true;
       } else {
         vehicle_command(&vehicle, &command, now_ms);
-        status_due = true;
+        status_due = status_due || command.kind != COMMAND_STICKS;  // sticks answer a status: it would never end
       }
       return true;
     case READ_BAD:
@@ -42,10 +42,12 @@ static bool take(uint8_t byte, uint32_t now_ms) {
 }
 
 void loop() {
-  uint16_t pulse_us, period_us;
   uint32_t now_ms = clock_ms();
+#ifndef HUMAN_GAMEPAD  // with it, nothing is on the receiver's pins
+  uint16_t pulse_us, period_us;
   if (receiver_take(STEERING, &pulse_us, &period_us)) vehicle_received(&vehicle, STEERING, pulse_us, period_us, now_ms);
   if (receiver_take(THROTTLE, &pulse_us, &period_us)) vehicle_received(&vehicle, THROTTLE, pulse_us, period_us, now_ms);
+#endif
   int byte;
   bool read = false;
   for (uint8_t n = 0; n < 32 && !read && (byte = serial_take()) >= 0; n++) read = take((uint8_t)byte, now_ms);

@@ -49,9 +49,19 @@ static uint16_t neutral_us(const struct vehicle *vehicle, enum channel channel) 
     return vehicle->car.servos[channel].neutral_us;
 }
 
+/* Whether the throttle's pulses come as densely as to be misread now and then; a gamepad's lines do not. */
+static bool throttle_may_err(const struct vehicle *vehicle) {
+#ifdef HUMAN_GAMEPAD
+    (void)vehicle;
+    return false;
+#else
+    return throttle_is_fast(&vehicle->car);
+#endif
+}
+
 /* How many pulses make a signal. */
 static uint8_t signal_pulses(const struct vehicle *vehicle, enum channel channel) {
-    return channel == THROTTLE && throttle_is_fast(&vehicle->car) ? FAST_SIGNAL_PULSES : SIGNAL_PULSES;
+    return channel == THROTTLE && throttle_may_err(vehicle) ? FAST_SIGNAL_PULSES : SIGNAL_PULSES;
 }
 
 static void enter(struct vehicle *vehicle, enum state state, enum reason reason) {
@@ -125,7 +135,7 @@ static bool see_throttle(struct vehicle *vehicle, uint16_t pulse_us) {
     if (!vehicle->throttle_off_rest && has_signal(vehicle)) vehicle->throttle_free = true;
     uint8_t pulses = 0;
     for (uint8_t bits = vehicle->throttle_moved; bits; bits >>= 1) pulses += bits & 1;
-    return pulses >= (throttle_is_fast(&vehicle->car) ? FAST_MOVED_PULSES : 1);
+    return pulses >= (throttle_may_err(vehicle) ? FAST_MOVED_PULSES : 1);
 }
 
 /* Whether the car's transmitter may send this. */
@@ -152,6 +162,43 @@ void vehicle_received(struct vehicle *vehicle, enum channel channel, uint16_t pu
     if (moved && vehicle->state != MANUAL) enter(vehicle, MANUAL, HUMAN);
 }
 
+/* Whether a command asks for pulses that none may ask for; counts it. */
+static bool is_out_of_range(struct vehicle *vehicle, const struct command *command) {
+    const struct servo *steering = &vehicle->car.servos[STEERING], *throttle = &vehicle->car.servos[THROTTLE];
+    if (!within(command->steering_us, steering->min_us, steering->max_us) ||
+        !within(command->throttle_us, throttle->min_us, throttle->max_us)) {
+        count(&vehicle->out_of_range);
+        return true;
+    }
+    return false;
+}
+
+#ifdef HUMAN_GAMEPAD
+/* A gamepad's sticks, as if a receiver had measured them. Each must answer a newer status than the last, and is as old as
+ * that status, so that nothing which waits or comes twice counts. Both 0: the human has let go, which counts at once.
+ * These pulses come from the host too, so they get no more throttle than the host does. */
+static void take_sticks(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
+    uint32_t at_ms = command->heard_ms, age_ms = now_ms - at_ms;
+    if (vehicle->boot != command->boot || age_ms > SIGNAL_TIMEOUT_MS || age_ms >= now_ms - vehicle->sticks_ms) {
+        count(&vehicle->old_commands);
+        return;
+    }
+    bool held = command->steering_us || command->throttle_us;
+    if (held && is_out_of_range(vehicle, command)) return;
+    vehicle->sticks_ms = at_ms;
+    if (held) {
+        const struct servo *servos = vehicle->car.servos;
+        uint16_t steering_us = (uint16_t)command->steering_us, throttle_us = (uint16_t)command->throttle_us;
+        throttle_us = towards(servos[THROTTLE].neutral_us, throttle_us, vehicle->cap_us);
+        vehicle_received(vehicle, STEERING, steering_us, servos[STEERING].period_us, at_ms);
+        vehicle_received(vehicle, THROTTLE, throttle_us, servos[THROTTLE].period_us, at_ms);
+    } else {
+        for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) forget_signal(vehicle, &vehicle->received[channel]);
+    }
+    vehicle_tick(vehicle, now_ms);
+}
+#endif
+
 enum missing vehicle_missing(const struct vehicle *vehicle, uint32_t now_ms) {
     if (!has_signal(vehicle)) return SIGNAL;
     if (vehicle->throttle_off_rest) return THROTTLE_AT_REST;
@@ -176,12 +223,8 @@ static char arm(struct vehicle *vehicle, const struct command *command, uint32_t
 
 /* in_turn: the command directly follows the last one, so that none was lost between them. */
 static enum result drive(struct vehicle *vehicle, const struct command *command, bool in_turn, uint32_t now_ms) {
-    const struct servo *steering = &vehicle->car.servos[STEERING], *throttle = &vehicle->car.servos[THROTTLE];
-    if (!within(command->steering_us, steering->min_us, steering->max_us) ||
-        !within(command->throttle_us, throttle->min_us, throttle->max_us)) {
-        count(&vehicle->out_of_range);
-        return OUT_OF_RANGE;
-    }
+    const struct servo *throttle = &vehicle->car.servos[THROTTLE];
+    if (is_out_of_range(vehicle, command)) return OUT_OF_RANGE;
     if (vehicle->state != AUTONOMOUS) return IGNORED;
     vehicle->wanted_us[STEERING] = (uint16_t)command->steering_us;
     vehicle->wanted_us[THROTTLE] = towards(throttle->neutral_us, (uint16_t)command->throttle_us, vehicle->cap_us);
@@ -248,6 +291,12 @@ static enum result neutral(struct vehicle *vehicle) {
 void vehicle_command(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
     /* First, so that a command that comes now cannot save one that timed out. */
     vehicle_tick(vehicle, now_ms);
+#ifdef HUMAN_GAMEPAD
+    if (command->kind == COMMAND_STICKS) {
+        take_sticks(vehicle, command, now_ms);
+        return;
+    }
+#endif
     uint32_t ahead = command->sequence - vehicle->sequence;
     bool in_turn = ahead == 1;
     bool old = command->boot != vehicle->boot || !within(ahead, 1, SEQUENCE_WINDOW);

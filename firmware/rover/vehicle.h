@@ -46,7 +46,11 @@ enum {
     THROTTLE_DEAD_BAND_US = 32,
     FAST_MOVED_PULSES = 5,     /* of the last eight, so that single ones may be misread; of a slow signal one is enough */
     /* A signal is present while its last two pulses (a fast throttle's last eight) are all younger than this. */
+#ifdef HUMAN_GAMEPAD
+    SIGNAL_TIMEOUT_MS = 150, /* as a host's command: its pulses come through a host */
+#else
     SIGNAL_TIMEOUT_MS = 100,
+#endif
     SIGNAL_PULSES = 2,
     FAST_SIGNAL_PULSES = 8,
     /* The gesture, a wiggle of the steering stick: at least this far to both sides of neutral within WIGGLE_MS, then still
@@ -132,6 +136,7 @@ struct vehicle {
     uint32_t driven_ms;                 /* when the last valid drive came, or the arming if none has */
     uint32_t paused_ms;                 /* while wary: when the drive came that ended the pause */
     bool wary;
+    uint32_t sticks_ms; /* of the status that a gamepad's last sticks answered */
     uint16_t bad_lines, old_commands, out_of_range, lost_bytes; /* stay at 65535 */
 };
 

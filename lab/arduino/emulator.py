@@ -61,8 +61,10 @@ def missing_packages() -> list[str]:
 
 
 @functools.cache
-def build() -> Built:
+def build(human: str = "receiver") -> Built:
     """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
+
+    human: as in `make -C firmware HUMAN=gamepad`.
 
     Raises ArduinoError if Debian packages or the repository's sources are missing, or if the compiler fails.
     """
@@ -78,10 +80,12 @@ def build() -> Built:
         )
 
     def make(folder: Path) -> None:
-        compile_c("make", "-C", FIRMWARE, f"BUILD={folder}/firmware")
+        compile_c("make", "-C", FIRMWARE, f"HUMAN={human}", f"BUILD={folder}/firmware")
         compile_c(*CC, "-DPROGRAM", "-o", folder / "arduino", *WITH_SIMAVR)
 
-    folder = cache_folder("arduino", key_of({"names": [source.name for source in sources]}, *sources), make)
+    folder = cache_folder(
+        "arduino", key_of({"names": [source.name for source in sources], "human": human}, *sources), make
+    )
     return Built(folder / "firmware" / "rover.elf", folder / "arduino")
 
 
@@ -134,6 +138,7 @@ class EmulatedArduino:
         nice: int = 0,
         slow: float = 1.0,
         eeprom: bytes | None = None,
+        human: str = "receiver",
     ):
         """Start the process.
 
@@ -142,9 +147,10 @@ class EmulatedArduino:
         see ready(). nice: scheduling priority; NICE comes close to a processor of its own. Below 0 it works only for
         root, and is silently left out for others. slow: how many times slower than this machine's the Arduino's clock
         runs; pulses are measured by its clock, monotonic_s by this machine's.
+        human: as for build().
         Raises ArduinoError as build() does, and if the program does not start.
         """
-        built = build()
+        built = build(human)
         # The program makes this link, and removes it even if the present process was killed.
         self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
         self._reading = threading.Lock()

@@ -105,19 +105,24 @@ class Vehicle(ctypes.Structure):
         ("driven_ms", ctypes.c_uint32),
         ("paused_ms", ctypes.c_uint32),
         ("wary", ctypes.c_bool),
+        ("sticks_ms", ctypes.c_uint32),
         *((name, ctypes.c_uint16) for name in ("bad_lines", "old_commands", "out_of_range", "lost_bytes")),
     )
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
-    """Load the firmware's C code for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
+def library(gamepad: bool = False) -> ctypes.CDLL:
+    """Load the firmware's C code for this machine, from the cache or compiled now. Raises ArduinoError without gcc.
+
+    gamepad: as it is built with HUMAN=gamepad.
+    """
+    command = (*CC, "-DHUMAN_GAMEPAD") if gamepad else CC
     headers = sorted((FIRMWARE / "rover").glob("*.h"))
 
     def make(folder: Path) -> None:
-        compile_c(*CC, "-shared", "-fPIC", "-o", folder / "native.so", *SOURCES)
+        compile_c(*command, "-shared", "-fPIC", "-o", folder / "native.so", *SOURCES)
 
-    folder = cache_folder("native-firmware", key_of({"command": CC}, *SOURCES, *headers), make)
+    folder = cache_folder("native-firmware", key_of({"command": command}, *SOURCES, *headers), make)
     native = ctypes.CDLL(str(folder / "native.so"))
     vehicle, u32 = ctypes.POINTER(Vehicle), ctypes.c_uint32
     native.crc32.restype = u32
@@ -152,11 +157,13 @@ class NativeArduino:
     You may set these: sticks: the transmitter's pulses (us), where 0 stands for no signal. misread: a function of a
     throttle pulse's number and length that returns what the board measures (None: no pulse). periods_us: of the
     transmitter's pulses.
+    gamepad: the firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
     now_ms: the board's clock, which wraps at 32 bits. sequence: of the last command. car: the car of the transmitter
     and of the host. The board is told of it too, unless it is the default.
     """
 
-    def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None):
+    def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None, gamepad: bool = False):
+        self.gamepad = gamepad
         self.car = car or Car()
         neutral = self.car.pwm.neutral()
         self.sticks: list[float] = [neutral.steering_us, neutral.throttle_us]
@@ -167,7 +174,7 @@ class NativeArduino:
         self.heard_ms: int | None = None
         self.asked_ms: int | None = None  # the same, of when somebody asked to arm it
         self._vehicle, self._reader = Vehicle(), Reader()
-        self._native = library()
+        self._native = library(gamepad)
         self._due_us = [0.0, 0.0]
         self._us = 0.0  # since the start
         self._pulses = 0
@@ -213,7 +220,15 @@ class NativeArduino:
             pins.append((self._vehicle.steering_us, self._vehicle.throttle_us))
         return pins
 
+    def send_sticks(self, steering_us: float, throttle_us: float, heard_ms: int) -> str:
+        """Send the sticks of a gamepad, by a host that last heard the board at that time."""
+        return self.send(frame(f">S {self._vehicle.boot} {heard_ms % (1 << 32)} {steering_us:.0f} {throttle_us:.0f}"))
+
     def _receive(self) -> None:
+        if self.gamepad:
+            if self.now_ms % 20 == 0 and self.sticks[STEERING]:
+                self.send_sticks(self.sticks[STEERING], self.sticks[THROTTLE], self.now_ms - 15)
+            return
         for channel, period_us in enumerate(self.periods_us):
             while self._due_us[channel] <= self._us:
                 self._due_us[channel] += period_us

@@ -540,6 +540,13 @@ def test_the_service_of_a_pi_camera_may_use_what_libcamera_needs(camera, more):
     assert [f"DeviceAllow=char-{d} rw" in unit for d in ("video4linux", "media", "dma_heap")] == [True, more, more]
 
 
+@pytest.mark.parametrize("gamepad", [False, True])
+def test_the_service_may_read_a_gamepad_where_there_is_one(gamepad):
+    lines = rendered("rover-drive.service", rover_gamepad=gamepad).splitlines()
+    assert ("DeviceAllow=char-input r" in lines) == gamepad
+    assert f"SupplementaryGroups=video dialout{' input' * gamepad}" in lines
+
+
 @pytest.mark.parametrize("name", ["rover-drive.service", "rover-check@.service"])
 @pytest.mark.parametrize("value", [v for v in HOSTILE if v.isprintable()])
 def test_models_may_be_in_any_folder(units, name, value):

@@ -40,6 +40,7 @@ THROTTLE_THROW_US = 100  # forward at least
 CAP_MAX_US = 118  # from neutral, either way: a fifth of the user's car's throttle
 
 CAP = 0.2
+HUMANS = ("receiver", "gamepad")  # on the Arduino's pins, or on this machine
 WIDTH_PX = 640  # of the pictures that the balloon world draws
 
 
@@ -49,7 +50,7 @@ class Car:
 
     pwm: its two channels. cap_us: the farthest that a host may move the throttle's pulse from neutral, either way.
     field_of_view_deg: of the camera, from the left edge to the right one. wheelbase_m: from axle to axle. positive: the
-    side that positive steering turns to, "left" or "right".
+    side that positive steering turns to, "left" or "right". human: where the human's pulses come from, one of HUMANS.
     """
 
     name: str = "the recordings' car"
@@ -58,6 +59,7 @@ class Car:
     field_of_view_deg: float = 77.3196  # a focal length of 400 pixels of 640
     wheelbase_m: float = 0.26
     positive: str = "right"  # as the pictures of the recordings show
+    human: str = "receiver"
 
     def __post_init__(self):
         steering, throttle = self.pwm.steering, self.pwm.throttle
@@ -135,10 +137,10 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether actions and pictures mean the same on both cars: all is equal but the name, the cap, and which side
-        is called left.
+        """Whether actions and pictures mean the same on both cars: all is equal but the name, the cap, the human, and
+        which side is called left.
         """
-        mine, others = ({**c.description(), "name": "", "steering": c.steering_us} for c in (self, other))
+        mine, others = ({**c.description(), "name": "", "human": "", "steering": c.steering_us} for c in (self, other))
         for description in (mine, others):
             description["throttle"] = {**description["throttle"], "cap_us": 0}
         return mine == others
@@ -171,12 +173,13 @@ class Car:
             },
             "camera": {"field_of_view_deg": self.field_of_view_deg},
             "wheelbase_m": self.wheelbase_m,
+            **({"human": self.human} if self.human != HUMANS[0] else {}),
         }
 
     @classmethod
     def of(cls, content: object, where: str = "car.yml") -> "Car":
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
-        content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m"})
+        content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m", "human"})
         steering = _section(
             content["steering"],
             f"{where}: steering",
@@ -197,6 +200,9 @@ class Car:
         name = content.get("name", "no name")
         if not isinstance(name, str) or not 0 < len(name) <= 60 or not name.isprintable():
             raise CarError(f"{where}: name must be 1 to 60 characters", found=repr(name)[:80])
+        human = content.get("human", HUMANS[0])
+        if human not in HUMANS:
+            raise CarError(f"{where}: human must be {' or '.join(HUMANS)}", found=repr(human)[:80])
         us = {
             f"{channel}.{key}": _whole(value, f"{where}: {channel}: {key}")
             for channel, section in (("steering", steering), ("throttle", throttle))
@@ -228,6 +234,7 @@ class Car:
                 ),
                 cap_us=cap_us,
                 positive=positive,
+                human=human,
                 **measures,
             )
         except (CarError, PwmError) as error:
@@ -237,7 +244,7 @@ class Car:
         ):
             # The checked constants themselves, because whole microseconds are slightly less precise.
             positive = steering.get("positive", _DEFAULT_CAR.positive)
-            car = cls(car.name, PwmCalibration(), cap_us, positive=positive, **measures)
+            car = cls(car.name, PwmCalibration(), cap_us, positive=positive, human=human, **measures)
         return car
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import serial
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
 from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
@@ -43,6 +44,7 @@ STALE_S = 0.5  # a status that is older means silence: the Arduino sends one eve
 LATE_S = 0.150  # the Arduino rejects older commands, and a link as slow as this is unfit for driving
 DATED = (">A", ">D")  # commands that carry the time of the newest status that the host had read
 READ_TIMEOUT_S = 0.05
+RELAY_EVERY_S = 0.015  # a gamepad's sticks at most: beside 100 commands a second, the line has room for these
 
 # serial.SerialException is an OSError, termios.error is not; TypeError: pyserial's, if another thread closed it.
 PORT_ERRORS = (OSError, termios.error, TypeError)
@@ -85,7 +87,7 @@ RESULTS = {
     "w": "refused: nobody has just wiggled the steering stick",
 }
 MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
-    "s": "switch the transmitter on",
+    "s": "switch the transmitter on, or hold L1 of the gamepad",
     "t": "let go of the throttle stick",
     "w": "move the steering stick far to both sides within 3 s and let go of it for a second, without any throttle",
     "-": "nothing is missing",
@@ -214,7 +216,8 @@ class ServoLink:
 
     Any thread may call any method. Nothing is reconnected behind the caller's back: when the port fails, each call
     raises LinkError, the Arduino stops by itself, and the caller decides whether to open a new link, whose Arduino is
-    then in manual and has to be armed again. If the Arduino resets itself, the link goes on with the number of its new
+    then in manual and has to be armed again. With a car whose human has a gamepad, the thread that reads the statuses
+    answers them with its sticks. If the Arduino resets itself, the link goes on with the number of its new
     start, but the Arduino ignores drive commands until arm().
     """
 
@@ -229,6 +232,8 @@ class ServoLink:
         """port: "" means the only Arduino's. car: None means this machine's. Raises CarError if its car.yml cannot be
         read, and PortError if it is not clear which port is meant.
         """
+        self._gamepad: Gamepad | None = None
+        self._relayed_s = 0.0
         self.port = port or find_port()
         self.car = car or this_car()
         self.calibration = self.car.pwm
@@ -266,7 +271,8 @@ class ServoLink:
         The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. It is
         told of every car but the default one, and of that too if it now drives its pins for another.
         Raises LinkError if the port cannot be opened or is in use, if nothing there says hello within `boot_s` seconds,
-        if the firmware is another one than this program knows, or if it refuses this car.
+        if the firmware is another one than this program knows, or if it refuses this car. Raises GamepadError as
+        open_gamepad() does.
         """
         if self._serial:
             raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
@@ -282,6 +288,11 @@ class ServoLink:
                 "port?",
             ) from error
         self._closing.clear()
+        try:
+            self._gamepad = open_gamepad() if self.car.human == "gamepad" else None
+        except RoverError:
+            self._release()
+            raise
         with self._heard:
             self._hello = self._telemetry = self._turned = self._requested = self._failure = None
             self._unanswered.clear()
@@ -319,12 +330,15 @@ class ServoLink:
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
                 self._asked = now
                 self._write(frame(">Q"))
-        if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, FIRMWARE_VERSION):
+        build, make = FIRMWARE_VERSION, "make -C firmware flash"
+        if self.car.human == "gamepad":
+            build, make = f"{build}-gamepad", f"{make} HUMAN=gamepad"
+        if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, build):
             car = "" if self.car.is_default else f"; it cannot drive {self.car.name!r} of car.yml"
             raise LinkError(
                 f"{self.port}: the Arduino has firmware {hello.firmware} (protocol {hello.protocol}), this program "
-                f"knows {FIRMWARE_VERSION} (protocol {PROTOCOL_VERSION}){car}",
-                remedy=f"put the matching firmware on it: make -C firmware flash PORT={self.port}",
+                f"knows {build} (protocol {PROTOCOL_VERSION}){car}",
+                remedy=f"put the matching firmware on it: {make} PORT={self.port}",
             )
         with self._heard:
             if not self._heard.wait_for(lambda: self._telemetry or self._failure, timeout=STALE_S):
@@ -383,6 +397,8 @@ class ServoLink:
             with contextlib.suppress(*PORT_ERRORS):
                 port.close()
         self._reader = None
+        if self._gamepad:
+            self._gamepad.close()
 
     def request(self, *, keep: bool = False) -> None:
         """Note that somebody asks for the car now; the next arm() tells the Arduino, which counts the request's age.
@@ -605,9 +621,24 @@ class ServoLink:
                 if not skipping:
                     self._hear(line, now)
                 skipping = False
+            if self._gamepad and lines:
+                self._relay(self._gamepad, now)
             if len(pending) > LINE_MAX:
                 pending, skipping = b"", True
                 self.garbled += 1
+
+    def _relay(self, gamepad: Gamepad, now: float) -> None:
+        """Answer the newest status with the gamepad's sticks, or with 0 and 0 while the human has let go."""
+        heard = self._telemetry
+        if not heard or heard.host_s != now or now - self._relayed_s < RELAY_EVERY_S:
+            return
+        self._relayed_s, pulses_us = now, (0, 0)
+        if sticks := gamepad.sticks():
+            throttle = max(sticks[1] * self.car.cap, self.calibration.throttle.low)
+            pulses = self.calibration.pulses(-sticks[0] * self.car.left, throttle)
+            pulses_us = pulses.steering_us, pulses.throttle_us
+        with contextlib.suppress(LinkError):  # the next call of another thread raises what it means
+            self._write(frame(f">S {heard.boot} {heard.uptime_ms} {pulses_us[0]} {pulses_us[1]}"))
 
     def _hear(self, line: bytes, now: float) -> None:
         message = parse(line, now)

@@ -27,6 +27,7 @@ from rover_lib.onboard.artifact.manifest import car_of, read_manifest, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.csi import is_csi
+from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.ports import find_port, list_ports
 from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
@@ -362,6 +363,8 @@ def _transmitter(link: ServoLink) -> Check:
             pulses = {"steering": telemetry.receiver_steering_us, "throttle": telemetry.receiver_throttle_us}
             silent = [name for name, pulse_us in pulses.items() if pulse_us is None]
         time.sleep(0.02)
+    if silent and link.car.human == "gamepad":
+        return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
     if silent:
         found = f"no signal on {' and '.join(silent)}: arming will be refused"
         return Check(
@@ -429,9 +432,16 @@ def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], res
 
 
 def car(artifact: Path | str | None = None) -> Iterator[Check]:
-    """Say which car this is, and warn if the artifact was calibrated for another. Raises CarError for a bad car.yml."""
+    """Say which car this is, and warn if the artifact was calibrated for another. If its human has a gamepad, open it.
+
+    Raises CarError for a bad car.yml, and GamepadError.
+    """
     this, path = this_car(), car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
+    if this.human == "gamepad":
+        open_gamepad().close()
+        found = ", ".join(map(str, list_gamepads()))
+        yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
     if artifact and Path(artifact).is_file():
         with contextlib.suppress(ArtifactError):  # the artifact's own check reports it
             if not (meant := car_of(read_manifest(Path(artifact)))).drives_like(this):

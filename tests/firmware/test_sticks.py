@@ -1,0 +1,150 @@
+"""A gamepad's sticks, which the host sends: the firmware built with HUMAN=gamepad, in virtual time."""
+
+import needs
+import pytest
+
+from lab.arduino.native import STEERING, THROTTLE, NativeArduino
+from rover_lib.onboard.car.servo_link import State, frame
+
+pytestmark = needs.gcc
+NEUTRAL = (1456, 120)
+CAP_US = 238
+
+
+@pytest.fixture
+def board():
+    """Running; somebody holds the gamepad's button, and the sticks rest."""
+    board = NativeArduino(gamepad=True)
+    board.run(300)
+    return board
+
+
+@pytest.fixture
+def armed(board):
+    board.wiggle()
+    assert board.command("A") == "k"
+    return board
+
+
+def moved_after_ms(pins):
+    return max((n for n, (_, us) in enumerate(pins, 1) if us > 120), default=0)
+
+
+def test_a_board_with_a_receiver_knows_no_sticks():
+    board = NativeArduino()
+    board.sticks = [0, 0]
+    for _ in range(50):
+        board.run(20)
+        board.send_sticks(1750, 200, board.now_ms - 15)
+    assert board.status.missing == "s"
+    assert board.run(1) == [NEUTRAL]
+    assert "gamepad" in NativeArduino(gamepad=True).hello.firmware
+    assert "gamepad" not in board.hello.firmware
+
+
+def test_the_human_drives(board):
+    board.sticks = [1700, 180]
+    assert board.run(40)[-1] == (1700, 180)
+    status = board.status
+    assert (status.receiver_steering_us, status.receiver_steering_period_us) == (1700, 21316)
+    assert (status.receiver_throttle_us, status.receiver_throttle_period_us) == (180, 1016)
+    board.sticks[THROTTLE] = 711  # these come through a host, too
+    assert board.run(40)[-1] == (1700, CAP_US)
+
+
+def test_throttle_passes_only_once_it_was_at_rest():
+    board = NativeArduino(gamepad=True)
+    board.sticks[THROTTLE] = 200
+    assert not moved_after_ms(board.run(1000))
+
+
+@pytest.mark.parametrize("stop", ["let go", "silence", "late"])
+@pytest.mark.parametrize("autonomous", [False, True])
+def test_each_loss_stops_within_200_ms(board, stop, autonomous):
+    if autonomous:
+        board.wiggle()
+        board.command("A")
+        board.drive(1600, 200, 300)
+    else:
+        board.sticks = [1700, 200]
+        board.run(300)
+    sticks = board.sticks
+    board.sticks = [0, 0]
+    if stop == "let go":
+        board.send_sticks(0, 0, board.now_ms)
+    pins = []
+    for _ in range(20):
+        if stop == "late":  # the host goes on, but its lines take longer and longer
+            board.send_sticks(*sticks, board.now_ms - 140)
+        pins += board.drive(1600, 200, 30) if autonomous else board.run(30)
+    assert moved_after_ms(pins) <= (1 if stop == "let go" else 151)
+    assert not autonomous or (board.status.state, board.status.reason) == (State.STOPPED, "s")
+    board.sticks = [1456, 200]  # and what was held is not taken up again
+    assert not moved_after_ms(board.run(500))
+
+
+def test_a_gesture_without_the_button_all_the_while_does_not_arm(board):
+    board.wiggle()
+    board.send_sticks(0, 0, board.now_ms)
+    board.run(400)
+    assert board.command("A") == "w"
+    board.wiggle()
+    board.sticks = [0, 0]
+    board.run(400)
+    assert board.command("A") == "s"
+
+
+def test_arming_wants_a_young_whole_gesture_and_uses_it_up(board):
+    assert board.command("A") == "w"  # a button that is stuck is none
+    board.sticks[STEERING] = 2012
+    board.run(5000)
+    assert board.command("A") == "w"
+    board.sticks[STEERING] = 1456
+    board.wiggle()
+    board.run(31000)
+    assert board.command("A") == "w"
+    board.wiggle()
+    assert board.command("A") == "k"
+    board.command("N")
+    assert board.command("A") == "w"
+
+
+@pytest.mark.parametrize("again", ["the same line", "older", "another boot", "too old", "from the future"])
+def test_no_line_counts_twice(board, again):
+    board.sticks = [0, 0]
+    board.run(1000)
+    now, boot = board.now_ms, board.status.boot
+    board.send_sticks(1456, 120, now - 20)
+    heard = {"the same line": now - 20, "older": now - 40, "another boot": now - 1, "too old": now - 151,
+             "from the future": now + 1}[again]  # fmt: skip
+    before = board.status.old_commands
+    for _ in range(10):
+        board.send(frame(f">S {boot + (again == 'another boot')} {heard} 1456 120"))
+    assert board.status.receiver_steering_us is None
+    assert board.status.old_commands == before + 10
+
+
+@pytest.mark.parametrize("pulses", [(0, 120), (1456, 0), (899, 120), (2013, 120), (1456, 712), (70000, 120)])
+def test_no_other_pulses(board, pulses):
+    board.send_sticks(*pulses, board.now_ms)
+    assert board.status.out_of_range == 1
+    assert board.run(1) == [NEUTRAL]
+
+
+@pytest.mark.parametrize("stick", [STEERING, THROTTLE])
+def test_a_moved_stick_takes_over(armed, stick):
+    armed.drive(1600, 200, 200)
+    armed.sticks[stick] += 80
+    pins = armed.drive(1600, 200, 100)
+    assert (armed.status.state, armed.status.reason) == (State.MANUAL, "h")
+    assert moved_after_ms(pins) <= 40
+
+
+def test_sticks_leave_what_became_of_the_hosts_commands(armed):
+    """The host reads the result of its own last command, however many sticks come between."""
+    armed.command("N")
+    assert armed.command("A") == "w"
+    before = armed.status
+    armed.run(200)
+    after = armed.status
+    assert (after.result, after.sequence) == (before.result, before.sequence) == ("w", armed.sequence)
