@@ -141,7 +141,7 @@ def bring_statistics(
     strongest = before.flatten(1).amax(1)
     near = strongest > strongest.quantile(1 - NEAR_SHARE)
 
-    given = net.get_submodule(norm)
+    given: Any = net.get_submodule(norm)
     usually = entered[~near].amax(0)
     beyond = entered[near].median(0).values - usually
     chosen = (beyond / entered.std(0)).topk(round(CHANGED * len(beyond))).indices

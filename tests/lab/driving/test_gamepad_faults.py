@@ -18,7 +18,7 @@ from lab.driving.bench import FaultError
 from lab.driving.priority import boost, boost_priority
 from lab.driving.virtual_gamepad import VirtualGamepad
 
-pytestmark = [pytest.mark.emulated, pytest.mark.slow, needs.simavr]
+pytestmark = [pytest.mark.emulated, pytest.mark.release, needs.simavr]  # in real time: of a quiet machine
 STOP_MS = 200
 CAP_US = 238  # of a stick at its end: the cap
 RELAY = """

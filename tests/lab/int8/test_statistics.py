@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import pytest
 import torch
 from policies import memory_samples
 
@@ -9,6 +10,7 @@ from rover_lib.workshop.int8.frames import ODD, describe_odd
 from rover_lib.workshop.int8.observe import calibrate
 
 
+@pytest.mark.slow
 def test_brought_statistics_make_a_few_frames_odd_by_the_products_own_measure(tiny):
     """And in float the policy plans nearly as before, so that INT8 alone is judged."""
     norm, times = STATISTICS["layer4, most"]
