@@ -66,7 +66,7 @@ HEARD_NOW = "ahead == 1; *(uint32_t *)&command->heard_ms = now_ms;"  # all that 
         ("asked_for", ">= COMMAND_TIMEOUT_MS", ">= 4000", KILLED),
         ("asked_for", "vehicle->throttle_free ? ", "true ? ", "presets after a loss"),
         ("asked_for", "ahead == 1;", HEARD_NOW, "a link further and further behind"),
-        ("capped", "command->throttle_us, vehicle->cap_us);", "command->throttle_us, 2000);", "a host that asks for full throttle"),
+        ("capped", ")command->throttle_us, vehicle->cap_us);", ")2000, 2000);", "a host that asks for full throttle"),
         ("slewed", "ms * THROTTLE_SLEW_US_PER_MS", "ms * 1000", Story()),
         ("slewed", "ms * STEERING_SLEW_US_PER_MS", "ms * 1000", Story()),
         ("human_wins", "FAST_MOVED_PULSES : 1)", "8 : 1)", "every third pulse misread"),
