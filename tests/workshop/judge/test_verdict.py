@@ -26,7 +26,7 @@ def demo():
     (path,) = folder.glob("benchmark-*.json")
     stages = copy.deepcopy(stages | {"benchmark": read_stage(path, "benchmark")["metrics"]})
     timed = stages["benchmark"]["artifacts"]
-    # What the rule makes of these is tested, not how busy the machine was that published them, nor what its mixed needed.
+    # What the rule makes of these is tested, not how busy the machine was that published them, nor what mixed needed.
     stages["quantize"]["modes"]["mixed"]["float_blocks"] = ["encoder.0.attention"]
     timed["mixed"]["latency_p50_ms"] = timed["static"]["latency_p50_ms"]
     for times in timed.values():
