@@ -82,9 +82,8 @@ SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
 SILENCE_S = 1200  # of processor time: loading the full policy in FP32 prints nothing for five minutes
 WAITING = 6  # by the clock the silence may be that many times longer, as the machine may have more to do
 
-BLOCK = np.dtype(
-    [(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")]
-)  # as in count.c
+# As in count.c.
+BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")])
 
 
 class CountError(RoverError):

@@ -62,7 +62,7 @@ def _break_logger() -> None:
     telemetry._seal = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
 
 
-# What a human gives by hand, a gesture before the car drives, is waited for only if stdin is a terminal.
+# A drive waits for its human's gesture only if stdin is a terminal.
 IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
 INSIDE = {"end the loop's thread": _end_this_thread, "raise in the loop": _raise, "raise in the logger": _break_logger}
 
@@ -73,6 +73,11 @@ def on_signal(what: str) -> None:
 
 
 # ---- the commands
+
+
+def rover_after(code: str) -> list[str]:
+    """Return the program that is `rover` once that code has run in its process."""
+    return [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
 
 
 class RoverCommand(Child):
@@ -122,7 +127,7 @@ class Drive(RoverCommand):
             code += IN_TERMINAL
         if start in INSIDE:
             code += f"from {__name__} import on_signal; on_signal({start!r}); "
-        run = [sys.executable, "-c", f"{code}from rover_lib.cli import main; main()"]
+        run = rover_after(code)
         if start == "clock":
             env = {"LD_PRELOAD": str(bench.clock_library()), "CLOCK_STEP": str(bench.clock)}
         devices = bench.devices()

@@ -21,7 +21,6 @@ import random
 import re
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,7 +33,16 @@ import numpy as np
 
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import CC, REPOSITORY, build, compile_c
-from lab.driving.bench import END_S, IN_TERMINAL, START_S, Drive, DrivingBench, FaultError, RoverCommand
+from lab.driving.bench import (
+    END_S,
+    IN_TERMINAL,
+    START_S,
+    Drive,
+    DrivingBench,
+    FaultError,
+    RoverCommand,
+    rover_after,
+)
 from lab.driving.pins import (
     CAR,
     CONTINUES,
@@ -202,9 +210,8 @@ def record_and_replay(bench: DrivingBench, steps: int = 24, step_s: float = 0.25
     bench.events = []
     episode = next(folder.glob("episode_*"))
     options = ["--replay", episode, "--port", bench.cable.port]
-    program = [sys.executable, "-c", f"{IN_TERMINAL}from rover_lib.cli import main; main()"]
     bench.arduino.ready(True)
-    with contextlib.closing(RoverCommand("drive", *options, run=program)) as replay:
+    with contextlib.closing(RoverCommand("drive", *options, run=rover_after(IN_TERMINAL))) as replay:
         replay.wait_for_message("armed")
         bench.arduino.ready(False)
         bench.wait(steps * step_s)

@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from rover_learn.train import TrainingRecipe, _train
 from rover_learn.training import Resumable
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
+from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.frames import describe_odd
 from rover_lib.workshop.int8.observe import calibrate
@@ -107,8 +108,7 @@ def _weights(recordings: Recordings, folder: Path, seed: int, name: str, recipe:
     if not policy.is_file():
         with Resumable(phases) as saved:
             trained = _train(recordings, SIZE, recipe, seed, torch.device("cpu"), saved)
-        with atomic_path(policy) as temporary:
-            torch.save(trained["model_state_dict"], temporary)
+        save_torch(policy, trained["model_state_dict"])
         shutil.rmtree(phases)
     weights = {k.removeprefix("model."): v for k, v in torch.load(policy, weights_only=True).items()}
     if (where := STATISTICS[name]) is None:

@@ -124,20 +124,15 @@ def _fit(root: Path) -> list[Row]:
 def _judged(root: Path) -> list[Row]:
     """How far off the computed times were."""
     metrics = _metrics(root / "results" / "clock", "clock")
+    judged = {"architecture left out": metrics["judged"]}
+    judged["Arm's GoogLeNet not judged"] = {"4": metrics["judged_without_odd"]["4"]}
+    judged["form chosen without it too"] = {n: metrics["choice"][n] for n in ("1", "4")}
+    judged |= {f"all of {runtime} left out": {"4": found} for runtime, found in metrics["other_runtime"].items()}
     rows: list[Row] = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
-    for n, found in metrics["judged"].items():
-        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct", "held_pct"))
-        rows.append((f"{n} thread{'s' * (n != '1')}, architecture left out", *shown))
-    for n, found in metrics["judged_without_odd"].items():
-        if n != "1":
-            shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
-            rows.append((f"{n} threads, Arm's GoogLeNet not judged", *shown, ""))
-    for n in ("1", "4"):
-        shown = (f"{metrics['choice'][n][key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
-        rows.append((f"{n} thread{'s' * (n != '1')}, form chosen without it too", *shown, ""))
-    for runtime, found in metrics["other_runtime"].items():
-        shown = (f"{found[key]:.3g}" for key in ("n", "median_pct", "worst_pct"))
-        rows.append((f"4 threads, all of {runtime} left out", *shown, ""))
+    for said, by_threads in judged.items():
+        for n, found in by_threads.items():
+            shown = (_of(found, key, ".3g") or "" for key in ("n", "median_pct", "worst_pct", "held_pct"))
+            rows.append((f"{n} thread{'s' * (n != '1')}, {said}", *shown))
     return rows
 
 

@@ -2,13 +2,12 @@
 
 import needs
 import pytest
+from test_vehicle import CAP_US, NEUTRAL, moved_after_ms
 
 from lab.arduino.native import STEERING, THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State, frame
 
 pytestmark = needs.gcc
-NEUTRAL = (1456, 120)
-CAP_US = 238
 
 
 @pytest.fixture
@@ -17,17 +16,6 @@ def board():
     board = NativeArduino(gamepad=True)
     board.run(300)
     return board
-
-
-@pytest.fixture
-def armed(board):
-    board.wiggle()
-    assert board.command("A") == "k"
-    return board
-
-
-def moved_after_ms(pins):
-    return max((n for n, (_, us) in enumerate(pins, 1) if us > 120), default=0)
 
 
 def test_a_board_with_a_receiver_knows_no_sticks():

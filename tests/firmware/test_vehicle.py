@@ -26,13 +26,6 @@ def board():
     return board
 
 
-@pytest.fixture
-def armed(board):
-    board.wiggle()
-    assert board.command("A") == "k"
-    return board
-
-
 def throttles(pins):
     return [throttle_us for _, throttle_us in pins]
 

@@ -30,9 +30,10 @@ from torch.ao.quantization.quantize_fx import prepare_fx
 from torch.fx import GraphModule, Node
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.onboard.stage import atomic_path, open_plain
+from rover_lib.onboard.stage import open_plain
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
@@ -160,8 +161,7 @@ class Calibration:
     frames: dict[str, Tensor] = field(default_factory=dict, repr=False)  # (samples, 2) extremes on each, by place
 
     def save(self, path: Path | str) -> None:
-        with atomic_path(path) as temporary:
-            torch.save(self.__dict__, temporary)
+        save_torch(Path(path), self.__dict__)
 
     @classmethod
     def load(cls, path: Path | str) -> "Calibration":

@@ -452,10 +452,8 @@ def _check_pictures(root: Path, dataset: "LeRobotDataset", cameras: tuple[_Camer
             packed = chunk.field("bytes")
             if chunk.null_count or packed.null_count:
                 raise _broken(f"{root}: pictures of '{camera.key}' are not in its tables, but named by a path")
-            for head in compute.binary_slice(
-                packed, 0, 26
-            ).to_pylist():  # LeRobot writes PNG; others are seen when read
-                if head.startswith(b"\x89PNG"):
+            for head in compute.binary_slice(packed, 0, 26).to_pylist():
+                if head.startswith(b"\x89PNG"):  # as LeRobot writes them; others are seen when read
                     width, height, _, kind = struct.unpack(">IIBB", head[16:])
                     shape = (height, width, {0: 1, 3: 1, 4: 2, 6: 4}.get(kind, 3))
                     _Pictures._check_size(camera, shape, row, root)
@@ -578,7 +576,8 @@ def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str,
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
     marks = [key for key in (INTERVENTION, SUCCESS) if key in dataset.meta.features]
     for key in marks:
-        if not _is_mark(feature := dataset.meta.features[key]):
+        feature = dataset.meta.features[key]
+        if feature["dtype"] != "bool" or list(feature["shape"]) != [1]:
             found = f"{quote(feature['dtype'])} of shape {list(feature['shape'])}"
             raise EpisodeError(
                 f"{root}: its '{key}' is not a yes or no for each frame",
@@ -617,11 +616,6 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
                     if reverse
                     else "are the names in the right order (--action-names), and the numbers in our units?",
                 )
-
-
-def _is_mark(feature: Any) -> bool:
-    """Whether a feature has one yes or no for each frame."""
-    return bool(feature["dtype"] == "bool" and list(feature["shape"]) == [1])
 
 
 def _check_rate(root: Path, columns: Mapping[str, np.ndarray], fps: float) -> None:

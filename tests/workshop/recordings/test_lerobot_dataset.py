@@ -351,7 +351,7 @@ def repainted(paint):
 
 
 def film(path, frames, fps):
-    """Writes the video again with its first `frames` frames, or its last one until there are so many."""
+    """Cuts the video to that many frames; a shorter one gets its last frame again and again."""
     with av.open(path) as source:
         pictures = [f.to_ndarray(format="rgb24") for f in source.decode(video=0)]
     with av.open(path, "w") as target:
