@@ -5,9 +5,9 @@ from pathlib import Path
 
 from policies import memory_samples
 
+from rover_hailo.kit import write_kit
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.hailo.kit import write_kit
 from rover_lib.workshop.recordings.episodes import Split
 from rover_lib.workshop.run.session import Opened
 

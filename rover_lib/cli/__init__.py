@@ -16,7 +16,7 @@ ROVERS = onboard.main.commands
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
     "Prepare a policy": (prepare.run, prepare.inspect, prepare.report),
     "Drive": (ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive),
-    "Look": (drive.view, drive.log),
+    "Look": (),
     "Step by step": (
         prepare.quantize,
         prepare.notebook,

@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -262,14 +263,8 @@ def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
     if kit is None:
         return
-    from rover_lib.workshop.hailo.kit import write_kit
-    from rover_lib.workshop.run.session import open_run
-
-    report = write_kit(open_run(run_dir, terminal_bar()), kit, samples=samples, progress=terminal_bar())
-    for name, network in report["networks"].items():
-        errors = ", ".join(f"{action} {error:.3g}" for action, error in network["stand_in_actions"].items())
-        click.echo(f"{name}: {network['gmac']:.2f} GMAC; in ONNX Runtime's INT8, actions differ by at most {errors}")
-    click.echo(f"{kit}: KIT.md says what is in it; next, where Hailo's compiler is: sh compile_hailo8.sh backbone")
+    (hailo,) = entry_points(group="rover.kits", name="hailo")
+    hailo.load()(run_dir, kit, samples)
 
 
 @click.command("export-dataset", short_help="Write recordings as a LeRobotDataset v3.")

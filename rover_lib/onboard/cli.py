@@ -729,7 +729,7 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of drive_log, or
+    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of rover_look, or
     balloon_world's Simulation, whose `ask` gets what is asked for on the page.
     """
     import asyncio

@@ -17,10 +17,10 @@ from rover_lib.onboard.recording.outcome import relabel
 from rover_lib.onboard.stage import read_stage
 from rover_lib.onboard.view.server import read_token
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.drive_log.replay import pictures_of
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.tub import read_tub
+from rover_look.replay import pictures_of
 
 MOST_S, MOST_BYTES = 10, 500_000_000
 

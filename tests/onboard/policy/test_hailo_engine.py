@@ -10,6 +10,7 @@ import pytest
 from hailo_kit import normalised
 from policies import memory_samples
 
+from rover_hailo import compile as hailo_compile
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import ReleaseError, inspect_artifact
@@ -17,7 +18,6 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.hailo import compile as hailo_compile
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ pytest.importorskip("mcap", reason="needs the package mcap, of the extra worksho
 
 from mcap.reader import make_reader
 
-from rover_lib.workshop.drive_log.mcap_log import SCHEMAS, write_mcap
+from rover_look.mcap_log import SCHEMAS, write_mcap
 
 
 def read_back(path):

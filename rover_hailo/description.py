@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from rover_hailo.chips import CHIPS
+from rover_hailo.operators import OPERATORS
 from rover_lib.workshop.act import ActConfig
-from rover_lib.workshop.hailo.chips import CHIPS
-from rover_lib.workshop.hailo.operators import OPERATORS
 
 
 def description(config: ActConfig, report: Mapping[str, Any]) -> str:

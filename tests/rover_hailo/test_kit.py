@@ -13,13 +13,13 @@ import torch
 from hailo_kit import FRAMES, normalised, opened
 from policies import TINY, lerobot_policy, memory_samples, smooth_frame
 
+from rover_hailo import int8_estimate as stand_in
+from rover_hailo.chips import CHIPS, estimate
+from rover_hailo.description import files
+from rover_hailo.kit import write_kit
+from rover_hailo.networks import networks
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, ActConfig, Affine, imagenet, inputs_of
-from rover_lib.workshop.hailo import int8_estimate as stand_in
-from rover_lib.workshop.hailo.chips import CHIPS, estimate
-from rover_lib.workshop.hailo.description import files
-from rover_lib.workshop.hailo.kit import write_kit
-from rover_lib.workshop.hailo.networks import networks
 
 DOCS = Path(__file__).parents[2] / "docs" / "hailo.md"
 

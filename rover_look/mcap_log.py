@@ -20,7 +20,7 @@ from rover_lib.onboard.drive.flight_log import Flight, Tick
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS, DRIVERS, json_controls, number_of
 from rover_lib.onboard.stage import atomic_path, plain
-from rover_lib.workshop.drive_log.replay import began_s, find_recording, pictures_of
+from rover_look.replay import began_s, find_recording, pictures_of
 
 TICK, EVENT, MACHINE, CONTROL, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/control", "/camera")
 INFO = 2  # a level of foxglove.Log

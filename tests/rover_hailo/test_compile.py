@@ -11,7 +11,7 @@ import hailo_standin
 import numpy as np
 import pytest
 
-from rover_lib.workshop.hailo import compile as hailo_compile
+from rover_hailo import compile as hailo_compile
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.format import open_memmap
 
+from rover_hailo.int8_estimate import session_of
+from rover_hailo.networks import Splits
 from rover_lib.workshop.act import inputs_of
-from rover_lib.workshop.hailo.int8_estimate import session_of
-from rover_lib.workshop.hailo.networks import Splits
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.episodes import Sample

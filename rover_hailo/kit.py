@@ -10,16 +10,16 @@ from typing import Any
 
 import onnx
 
+from rover_hailo.calibration import save_arrays, write_calibration, write_expected
+from rover_hailo.chips import CHIPS, estimate
+from rover_hailo.description import description
+from rover_hailo.int8_estimate import Error, stand_in_errors
+from rover_hailo.networks import Network, Splits
+from rover_hailo.scripts import compile_script, model_script, script_names
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, Artifact
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, Affine
-from rover_lib.workshop.hailo.calibration import save_arrays, write_calibration, write_expected
-from rover_lib.workshop.hailo.chips import CHIPS, estimate
-from rover_lib.workshop.hailo.description import description
-from rover_lib.workshop.hailo.int8_estimate import Error, stand_in_errors
-from rover_lib.workshop.hailo.networks import Network, Splits
-from rover_lib.workshop.hailo.scripts import compile_script, model_script, script_names
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly

@@ -19,9 +19,9 @@ from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_l
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.view.path_overlay import CarShape
-from rover_lib.workshop.drive_log import film as f
-from rover_lib.workshop.drive_log import replay as r
 from rover_lib.workshop.progress import silent
+from rover_look import film as f
+from rover_look import replay as r
 
 SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10
 

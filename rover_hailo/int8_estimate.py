@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 import torch
 
-from rover_lib.workshop.hailo.networks import Network, Splits
+from rover_hailo.networks import Network, Splits
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.progress import Progress
 

@@ -10,9 +10,9 @@ import torch
 from onnx import helper, numpy_helper
 from torch import Tensor, nn
 
+from rover_hailo.operators import OPERATORS
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block, transform
-from rover_lib.workshop.hailo.operators import OPERATORS
 from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
 
 

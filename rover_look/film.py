@@ -18,8 +18,8 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.onboard.view.path_overlay import CarShape, from_now
-from rover_lib.workshop.drive_log.replay import AHEAD, Replay
 from rover_lib.workshop.progress import Progress, silent
+from rover_look.replay import AHEAD, Replay
 
 WIDTH = 640
 PANEL = 118  # rows below the picture

@@ -1,8 +1,8 @@
 """Write the texts for Hailo's compiler: a model script (.alls) for each network and chip, and a script to start it."""
 
+from rover_hailo.chips import Chip
+from rover_hailo.networks import Network
 from rover_lib.workshop.act import ActConfig, zero_colour
-from rover_lib.workshop.hailo.chips import Chip
-from rover_lib.workshop.hailo.networks import Network
 
 
 def script_names(network: Network) -> dict[str, str]:

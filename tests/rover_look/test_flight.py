@@ -11,7 +11,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
-from rover_lib.workshop.drive_log.flight import flight_figure
+from rover_look.flight import flight_figure
 
 
 class Pi(Host):

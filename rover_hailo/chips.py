@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rover_lib.workshop.hailo.networks import Network
+from rover_hailo.networks import Network
 
 
 @dataclass(frozen=True)
