@@ -85,7 +85,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
-	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib rover_look rover_hailo rover_learn balloon_world tests
+	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world tests
 
 # The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
 # The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.
@@ -108,7 +108,7 @@ check-release: lint $(DEMO)
 	$(MAKE) faults faults-cars random mutants kills pi-fast pi
 
 coverage: $(DEMO)
-	$(VENV)/bin/pytest --cov=rover_lib --cov=rover_look --cov=rover_hailo --cov=rover_learn --cov=balloon_world --cov=lab --cov=lerobot_robot_rover --cov-report=term
+	$(VENV)/bin/pytest --cov=rover_lib --cov=rover_exchange --cov=rover_look --cov=rover_hailo --cov=rover_learn --cov=balloon_world --cov=lab --cov=lerobot_robot_rover --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. The last file that it makes is policy_static.onnx.zip.
 count: $(READY)

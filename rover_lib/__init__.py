@@ -1,6 +1,6 @@
 """Put a learned driving policy (LeRobot ACT) on a small computer.
 
-Imports go one way: onboard <- workshop <- cli <- rover_look, rover_hailo, rover_learn <- balloon_world <- lab.
+Imports go one way: onboard <- workshop <- cli <- what stands beside it <- balloon_world <- lab.
 """
 
 import os

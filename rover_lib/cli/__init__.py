@@ -26,7 +26,7 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
         prepare.list_runs,
     ),
     "Teach": (),
-    "Recordings": (ROVERS["label"], prepare.import_tub, prepare.export_dataset),
+    "Recordings": (ROVERS["label"],),
     "A rover's models, and arming it": (
         prepare.wheelhouse,
         ROVERS["release"],
@@ -34,7 +34,8 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
         ROVERS["heartbeat"],
     ),
 }
-MORE = {"rover.teach": "Teach", "rover.look": "Look"}  # sections, by the group of entry points that adds to them
+# Sections, by the group of entry points that adds to them.
+MORE = {"rover.teach": "Teach", "rover.look": "Look", "rover.recordings": "Recordings"}
 
 
 class Workstation(Rover):

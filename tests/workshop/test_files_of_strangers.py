@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
@@ -19,7 +20,6 @@ from rover_lib.onboard.view.server import read_token
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.tub import read_tub
 from rover_look.replay import pictures_of
 
 MOST_S, MOST_BYTES = 10, 500_000_000

@@ -10,15 +10,15 @@ import pytest
 from click.testing import CliRunner
 from test_episodes import edit, load, record
 
+from rover_exchange.export_dataset import export_dataset
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
-from rover_lib.workshop.recordings.export_dataset import export_dataset
 from rover_lib.workshop.recordings.samples import car_of
 
-CRAWLER = read_car(Path(__file__).parents[3] / "lab/cars/crawler.yml")
+CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
 CHUNK = 8  # as in test_episodes.load
 
 # Importing LeRobot and encoding tiny pictures as AV1 takes seconds.

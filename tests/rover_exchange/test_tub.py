@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from rover_exchange.export_dataset import export_dataset, usual_rate_hz
+from rover_exchange.tub import read_tub
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.kinds import kinds_of
-from rover_lib.workshop.recordings.export_dataset import export_dataset, usual_rate_hz
 from rover_lib.workshop.recordings.samples import frame_rate_hz
-from rover_lib.workshop.recordings.tub import read_tub
 
 LEFT = Car.of(
     {

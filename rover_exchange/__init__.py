@@ -1,0 +1,1 @@
+"""Recordings to and from other projects: LeRobotDatasets out, donkeycar's tubs in."""
