@@ -76,7 +76,7 @@ def start_relay(board, pad):
 
 
 def hear(child):
-    heard = child.read(120.0).decode().strip()
+    heard = child.read_line(30.0).strip()
     assert heard, child.errors()
     return heard
 
