@@ -198,11 +198,11 @@ def record_and_replay(bench: DrivingBench, steps: int = 24, step_s: float = 0.25
     bench.end_drive()
     bench.repair()
     folder, times_s = bench.folder / "episodes", []
-    with contextlib.closing(RoverCommand("record", folder, *bench.devices())) as record:
+    with contextlib.closing(RoverCommand("record", folder, *bench.devices(), run=rover_after(bench.inside))) as record:
         record.wait_for_message("recording")
         for pulses in sent:
             times_s.append(time.monotonic())
-            bench.arduino.transmitter(*pulses)
+            bench.human.transmitter(*pulses)
             bench.wait(step_s)
         record.process.send_signal(signal.SIGINT)
         record.wait_for_success()
@@ -210,10 +210,10 @@ def record_and_replay(bench: DrivingBench, steps: int = 24, step_s: float = 0.25
     bench.events = []
     episode = next(folder.glob("episode_*"))
     options = ["--replay", episode, "--port", bench.cable.port]
-    bench.arduino.ready(True)
-    with contextlib.closing(RoverCommand("drive", *options, run=rover_after(IN_TERMINAL))) as replay:
+    bench.human.ready(True)
+    with contextlib.closing(RoverCommand("drive", *options, run=rover_after(bench.inside + IN_TERMINAL))) as replay:
         replay.wait_for_message("armed")
-        bench.arduino.ready(False)
+        bench.human.ready(False)
         bench.wait(steps * step_s)
         replay.wait_for_success()
     bench.wait(0.2)

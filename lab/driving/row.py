@@ -25,6 +25,7 @@ class FaultRow:
     limits: what stops a drive that `continues` after all, in words. until_limit: whether that happens in this row.
     starves: whether the fault takes this machine's time away from the drive. paused_s: for how long it pauses the
     drive. human_us: the pulses expected on the pins if `human` is expected.
+    human: the only one of car.yml's humans who has this fault; "": both.
     """
 
     kind: str
@@ -40,6 +41,7 @@ class FaultRow:
     limits: str = ""
     until_limit: bool = False
     starves: bool = False
+    human: str = ""
     paused_s: float = 0.0
     human_us: tuple[float, float] = REST_US
 
