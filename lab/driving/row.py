@@ -6,7 +6,7 @@ from typing import Any
 
 from balloon_world.simulated_arduino import REST_US
 from lab.driving.bench import DrivingBench
-from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
+from lab.driving.pins import CAR, CONTINUES, HUMAN, REFUSED, STOPPED
 
 Inject = Callable[[DrivingBench], float | None]
 
@@ -59,6 +59,8 @@ class FaultKind:
         more: other fields of FaultRow. Unless exit_code is among them, it is 3 for `stopped`, 4 for `human`, None for
         `continues` and 1 for `refused`.
         """
+        if CAR.human == "gamepad" and expected == STOPPED:  # whatever stops the commands stops its sticks too
+            message += "|the transmitter's signal was lost"
         more.setdefault("exit_code", {STOPPED: 3, HUMAN: 4, CONTINUES: None, REFUSED: 1}[expected])
 
         def row(inject: Inject) -> Inject:
