@@ -134,6 +134,7 @@ class GamepadHuman:
         self._ready = ready
 
     def _run(self) -> None:
+        boost(threading.get_native_id())
         while not self._over.wait(0.1):
             status = self._status()
             if not status or status.state is State.AUTONOMOUS:
