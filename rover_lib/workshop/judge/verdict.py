@@ -485,7 +485,13 @@ def _cautions(
         lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
     if units := (stages["load"]["checkpoint"].get("normalisation") or {}).get("units"):
         lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
-    if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
+    steering = stages["load"].get("steering", {})
+    if steering.get("denied"):
+        lines.append(
+            f"The pictures show that positive steering turns {steering['side']}, and their car's file says otherwise: "
+            "is the camera's picture mirrored? `rover doctor` tells after a recorded minute."
+        )
+    if mirrored := steering.get("mirrored", []):
         lines.append(
             f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
         )

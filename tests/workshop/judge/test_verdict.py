@@ -178,10 +178,12 @@ def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused
 def test_recomputed_actions_and_throttle_beyond_the_limit_are_said(demo):
     demo["load"]["recordings"]["recomputed"] = "the actions of 5 of 6 episodes were recomputed"
     demo["compare"]["action_range"]["throttle"] = [0.0, 0.27]
+    demo["load"]["steering"] = {"side": "left", "mirrored": [], "denied": True}
     said = "\n".join(judge(demo)["cautions"])
     assert (
         "The actions of 5 of 6 episodes were recomputed." in said and "throttle up to 0.27" in said and "0.2:" in said
     )
+    assert "turns left, and their car's file says otherwise: is the camera's picture mirrored?" in said
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
