@@ -268,8 +268,8 @@ def kill_commands(ctx: click.Context, output: Path | None, each: int, only: tupl
                 metrics[f"{work.name}_twice"] = kills.do_twice(work, inputs, max(1, each // 10))
             if os.geteuid() == 0:
                 metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
-    if output:
-        write_stage(output, "kills", params={"each": each}, metrics=metrics)
+            if output:  # after each work, as all of them take an hour
+                write_stage(output, "kills", params={"each": each}, metrics=metrics)
     show(metrics, False)
     ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
 

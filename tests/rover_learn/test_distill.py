@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 from interrupted import interrupt, save_each_step
-from policies import TINY, lerobot_policy, of_a_cars_size, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, of_a_cars_size, trainer_content
 from recorded import record_drives
 
 from rover_learn import distill as distill_module
 from rover_learn import training
 from rover_learn.distill import DistillRecipe, distill, summary
+from rover_learn.fake_quant import Rounded
 from rover_learn.student import StudentShape, student_config
 from rover_lib.onboard.errors import DistillError, RoverError, TrainingError
 from rover_lib.onboard.params import params
@@ -23,6 +24,8 @@ from rover_lib.workshop.act import ACT, Affine, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.int8.choose import Chooser
+from rover_lib.workshop.int8.observe import RangeObserver, restore_observed
+from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.progress import silent
 from rover_lib.workshop.run import session
@@ -130,6 +133,32 @@ def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episode
     lessons, students = places[::2], places[1::2]
     assert len(set(lessons)) == 1
     assert students[0] != students[1] and students[2] == students[3]  # the settings matter only with QAT
+
+
+def test_int8s_training_begins_from_the_ranges_that_were_chosen(tiny, calibration, tmp_path, monkeypatch):
+    """With others, all that it learned would be against a rounding that the export does not do."""
+    chosen = Scheme(observer="frames", usual_pct=50.0, wider=(("image_project", 0.5),))
+    observed = restore_observed(tiny, chosen, calibration)
+    ranges = {m.calculate_qparams()[0].item() for m in observed.modules() if isinstance(m, RangeObserver)}
+    chooser = SimpleNamespace(observer=lambda *_: (chosen, {}))
+    monkeypatch.setattr(distill_module, "calibrate", lambda *_, **__: calibration)
+    monkeypatch.setattr(distill_module.quantization, "prepare_chooser", lambda *_: chooser)
+    monkeypatch.setattr(distill_module, "_checkpoint", lambda *_: tiny)
+    found = []
+
+    def see(policy, _):
+        found.extend(m.scale for m in policy.modules() if isinstance(m, Rounded))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distill_module.RoundedPolicy, "to", see)
+    opened = SimpleNamespace(parts=SimpleNamespace(calibration=memory_samples(4)))
+    work = SimpleNamespace(opened=opened, config=tiny.config, progress=silent, device="cpu")
+    policy = SimpleNamespace(weights=dict)
+    for _ in range(2):  # the second time from what was kept
+        with pytest.raises(KeyboardInterrupt):
+            distill_module._train_rounded(work, None, policy, None, tmp_path)
+        assert set(found) < ranges and len(ranges) - len(set(found)) == 1  # pixels are their own INT8
+        found.clear()
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ Errors are against FP32, in percent of each action's recorded range. An action t
 not judged: its error is None, and `warnings` says so.
 """
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_ac
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.frames import ODD, odd_share, usual
 from rover_lib.workshop.int8.observe import Calibration, restore_observed, set_ranges, times_of
-from rover_lib.workshop.int8.quantize import convert, forget_graphs, quantize
+from rover_lib.workshop.int8.quantize import Rangeable, convert, forget_graphs
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
@@ -44,7 +44,7 @@ ALL_WIDER = (0.9, 0.8, 0.7, 0.5, 0.3)
 WIDENED = 8  # this many tensors,
 WIDER = 0.2  # by this share of the way at a time,
 WIDENING_PAYS = 0.99  # if the error is at most this times what it was,
-WIDENING_COSTS = 1.2  # and that of usual frames at most this times what it was without any,
+WIDENING_COSTS = 1.1  # and that of usual frames at most this times what it was without any,
 WIDENING_ROUNDS = 3  # this many times at most
 
 
@@ -105,7 +105,10 @@ class Chooser:
 
     def error(self, module: nn.Module) -> Errors:
         """The errors of a quantized policy against FP32, on the samples, in % of the recorded range."""
-        return mae_pct(self.errors(module), self.weights, self.action_range)
+        return self._mean(self.errors(module))
+
+    def _mean(self, errors: Tensor) -> Errors:
+        return mae_pct(errors, self.weights, self.action_range)
 
     def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
         """The same on usual and on odd frames, of the kinds that there are."""
@@ -134,33 +137,32 @@ class Chooser:
                 wider = tuple((place, by) for place in self.calibration.frames)
                 name = f"frames {all_but_odd:g}, all {by:g} wider"
                 tried[name] = replace(scheme, observer="frames", usual_pct=all_but_odd, wider=wider)
-        table = {}
-        for name in progress(tried, desc="observers"):
-            module = quantize(self.checkpoint, tried[name], self.calibration).module
-            table[name] = self.error(module)
-        best = min(table, key=lambda name: _worst(table[name]))
-        for name, how in tried.items():  # of these, what clips less comes first
-            rival = how.observer in ("minmax", "frames") and not how.wider
-            if rival and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
-                best = name
-                break
+        graph = restore_observed(self.checkpoint, scheme, self.calibration)
+        forget_graphs()
+        policy = Rangeable(graph, self.checkpoint.config, scheme)
+
+        def judge(scheme: Scheme) -> Tensor:
+            set_ranges(graph, scheme, self.calibration)
+            policy.take()
+            return self._from_reference(predictions(policy.module, self.inputs))
+
+        table = {name: self._mean(judge(tried[name])) for name in progress(tried, desc="observers")}
+        best = best_of(tried, table)
         if tried[best].observer != "frames":
             return tried[best], table
-        chosen, table[f"{best}, widened"] = self._widen(tried[best], progress)
+        chosen, table[f"{best}, widened"] = self._widen(tried[best], judge, progress)
         return chosen, table
 
-    def _widen(self, scheme: Scheme, progress: Progress) -> tuple[Scheme, Errors]:
+    def _widen(self, scheme: Scheme, errors: Callable[[Scheme], Tensor], progress: Progress) -> tuple[Scheme, Errors]:
         """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
         frames, kept = self.calibration.frames, usual(self.calibration.frames, scheme.usual_pct)
         further = {place: seen.abs().max() / seen[kept].abs().max().clamp(min=1e-6) for place, seen in frames.items()}
         places = sorted(further, key=lambda place: -further[place])[:WIDENED]
-        graph = restore_observed(self.checkpoint, scheme, self.calibration)
 
         def judge(scheme: Scheme) -> tuple[Errors, float]:
-            set_ranges(graph, scheme, self.calibration)
-            errors = self.errors(convert(graph, self.checkpoint.config, scheme))
-            of_usual = mae_pct(errors, self.weights * ~self.is_odd, self.action_range)
-            return mae_pct(errors, self.weights, self.action_range), _worst(of_usual)
+            found = errors(scheme)
+            of_usual = mae_pct(found, self.weights * ~self.is_odd, self.action_range)
+            return self._mean(found), _worst(of_usual)
 
         error, usually = judge(scheme)
         best, wider, touched = scheme, dict(scheme.wider), set[str]()
@@ -300,6 +302,16 @@ def _used_from(nodes: Sequence[Node], first: int) -> list[Node]:
         for source in node.all_input_nodes:
             used.add(source.all_input_nodes[0] if _is_observer(source) else source)
     return [node for node in nodes[:first] if node in used]
+
+
+def best_of(tried: Mapping[str, Scheme], table: Mapping[str, Errors]) -> str:
+    """The name whose worse action has the least error, unless it clips more than another and does not win clearly."""
+    best = min(table, key=lambda name: _worst(table[name]))
+    for name, how in tried.items():  # of these, what clips less comes first
+        rival = how.observer in ("minmax", "frames") and not how.wider
+        if rival and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
+            return name
+    return best
 
 
 def float_costs_pct(checkpoint: Checkpoint) -> dict[str, float]:

@@ -26,9 +26,16 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
-from rover_lib.workshop.int8.choose import Chooser, float_costs_pct
+from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, qconfig_mapping, restore_observed
+from rover_lib.workshop.int8.observe import (
+    Calibration,
+    RangeObserver,
+    calibrate,
+    qconfig_mapping,
+    restore_observed,
+    set_ranges,
+)
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, OBSERVERS, SMALLEST_SCALE, Scheme
@@ -358,15 +365,21 @@ def test_chooses_by_error(tiny, calibration):
         ({"histogram": (0.1, 0.3), "percentile": (0.1, 0.29)}, "percentile"),
     ],
 )
-def test_an_observer_that_clips_must_win_clearly(tiny, calibration, monkeypatch, errors, chosen):
-    rows = iter(errors.values())
-    monkeypatch.setattr(Chooser, "__init__", lambda self: None)
-    monkeypatch.setattr(Chooser, "error", lambda *_: dict(zip(("steering", "throttle"), next(rows), strict=True)))
-    monkeypatch.setattr("rover_lib.workshop.int8.choose.quantize", lambda *_: SimpleNamespace(module=None))
-    chooser = Chooser()
-    chooser.checkpoint, chooser.calibration = tiny, calibration
-    scheme, table = chooser.observer(Scheme(), list(errors))
-    assert scheme.observer == chosen and list(table) == list(errors)
+def test_an_observer_that_clips_must_win_clearly(errors, chosen):
+    table = {name: dict(zip(("steering", "throttle"), row, strict=True)) for name, row in errors.items()}
+    assert best_of({name: Scheme(observer=name) for name in errors}, table) == chosen
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "affine"])
+def test_one_conversion_takes_the_ranges_of_every_scheme(tiny, calibration, made, kind):
+    """To the last bit as if each were converted: choosing converts once, as conversions took most of its time."""
+    schemes = [Scheme(kind=kind), Scheme(kind=kind, observer="minmax"), Scheme(kind=kind)]
+    graph, x = restore_observed(tiny, schemes[1], calibration), inputs(tiny)
+    policy = q.Rangeable(graph, tiny.config, schemes[1])
+    for scheme in schemes:
+        set_ranges(graph, scheme, calibration)
+        policy.take()
+        assert torch.equal(predictions(policy.module, x), predictions(made(scheme).module, x))
 
 
 @pytest.mark.slow
