@@ -89,7 +89,7 @@ def verdict(
         "compared": "least ms" if time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms" else "p50 ms",
         "modes": list(rows.values()),
         "failed": failed,
-        "cautions": _cautions(stages, params, rows, best, deploy is not None),
+        "cautions": _cautions(stages, params, rows, best, deploy is not None) + _allowed(deploy, refused),
     }
     return judged | {"next": _next(judged, best["mode"], stages, names)}
 
@@ -408,6 +408,16 @@ def _for_another_robot(refused: Mapping[str, str]) -> list[str]:
     whys = "; ".join(why for kind, why in refused.items() if kind not in MAY_DIFFER)
     robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
     return [f"{robot}, to benchmark only: {whys}."] if whys else []
+
+
+def _allowed(deploy: str | None, refused: Mapping[str, str]) -> list[str]:
+    """Say what a rover takes the artifact for only if it is told to, but for the mode, which the table shows."""
+    whys = "; ".join(why for kind, why in refused.items() if kind in MAY_DIFFER and kind != "mode")
+    return (
+        [f"Was it trained for this car? A rover takes it only if rover_allow says so: {whys}."]
+        if deploy and whys
+        else []
+    )
 
 
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:

@@ -173,6 +173,9 @@ def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused
         assert says in judged["why"] and commands(judged) == ["rover benchmark runs/mine/policy_static.pt"]
     else:
         assert deploying[0].endswith(says or "policy_static.pt")
+    # A rover refused CarRacing's square pictures, and only a deploy command that was not printed said so.
+    asked = [c for c in judged["cautions"] if c.startswith("Was it trained for this car?")]
+    assert [c.rpartition(": ")[2] for c in asked] == (["c; p."] if "chunk" in refused else [])
 
 
 def test_recomputed_actions_and_throttle_beyond_the_limit_are_said(demo):
