@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from rover_learn.train import TrainingRecipe, _train
-from rover_learn.training import Resumable
+from rover_learn.training import Resumable, threads
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of
@@ -80,6 +80,7 @@ def judge_statistics(
     return read_stage(path, "statistics")
 
 
+@threads(1)  # so small a policy's layers are done before a second thread wakes
 def _judge(episodes: Path, folder: Path, seed: int, name: str, recipe: TrainingRecipe) -> dict[str, Any]:
     p = params()
     recordings = load_recordings(episodes, SIZE.chunk, p["calibration"]["sync_s"])

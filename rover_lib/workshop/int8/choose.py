@@ -44,7 +44,7 @@ ALL_WIDER = (0.9, 0.8, 0.7, 0.5, 0.3)
 WIDENED = 8  # this many tensors,
 WIDER = 0.2  # by this share of the way at a time,
 WIDENING_PAYS = 0.99  # if the error is at most this times what it was,
-WIDENING_COSTS = 1.2  # and that of usual frames at most this times what it was without any,
+WIDENING_COSTS = 1.1  # and that of usual frames at most this times what it was without any,
 WIDENING_ROUNDS = 3  # this many times at most
 
 

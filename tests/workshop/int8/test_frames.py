@@ -20,6 +20,7 @@ from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrat
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import worst
+from rover_lib.workshop.progress import silent
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.session import load
@@ -60,6 +61,21 @@ def test_the_odd_frame_is_found_and_named():
 )
 def test_a_range_reaches_from_usual_frames_to_all(place, wider, expected):
     assert frames.range_over(EXTREMES[place], frames.usual(EXTREMES, 75), wider) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("costs", "is_widened"), [(1.05, True), (1.15, False)])
+def test_usual_frames_pay_at_most_a_tenth_for_odd_ones(costs, is_widened):
+    """A fifth took usual frames of a policy from elsewhere out of their limit, with 120 frames that calibrated."""
+    chooser = Chooser.__new__(Chooser)
+    chooser.calibration, chooser.action_range = SimpleNamespace(frames=EXTREMES), RANGE
+    chooser.weights, chooser.is_odd = torch.ones(3), torch.tensor([False, False, True])
+
+    def errors(scheme):
+        usual, odd = (costs, 1.0) if scheme.wider else (1.0, 100.0)
+        return torch.tensor([[usual], [usual], [odd]]).expand(3, 2)
+
+    scheme, _ = chooser._widen(Scheme(observer="frames", usual_pct=75), errors, silent)
+    assert bool(scheme.wider) == is_widened
 
 
 @pytest.fixture(scope="module")
