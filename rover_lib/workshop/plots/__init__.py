@@ -10,13 +10,7 @@ Each subject has a module; `style` has what all figures share.
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.benchmarks import latency, soak
 from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames
-from rover_lib.workshop.plots.counting import (
-    draw_counts,
-    draw_counts_by_kernel,
-    draw_counts_by_size,
-    instruction_counts,
-    whole_size,
-)
+from rover_lib.workshop.plots.counting import instruction_counts, whole_size
 from rover_lib.workshop.plots.quantization import errors_by_choice, layers, outlier_channels, sensitivity
 from rover_lib.workshop.plots.recordings import (
     calibration_coverage,

@@ -1,4 +1,4 @@
-"""Notebooks 03 and 06: instructions counted on an emulated Cortex-A76."""
+"""Notebook 03: instructions counted on an emulated Cortex-A76. lab.a76.plots draws those of notebook 06."""
 
 import re
 from collections.abc import Mapping
@@ -7,25 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import (
-    BLUE,
-    GREY,
-    MIST,
-    NAMES,
-    OTHERS,
-    RED,
-    SKY,
-    SLATE,
-    action_colour,
-    bar_values,
-    claim,
-    judged_keys,
-    legend,
-    legend_below,
-    new_figure,
-    simd_bars,
-)
+from rover_lib.workshop.plots.style import NAMES, legend, new_figure, simd_bars
 
 # Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all instructions, and the SIMD
 # instructions among them. Notebook 03 shows them for a run that `make count` has not counted. Source: `make count
@@ -39,9 +21,6 @@ COUNTED = (
     ("dot-product instructions alone", 0.94, 0.94),
 )
 
-NEAR = 2  # rows with less than this many times the fewest instructions are shown again, enlarged
-GROUP_COLOURS = (BLUE, SKY, *OTHERS[1:], MIST, GREY)  # the first two are the INT8 products
-
 
 def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """Return the artifacts at the image size of training, by mode, and other engines' peers, most instructions first.
@@ -52,87 +31,6 @@ def whole_size(metrics: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     ours = {mode: m for mode, m in ours.items() if not re.search(r"_\d+x\d+$", mode)}
     counted = ours | {name: m for name, m in metrics.get("peers", {}).items() if "artifact" not in m}
     return dict(sorted(counted.items(), key=lambda item: -item[1]["instructions_g"]))
-
-
-def draw_counts(metrics: Mapping[str, Any]) -> Figure:
-    """Draw instructions against the floor, and beside them the error on the same core. metrics: those of arm.json."""
-    rows = whole_size(metrics)
-    fig, axes = new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
-    (left, right), y = axes[0], np.arange(len(rows))
-    total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
-    simd_bars(left, y, total, simd)
-    floor_g = next(m["floor_g"] for m in rows.values())
-    left.axvline(floor_g, color=RED, ls="--", lw=1.2, label=f"floor: dot products alone, {floor_g:.2g}")
-    left.set_yticks(y, [NAMES.get(n, n) for n in rows])
-    left.invert_yaxis()
-    left.set_xlabel("instructions of one inference (10^9)")
-    left.set_title("counted on an emulated Cortex-A76", fontsize=11)
-    first = next(iter(metrics["artifacts"].values()))
-    keys = judged_keys(right, {k: v for k, v in first.items() if "workstation" not in k})
-    height = 0.8 / max(len(keys), 1)
-    judged = [
-        m if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{n}" else None
-        for n, m in rows.items()
-    ]
-    frames = sorted({m["frames_on_the_core"] for m in judged if m})
-    over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
-    for i, key in enumerate(keys):
-        known = [(at, m[key]) for at, m in enumerate(judged) if m is not None]
-        at, values = [at + (i - (len(keys) - 1) / 2) * height for at, _ in known], [value for _, value in known]
-        right.barh(at, values, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
-        bar_values(right, at, values, "{:.2f}")
-    right.set_xlabel("mean error against FP32\n(% of the recorded range)")
-    right.set_title(f"computed on it, {over} frames", fontsize=11)
-    legend(left, loc="lower right")
-    legend(right, loc="upper right")
-    claim(fig, claims.instructions(rows))
-    return fig
-
-
-def draw_counts_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draw what the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, all in the same order."""
-    totals = {name: sum(by_group.values()) for name, by_group in groups.items()}
-    near = {name: by_group for name, by_group in groups.items() if totals[name] < NEAR * min(totals.values())}
-    panels = [groups, near] if 1 < len(near) < len(groups) else [groups]
-    rows = [len(shown) for shown in panels]
-    fig, axes = new_figure(len(panels), height_in=1.3 + 0.5 * len(panels) + 0.36 * sum(rows), height_ratios=rows)
-    for ax, shown in zip(axes[:, 0], panels, strict=True):
-        y, left = np.arange(len(shown)), np.zeros(len(shown))
-        for colour, group in zip(GROUP_COLOURS, next(iter(shown.values())), strict=True):
-            width = np.array([by_group[group] for by_group in shown.values()])
-            ax.barh(y, width, left=left, color=colour, label=group)
-            left += width
-        bar_values(ax, y, left, "{:.3g}")
-        ax.set_yticks(y, [NAMES.get(n, n) for n in shown])
-        ax.invert_yaxis()
-    axes[0, 0].set_title("counted on an emulated Cortex-A76", fontsize=11)
-    if len(panels) > 1:
-        axes[1, 0].set_title("those of the fewest instructions, closer", fontsize=11)
-    axes[-1, 0].set_xlabel("instructions of one inference (10^9)")
-    legend_below(fig, axes[0, 0], 4)
-    return fig
-
-
-def draw_counts_by_size(metrics: Mapping[str, Any]) -> Figure:
-    """Draw what a smaller image saves: static INT8 and its floor by image size. metrics: those of arm.json."""
-    rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
-    rows.sort(key=lambda m: m["gmac"])
-    fig, axes = new_figure(1, height_in=3.7)
-    ax, x = axes[0, 0], np.array([m["image_height"] * m["image_width"] for m in rows]) / 1e3
-    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SLATE, "s-", "SIMD instructions"))
-    for key, colour, style, label in (*lines, ("floor_g", RED, "--", "floor: dot products alone")):
-        ax.plot(x, [m[key] for m in rows], style, color=colour, lw=1.8, label=label)
-    for at, m in zip(x, rows, strict=True):
-        ax.annotate(f"{m['instructions_g']:.3g}", (at, m["instructions_g"]), (0, 7), textcoords="offset points",
-                    ha="center", fontsize=9)  # fmt: skip
-    ax.set_xticks(x, [f"{m['image_width']}x{m['image_height']}" for m in rows])
-    ax.set(ylim=(0, 1.12 * max(m["instructions_g"] for m in rows)), ylabel="instructions of one inference (10^9)")
-    ax.set_xlabel("image, width x height in pixels; the axis is in proportion to their number")
-    ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
-    ax.set_xlim(0, None)
-    legend(ax, loc="lower right")
-    claim(fig, claims.smaller_picture(rows))
-    return fig
 
 
 def instruction_counts(metrics: Mapping[str, Any] | None = None) -> Figure:
