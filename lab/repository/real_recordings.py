@@ -69,7 +69,7 @@ def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[
         camera = Camera(episode.path)
         sight, before = Sight(camera, settings), np.empty(0)
         for sample in episode.samples:
-            camera._add(sample.frame_bgr(), sample.time_s, None)
+            camera.add(sample.frame_bgr(), sample.time_s, None)
             if (frame := camera.latest()) is None:
                 continue
             sight.sent(sample.time_s, settings.throttle_limit)
