@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -54,7 +55,8 @@ class TorchScript:
         self.versions: dict[str, str] = {}  # empty, because torch's version is in every manifest anyway
         with warnings.catch_warnings(), torch.inference_mode():
             warnings.simplefilter("ignore")
-            self.traced = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+            frozen = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
+        self.traced = _reread(frozen)
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
         with torch.jit.optimized_execution(False):
@@ -62,6 +64,23 @@ class TorchScript:
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
         return artifact.save_artifact(path, self.traced, manifest, vectors)
+
+
+def _reread(frozen: torch.jit.ScriptModule) -> torch.jit.ScriptModule:
+    """Return a frozen module as a file gives it, and empty the one that was given.
+
+    torch never frees a frozen module's type, nor the weights in its graph: a run would keep those of each artifact that
+    it writes. The type of a module that was read goes with it.
+    """
+    file = BytesIO()
+    torch.jit.save(frozen, file)
+    file.seek(0)
+    graph = frozen.graph
+    for _ in list(graph.outputs()):
+        graph.eraseOutput(0)
+    for node in reversed(list(graph.nodes())):
+        node.destroy()
+    return torch.jit.load(file)
 
 
 class Onnx:
