@@ -34,7 +34,7 @@ help:
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
 	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
-	@echo "make faults-cars                            the same on two other cars, of lab/cars"
+	@echo "make faults-cars                            the same on other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
 	@echo "make kills                                  kill what writes files at random moments, and fill its disk: root"
@@ -121,6 +121,7 @@ faults: $(READY)
 faults-cars: $(READY)
 	$(LAB) faults runs/faults-crawler.json --car lab/cars/crawler.yml
 	$(LAB) faults runs/faults-inverted.json --car lab/cars/inverted.yml
+	$(LAB) faults runs/faults-gamepad.json --car lab/cars/gamepad.yml
 
 random: $(READY)
 	$(LAB) random runs/random.json

@@ -7,6 +7,7 @@ import select
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Mapping
 from typing import IO
 
@@ -90,6 +91,16 @@ class Child:
         if not data:
             raise self.ended()
         return data
+
+    def read_line(self, within_s: float) -> str:
+        """Return the next line that it prints; what comes of it within that time, if its end does not.
+
+        An unbuffered Python writes a line and its end apart, so read() may return them one after the other.
+        """
+        line, end_s = b"", time.monotonic() + within_s
+        while not line.endswith(b"\n") and (left_s := end_s - time.monotonic()) > 0:
+            line += self.read(left_s)
+        return line.decode()
 
     def keep_unread(self, size: int) -> None:
         """Let its standard output hold up to `size` bytes that nobody has read yet."""

@@ -8,8 +8,6 @@ the page says so. A real car would have to be stopped there.
 
 import asyncio
 import contextlib
-import os
-import sys
 import threading
 import time
 from collections import deque
@@ -37,6 +35,9 @@ PLAN_S = 0.1  # what a plan takes, in the simulation's time: about what a Pi may
 PICTURE_S = 1 / 15  # between two pictures, by the clock
 HOLD_S = 1.5  # between two worlds
 PACE_S = 2.0  # the pace is that of the last seconds
+# Threads wait for each other by spinning. Beside other busy programs, two needed 400 ms of processor for a plan of the
+# demo's that one computes in 4. The first number is what counts: XNNPACK's pool keeps it for as long as a process runs.
+THREADS = 1
 SLOW = 0.9  # of the clock; the page speaks of a slower pace
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped"}
@@ -59,12 +60,11 @@ class Simulation:
         if artifact not in self._paths.values():
             self._paths = {artifact.name: artifact}
         self._wanted = next(name for name, path in self._paths.items() if path == artifact)
-        self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact)}
+        self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
         self.car = self._policies[self._wanted].car
         self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
         self._seed, self._artifact = seed, artifact
-        if (torch := sys.modules.get("torch")) and os.getloadavg()[0] > (os.cpu_count() or 1):
-            torch.set_num_threads(1)  # beside other busy programs, threads would mostly wait for each other
+        cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
         self._driving: PacedCar | None = None
 
@@ -109,7 +109,7 @@ class Simulation:
         while not self._closing.is_set() and driven != worlds:
             name = self._wanted
             if name not in self._policies:
-                self._policies[name] = load_policy(self._paths[name])
+                self._policies[name] = load_policy(self._paths[name], threads=THREADS)
             world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
@@ -137,7 +137,11 @@ class Simulation:
         """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
         world, row, plan = car.world, car.log.row, car.newest()
         frame, pace = world.render(), car.pace()
-        slow = f"this machine is busy: time in the simulation runs at {pace:.0%} of the clock" if pace < SLOW else ""
+        slow = (
+            f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
+            if pace < SLOW
+            else ""
+        )
         head: dict[str, Any] = {
             "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},

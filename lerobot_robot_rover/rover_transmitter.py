@@ -85,7 +85,7 @@ class RoverTransmitter(Teleoperator):
             told = False
             while _sticks(link.latest()) is None:
                 if not told:
-                    _log.warning("before the human can drive: %s", MISSING["s"])
+                    _log.warning("before the human can drive: %s", link.remedy("s"))
                     told = True
                 time.sleep(CHECK_S)
         except BaseException:
@@ -103,10 +103,10 @@ class RoverTransmitter(Teleoperator):
         telemetry = self._link.latest()
         sticks = _sticks(telemetry)
         if telemetry is None or sticks is None:
-            raise self._lost()
+            raise self._lost(self._link)
         actions = self._link.calibration.actions_from_pulses(*sticks)
         if actions.steering is None or actions.throttle is None:
-            raise self._lost()
+            raise self._lost(self._link)
         self._check_passed_on(telemetry)
         self._line.humans_action = True
         return named(actions.steering, actions.throttle)
@@ -122,10 +122,10 @@ class RoverTransmitter(Teleoperator):
         self._line.humans_action = False
         self._line.close()
 
-    def _lost(self) -> LinkError:
+    def _lost(self, link: ServoLink) -> LinkError:
         return LinkError(
             f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that",
-            remedy=f"{MISSING['s']} and record this episode again; those before it are kept",
+            remedy=f"{link.remedy('s')} and record this episode again; those before it are kept",
         )
 
     def _check_passed_on(self, telemetry: Telemetry) -> None:

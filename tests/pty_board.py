@@ -57,7 +57,7 @@ class Board:
 
     @property
     def sequence(self):
-        numbered = [int(b.split()[2]) for b in self.heard if b[1] != "Q"]
+        numbered = [int(b.split()[2]) for b in self.heard if b[1] not in "QS"]
         return numbered[-1] if numbered else 0
 
     def _run(self):

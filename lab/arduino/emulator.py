@@ -95,12 +95,13 @@ def compile_c(*command: object) -> None:
 
 
 @functools.cache
-def symbol(name: str) -> int:
-    """Return the address of one of the firmware's functions in flash memory."""
-    table = run("avr-nm", build().firmware, error=ArduinoError)
+def symbol(name: str, human: str = "receiver") -> int:
+    """Return the address of one of the firmware's functions in flash memory. human: as for build()."""
+    firmware = build(human).firmware
+    table = run("avr-nm", firmware, error=ArduinoError)
     line = re.search(rf"^([0-9a-f]+) \w {name}$", table, re.M)
     if not line:
-        raise ArduinoError(f"{build().firmware}: the firmware has no function {name}")
+        raise ArduinoError(f"{firmware}: the firmware has no function {name}")
     return int(line[1], 16)
 
 
@@ -150,7 +151,7 @@ class EmulatedArduino:
         human: as for build().
         Raises ArduinoError as build() does, and if the program does not start.
         """
-        built = build(human)
+        built, self._human = build(human), human
         # The program makes this link, and removes it even if the present process was killed.
         self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
         self._reading = threading.Lock()
@@ -212,7 +213,7 @@ class EmulatedArduino:
 
     def hang(self) -> None:
         """Make the firmware's loop() an endless loop until the next reset."""
-        self._process.send_line(f"hang {symbol('loop'):x}")
+        self._process.send_line(f"hang {symbol('loop', self._human):x}")
 
     def pulses(self) -> list[PinEvent]:
         """Return what happened since the last call, ordered by when it ended.

@@ -6,6 +6,7 @@ import mmap
 import os
 import platform
 import random
+import re
 import resource
 import shutil
 import signal
@@ -23,10 +24,11 @@ from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import CC, NICE, EmulatedArduino, compile_c
 from lab.driving.cable import Cable
-from lab.driving.pins import BEFORE_S, STOPPED_THROTTLE_US
+from lab.driving.pins import BEFORE_S, CAR, STOPPED_THROTTLE_US
 from lab.driving.policy import PLAIN, RATE_HZ, make_artifact, pictures
 from lab.driving.priority import boost, boost_priority
 from lab.driving.rpicam_vid import install
+from lab.driving.virtual_gamepad import GamepadHuman, VirtualGamepad
 from rover_lib.onboard.drive.flight_log import LogError, read_log
 from rover_lib.onboard.errors import RoverError
 
@@ -34,6 +36,7 @@ AT_SPEED_S = 0.6  # from the first throttle to the fault
 START_S = 90.0  # a drive imports torch twice, which takes a third of a minute while four other processes are busy
 END_S = 6.0
 DISK_BYTES = 512 * 1024
+UNHELD = "arming was refused|signal was lost"  # this machine had no time for the gamepad: nobody held it
 CLOCK = Path(__file__).with_name("clock.c")
 
 
@@ -122,7 +125,7 @@ class Drive(RoverCommand):
         self._folder = bench.folder
         self.log = bench.disk / "flight.log" if start == "disk" else bench.folder / "flight.log"
         env: dict[str, str] = {}
-        code = "from lab.driving.policy import obey_pictures; obey_pictures(); "
+        code = bench.inside + "from lab.driving.policy import obey_pictures; obey_pictures(); "
         if self.in_terminal:
             code += IN_TERMINAL
         if start in INSIDE:
@@ -195,8 +198,12 @@ class DrivingBench:
         self._pictures = {instruction: pictures(instruction) for instruction in range(7)}
         self._drive: Drive | None = None
         try:
-            self.arduino = self._stack.enter_context(EmulatedArduino(transmitter=REST_US, nice=NICE))
+            self.arduino = self._stack.enter_context(EmulatedArduino(transmitter=REST_US, nice=NICE, human=CAR.human))
             boost(self.arduino.pid)
+            self.human: EmulatedArduino | GamepadHuman = self.arduino
+            if CAR.human == "gamepad":
+                pad = self._stack.enter_context(VirtualGamepad(self.folder))
+                self.human = self._stack.enter_context(GamepadHuman(pad, lambda: self.cable.status))
             self.cable = Cable(self.arduino.port)
             self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
             self._stack.enter_context(boost_priority())
@@ -218,6 +225,13 @@ class DrivingBench:
         """The present drive, or the last one."""
         assert self._drive is not None, "at_speed() comes first"
         return self._drive
+
+    @property
+    def inside(self) -> str:
+        """The code that plugs the bench's gamepad, if it has one, into a `rover` command's process."""
+        if CAR.human == "receiver":
+            return ""
+        return f"from lab.driving.virtual_gamepad import plug_in; plug_in({str(self.folder)!r}); "
 
     def wait(self, seconds: float) -> None:
         """Let time pass, and read the pins meanwhile."""
@@ -250,7 +264,7 @@ class DrivingBench:
         self.cable.to_arduino = self.cable.to_host = None
         self.feed.late_s = 0.0
         self.show(PLAIN)
-        self.arduino.transmitter(*REST_US)
+        self.human.transmitter(*REST_US)
 
     def restart(self, start: str = "") -> None:
         """Start a new drive, and wait until it has been driving for a while."""
@@ -261,11 +275,13 @@ class DrivingBench:
             self.wait(0.02)
             if first_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
+            if self.human is not self.arduino and not drive.running and re.search(UNHELD, drive.last_words()):
+                drive, first_s = self.start(start, make=PatientDrive), None
             if not drive.running or time.monotonic() > deadline:
                 raise FaultError(
                     f"rover drive did not drive within {START_S:g} s: {drive.last_words()}", remedy="drive it by hand"
                 )
-        self.arduino.ready(False)  # from here on the human only does what a fault says
+        self.human.ready(False)  # from here on the human only does what a fault says
 
     def start(
         self,
@@ -276,7 +292,7 @@ class DrivingBench:
         """Start a new drive, with a fault that is injected before. make: the class of the drive."""
         self.end_drive()
         self.repair()
-        self.arduino.ready(True)
+        self.human.ready(True)
         fault(self)
         self._drive = make(self, start)
         return self._drive
@@ -285,6 +301,8 @@ class DrivingBench:
         """Restore everything that was broken: end all faults, and plug in a new camera and a new cable."""
         self.clear_faults()
         self._disconnect()
+        if isinstance(self.human, GamepadHuman):
+            self.human.pad.plug()
         self.feed = CameraFeed(self.camera, *self._pictures[PLAIN])
         self.cable = Cable(self.arduino.port)
 

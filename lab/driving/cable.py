@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from lab.driving.pins import Command
 from lab.driving.priority import boost
-from rover_lib.onboard.car.servo_link import frame
+from rover_lib.onboard.car.servo_link import Telemetry, frame, parse
 
 Change = Callable[[bytes], bytes]
 
@@ -64,7 +64,7 @@ class Cable:
 
     to_arduino, to_host: changes of what passes, which you may set. commands: the drive commands that the host wrote,
     before any change; lines: all lines that it wrote. not_ours: lines that another program writes to the port; they are
-    not counted among these.
+    not counted among these. status: the Arduino's newest since the host opened the port, before any change.
     """
 
     def __init__(self, arduino_port: str):
@@ -81,7 +81,8 @@ class Cable:
         self.lines: list[bytes] = []
         self.not_ours: set[bytes] = set()
         self._injected: deque[bytes] = deque()
-        self._pending = b""
+        self.status: Telemetry | None = None
+        self._pending = self._coming = b""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cable", daemon=True)
         self._thread.start()
@@ -114,23 +115,30 @@ class Cable:
                     # which resets the Arduino.
                     _set_hang_up(arduino, bool(termios.tcgetattr(self._master)[2] & termios.HUPCL))
                     os.close(arduino)
-                    arduino = -1
+                    arduino, self.status = -1, None
                 self._closing.wait(0.005)
                 continue
             if arduino < 0:
                 arduino = os.open(self._arduino_port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
                 poller.register(arduino, select.POLLIN)
-                self._pending = b""
+                self._pending = self._coming = b""
             if data := _read(self._master):
                 self._note(data)
                 _write(arduino, self.to_arduino(data) if self.to_arduino else data)
             while self._injected:
                 _write(arduino, self._injected.popleft())
             if data := _read(arduino):
+                self._hear(data)
                 _write(self._master, self.to_host(data) if self.to_host else data)
         for fd in (self._master, arduino):
             if fd >= 0:
                 os.close(fd)
+
+    def _hear(self, data: bytes) -> None:
+        *lines, self._coming = (self._coming + data).split(b"\n")
+        for line in lines:
+            if isinstance(message := parse(line, 0.0), Telemetry):
+                self.status = message
 
     def _note(self, data: bytes) -> None:
         now = time.monotonic()

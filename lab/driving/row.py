@@ -6,7 +6,7 @@ from typing import Any
 
 from balloon_world.simulated_arduino import REST_US
 from lab.driving.bench import DrivingBench
-from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
+from lab.driving.pins import CAR, CONTINUES, HUMAN, REFUSED, STOPPED
 
 Inject = Callable[[DrivingBench], float | None]
 
@@ -25,6 +25,7 @@ class FaultRow:
     limits: what stops a drive that `continues` after all, in words. until_limit: whether that happens in this row.
     starves: whether the fault takes this machine's time away from the drive. paused_s: for how long it pauses the
     drive. human_us: the pulses expected on the pins if `human` is expected.
+    human: the only one of car.yml's humans who has this fault; "": both.
     """
 
     kind: str
@@ -40,6 +41,7 @@ class FaultRow:
     limits: str = ""
     until_limit: bool = False
     starves: bool = False
+    human: str = ""
     paused_s: float = 0.0
     human_us: tuple[float, float] = REST_US
 
@@ -57,6 +59,8 @@ class FaultKind:
         more: other fields of FaultRow. Unless exit_code is among them, it is 3 for `stopped`, 4 for `human`, None for
         `continues` and 1 for `refused`.
         """
+        if CAR.human == "gamepad" and expected == STOPPED:  # whatever stops the commands stops its sticks too
+            message += "|the transmitter's signal was lost"
         more.setdefault("exit_code", {STOPPED: 3, HUMAN: 4, CONTINUES: None, REFUSED: 1}[expected])
 
         def row(inject: Inject) -> Inject:

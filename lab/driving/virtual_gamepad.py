@@ -1,14 +1,19 @@
 """A gamepad made of two FIFOs that speak struct input_event, where the kernel has no uinput."""
 
 import contextlib
+import math
 import os
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from lab.driving.pins import CAR
+from lab.driving.priority import boost
 from rover_lib.onboard.car import servo_link
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, EVENT, KEY, STEERING, SYN, THROTTLE, Gamepad, Stick
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DEAD, EVENT, KEY, STEERING, SYN, THROTTLE, Gamepad, Stick
+from rover_lib.onboard.car.servo_link import State, Telemetry
 
 FULL = 32767
 EVERY_S = 0.004  # between two reports of its motion sensors
@@ -20,13 +25,10 @@ class VirtualGamepad:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        for name in ("pad", "motion"):
-            os.mkfifo(folder / name)
-        # A FIFO that is open for both never blocks, and has its end when this closes it.
-        self._pad, self._motion = (os.open(folder / name, os.O_RDWR | os.O_NONBLOCK) for name in ("pad", "motion"))
-        self._over = threading.Event()
+        self._pad = self._motion = -1
+        self._over, self._writing = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._move, daemon=True)
-        self._thread.start()
+        self.plug()
 
     def __enter__(self) -> "VirtualGamepad":
         return self
@@ -34,19 +36,31 @@ class VirtualGamepad:
     def __exit__(self, *exc: object) -> None:
         self.unplug()
 
+    def plug(self) -> None:
+        """Plug it in anew, with what nobody has read forgotten."""
+        self.unplug()
+        for name in ("pad", "motion"):
+            (self.folder / name).unlink(missing_ok=True)
+            os.mkfifo(self.folder / name)
+        # A FIFO that is open for both never blocks, and has its end when this closes it.
+        self._pad, self._motion = (os.open(self.folder / name, os.O_RDWR | os.O_NONBLOCK) for name in ("pad", "motion"))
+        self._over.clear()
+        self._thread = threading.Thread(target=self._move, daemon=True)
+        self._thread.start()
+
     def freeze(self) -> None:
         """Send nothing more, as when its radio is out of reach."""
         self._over.set()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
 
     def unplug(self) -> None:
         """Let its readers come to an end."""
-        if not self._over.is_set():
-            self.freeze()
-        for fd in (self._pad, self._motion):
-            with contextlib.suppress(OSError):
+        self.freeze()
+        with self._writing:
+            for fd in {self._pad, self._motion} - {-1}:
                 os.close(fd)
-        self._pad = self._motion = -1
+            self._pad = self._motion = -1
 
     def hold(self, held: bool) -> None:
         """Press the dead-man button, or let go of it."""
@@ -66,18 +80,71 @@ class VirtualGamepad:
 
     def send(self, kind: int, code: int, value: int, age_s: float = 0.0) -> None:
         """Send an event that is that old."""
-        self._write(self._pad, (kind, code, value), age_s)
+        with self._writing:
+            self._write(self._pad, (kind, code, value), age_s)
 
     def _write(self, fd: int, event: tuple[int, int, int], age_s: float = 0.0) -> None:
         at_s = time.monotonic() - age_s
-        with contextlib.suppress(BlockingIOError):  # nobody reads
-            os.write(fd, EVENT.pack(int(at_s), int(at_s % 1 * 1e6), *event) + EVENT.pack(int(at_s), 0, SYN, 0, 0))
+        if not self._over.is_set():
+            with contextlib.suppress(BlockingIOError):  # nobody reads
+                os.write(fd, EVENT.pack(int(at_s), int(at_s % 1 * 1e6), *event) + EVENT.pack(int(at_s), 0, SYN, 0, 0))
 
     def _move(self) -> None:
+        boost(threading.get_native_id())
         value = 0
         while not self._over.wait(EVERY_S):
             value += 1
             self._write(self._motion, (ABS, 0, value))
+
+
+class GamepadHuman:
+    """Who holds the gamepad, as an EmulatedArduino's human holds a transmitter. A context manager.
+
+    status: returns the Arduino's newest. Whoever holds L1 presses it again when the Arduino says that it has no signal,
+    and whoever is ready wiggles when only that is missing. A car that is armed is left alone.
+    """
+
+    def __init__(self, pad: VirtualGamepad, status: Callable[[], Telemetry | None]):
+        self.pad, self._status = pad, status
+        self._holds = self._ready = False
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> "GamepadHuman":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def transmitter(self, steering_us: float, throttle_us: float) -> None:
+        """Hold L1, and move the sticks to where the Arduino gets these pulses; with a 0, let go of L1."""
+        held = bool(steering_us and throttle_us)
+        if held:
+            actions = CAR.pwm.actions_from_pulses(steering_us, throttle_us)
+            moved = -CAR.left * (actions.steering or 0.0), (actions.throttle or 0.0) / CAR.cap
+            self.pad.move(*(math.copysign(DEAD + (1 - DEAD) * min(abs(x), 1.0), x) if x else 0.0 for x in moved))
+        if held != self._holds:
+            self._holds = held
+            self.pad.hold(held)
+
+    def ready(self, ready: bool) -> None:
+        """Set whether they wiggle the stick unasked."""
+        self._ready = ready
+
+    def _run(self) -> None:
+        boost(threading.get_native_id())
+        while not self._over.wait(0.1):
+            status = self._status()
+            if not status or status.state is State.AUTONOMOUS:
+                continue
+            if status.missing == "s" and self._holds:
+                self.pad.hold(False)
+                self.pad.hold(True)
+                self._over.wait(0.3)
+            elif status.missing == "w" and self._ready:
+                self.pad.wiggle()
 
 
 def open_virtual(folder: Path) -> Gamepad:
@@ -86,6 +153,6 @@ def open_virtual(folder: Path) -> Gamepad:
     return Gamepad("virtual", pad, motion, {axis: Stick(-FULL, FULL) for axis in (STEERING, THROTTLE)})
 
 
-def plug_in(folder: Path) -> None:
+def plug_in(folder: Path | str) -> None:
     """Make it the gamepad of each ServoLink of this process."""
-    servo_link.open_gamepad = partial(open_virtual, folder)
+    servo_link.open_gamepad = partial(open_virtual, Path(folder))

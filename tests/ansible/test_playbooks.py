@@ -15,7 +15,9 @@ from pathlib import Path
 import jinja2
 import pytest
 import yaml
+from pty_board import board_of, obedient
 
+from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.drive.watch import PRIORITY
 
 pytestmark = pytest.mark.slow  # Ansible takes a second to start
@@ -538,6 +540,17 @@ def test_the_service_of_a_pi_camera_may_use_what_libcamera_needs(camera, more):
     unit = rendered("rover-drive.service", rover_camera=camera)
     assert f"--camera {camera} " in unit.replace('"', "")
     assert [f"DeviceAllow=char-{d} rw" in unit for d in ("video4linux", "media", "dma_heap")] == [True, more, more]
+
+
+@pytest.mark.parametrize(("firmware", "flashes"), [("4.1.1-gamepad", False), ("4.1.1", True)])
+def test_a_board_is_not_flashed_again_for_want_of_a_gamepad(tmp_path, firmware, flashes):
+    tasks = yaml.safe_load((ROLE / "tasks" / "firmware.yml").read_text())
+    (asks,) = [task["ansible.builtin.command"]["argv"] for task in tasks if "Ask the Arduino" in task["name"]]
+    (tmp_path / "car.yml").write_text(yaml_of(Car(human="gamepad")))
+    with board_of(answer=obedient, hello=f"<H 4 {firmware} 7 0 e {Car().id}") as board:
+        env = {**os.environ, "ROVER_CAR": str(tmp_path / "car.yml")}
+        done = subprocess.run([sys.executable, *asks[1:-1], board.port], env=env, capture_output=True, text=True)
+    assert bool(done.returncode) == flashes, done.stderr
 
 
 @pytest.mark.parametrize("gamepad", [False, True])

@@ -9,7 +9,13 @@ from needs import ended
 from balloon_world.child_process import Child
 from rover_lib.onboard.errors import WorldError
 
-ECHO = "import sys\nfor line in sys.stdin: print(line.upper(), end='', flush=True)"
+ECHO = """
+import sys, time
+for line in sys.stdin:
+    for piece in line.upper()[:-1], "\\n":  # as an unbuffered Python's print() does
+        print(piece, end="", flush=True)
+        time.sleep(0.05)
+"""
 
 
 def start(program, **options):
@@ -19,8 +25,8 @@ def start(program, **options):
 def test_a_child_that_talks_ends_with_its_input():
     child = start(ECHO, talks=True)
     child.send_line("hello")
-    assert child.read(20) == b"HELLO\n"
-    assert child.read() == b""
+    assert child.read_line(20) == "HELLO\n"
+    assert child.read_line(0.01) == ""
     child.check()
     child.close()
     assert child.process.returncode == 0

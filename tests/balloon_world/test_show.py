@@ -1,5 +1,7 @@
 """The balloon world in a view: a slow machine slows its time and changes nothing else; a page's requests."""
 
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -15,7 +17,7 @@ class Straight:
 
     rate_hz, car = 30.0, this_car()
 
-    def __init__(self, path, seconds=0.0):
+    def __init__(self, path, seconds=0.0, threads=None):
         self.seconds = seconds
 
     def predict_unclipped(self, frame_bgr, state):
@@ -79,3 +81,16 @@ def test_what_a_page_asks_for(simulation):
     assert ("ended", "stopped here; nobody drives", "INT8") in said and said[-1][2] == "FP32"
     assert [results[1] for results in simulation._results.values()] == [0, 1]  # what was stopped counts for nobody
     assert simulation._seed == 10_002
+
+
+@pytest.mark.slow
+def test_no_thread_waits_for_another_by_spinning(demo_run):
+    """Neither XNNPACK's nor OpenCV's: beside busy processes they take the time that a plan needs."""
+    program = f"""
+import os
+from balloon_world.show import Simulation
+Simulation({str(demo_run / "policy_static.pt")!r}).run(lambda head, picture: None, 1)
+print(os.listdir("/proc/self/task") == [str(os.getpid())])
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "True\n", done.stderr

@@ -6,6 +6,8 @@
  * drive as fast and as far as the limits let them, and the latter two only in their state and while there is a signal; a
  * moved stick ends autonomy; and nothing arms without a wiggle, nor long after it was asked for. The board starts anew now and then, often shortly before
  * its clock or the host's sequence wraps, and as another car; other cars are told too, some of which may not be.
+ * With HUMAN_GAMEPAD the human's pulses come as lines as well: they count from when their host heard the board, if that is
+ * newer than before, and get the host's cap.
  * Use: fuzz LINES SEED
  */
 #include <stdio.h>
@@ -51,19 +53,25 @@ static const uint16_t BAD_CARS[][9] = {
 static const uint16_t *car = CARS[0];
 static bool told = true; /* or it is the first */
 static bool fast(void) { return car[4] < 3000; }
+#ifdef HUMAN_GAMEPAD
+enum { GAMEPAD = true, LOST_MS = 150 };
+#else
+enum { GAMEPAD = false, LOST_MS = 100 };
+#endif
+static uint32_t sticks_ms; /* of the status that the gamepad's last line answered */
 static uint32_t id_of(const uint16_t *numbers) { return crc32((const char *)numbers, 18); }
 static uint16_t stick_us[2] = {1456, 120};
 static uint16_t seen_us[2]; /* of them, the receiver's last pulses */
 static uint32_t seen_ms[2], seen_before_ms[2]; /* of the last pulse, and of the one before */
 static uint16_t rest_us[2]; /* the sticks on arming */
 static bool signal_on = true;
-static bool misreading;           /* some throttle pulses are measured wrongly */
+static bool misreading;           /* some throttle pulses are measured wrongly; of a gamepad: its host sends no lines */
 static bool sides[2], wiggled;    /* the steering stick was there, with the throttle at rest since, and no arming or loss */
 static uint32_t sides_ms[2], wiggled_ms;
 static void forget_wiggle(void) { sides[0] = sides[1] = wiggled = false; }
 static unsigned at_rest, away;    /* throttle pulses in a row: at rest; not where they were on arming */
 static bool throttle_may_pass;
-static bool awaited[2];           /* a signal is not there before two of its pulses within 100 ms */
+static bool awaited[2];           /* a signal is not there before two of its pulses within LOST_MS */
 static uint32_t wanted_us[2];     /* of the last drive that must count */
 static uint32_t wanted_since_ms, wanted_heard_ms;
 static bool wanted;
@@ -90,11 +98,11 @@ static bool on_the_way(int before, int now, int wanted_there, uint32_t most) {
 static void check(void) {
     bool neutral = vehicle.steering_us == car[2] && vehicle.throttle_us == car[6];
     for (int i = 0; i < 2; i++) { /* pulses of the other count while it is awaited, its own from before do not */
-        bool old = now_ms - seen_before_ms[i] > 100;
+        bool old = now_ms - seen_before_ms[i] > LOST_MS;
         if (old && !awaited[i]) at_rest = 0, seen_ms[i] = now_ms - 1000;
         awaited[i] = old;
     }
-    bool lost = now_ms - seen_ms[0] > 100 || now_ms - seen_ms[1] > 100;
+    bool lost = now_ms - seen_ms[0] > LOST_MS || now_ms - seen_ms[1] > LOST_MS;
     if (!neutral && lost) fail("no signal, and not neutral");
     if (lost) forget_wiggle();
     if (lost) throttle_may_pass = false;
@@ -104,7 +112,7 @@ static void check(void) {
         bool throttle = vehicle.throttle_us == throttle_us || vehicle.throttle_us == car[6];
         if (!neutral && (vehicle.steering_us != seen_us[0] || !throttle)) fail("not the human's");
     } else if (vehicle.state == AUTONOMOUS) {
-        if (abs(seen_us[0] - rest_us[0]) > 48 || away >= (fast() ? 5 : 1)) fail("the human was ignored");
+        if (abs(seen_us[0] - rest_us[0]) > 48 || away >= (fast() && !GAMEPAD ? 5 : 1)) fail("the human was ignored");
         if (!neutral && !(wanted && now_ms - wanted_since_ms < 150 && now_ms - wanted_heard_ms < 200))
             fail("nobody asked for it");
         uint32_t ms = before_state == AUTONOMOUS ? now_ms - before_ms : 0;
@@ -124,46 +132,74 @@ static void check(void) {
     before_ms = now_ms;
 }
 
-static void see_throttle(uint16_t us) {
+static void see_steering(uint16_t us, uint32_t at_ms) {
+    seen_us[0] = us;
+    seen_before_ms[0] = seen_ms[0], seen_ms[0] = at_ms;
+    for (int side = 0; side < 2; side++)
+        if (side ? us >= car[2] + 200 : us <= car[2] - 200) {
+            sides[side] = true, sides_ms[side] = at_ms;
+            if (sides[!side] && at_ms - sides_ms[!side] <= 3000) wiggled = true, wiggled_ms = at_ms;
+        }
+}
+
+static void see_throttle(uint16_t us, uint32_t at_ms) {
     if (fast() ? us >= 40 && us <= 980 : us >= 800 && us <= 2200) { /* else it is no pulse */
         seen_us[1] = us;
-        seen_before_ms[1] = seen_ms[1], seen_ms[1] = now_ms;
+        seen_before_ms[1] = seen_ms[1], seen_ms[1] = at_ms;
         at_rest = abs(us - car[6]) <= 32 ? at_rest + 1 : 0;
         if (!at_rest) forget_wiggle();
         away = abs(us - rest_us[1]) > 32 ? away + 1 : 0;
         if (at_rest >= 8) throttle_may_pass = true;
     }
-    vehicle_received(&vehicle, THROTTLE, us, car[4], now_ms);
 }
+
+/* A gamepad's line that the host sent, and that the board must take if it is newer than the last and in range. */
+static void see_sticks(const struct command *sticks) {
+    uint32_t at_ms = sticks->heard_ms;
+    if (now_ms - at_ms > LOST_MS || now_ms - at_ms >= now_ms - sticks_ms) return;
+    if (!sticks->steering_us && !sticks->throttle_us) {
+        sticks_ms = at_ms;
+        for (int i = 0; i < 2; i++) seen_ms[i] = seen_before_ms[i] = now_ms - 1000, awaited[i] = true;
+        forget_wiggle();
+        throttle_may_pass = false, at_rest = 0;
+        return;
+    }
+    uint32_t steering_us = sticks->steering_us, throttle_us = sticks->throttle_us;
+    if (steering_us < car[1] || steering_us > car[3] || throttle_us < car[5] || throttle_us > car[7]) return;
+    sticks_ms = at_ms;
+    see_steering((uint16_t)steering_us, at_ms);
+    uint32_t least_us = car[6] - cap_us(), most_us = car[6] + cap_us();
+    see_throttle((uint16_t)(throttle_us < least_us ? least_us : throttle_us > most_us ? most_us : throttle_us), at_ms);
+}
+
+static void relay(void);
 
 static void pass(uint32_t ms) { /* as the sketch's loop does */
     while (ms--) {
         clock_wraps += !++now_ms;
-        if (signal_on && now_ms % 21 == 0) {
-            seen_us[0] = stick_us[0];
-            seen_before_ms[0] = seen_ms[0], seen_ms[0] = now_ms;
-            for (int side = 0; side < 2; side++)
-                if (side ? seen_us[0] >= car[2] + 200 : seen_us[0] <= car[2] - 200) {
-                    sides[side] = true, sides_ms[side] = now_ms;
-                    if (sides[!side] && now_ms - sides_ms[!side] <= 3000) wiggled = true, wiggled_ms = now_ms;
-                }
+        if (GAMEPAD && !misreading && now_ms % 20 == 0) relay();
+        if (!GAMEPAD && signal_on && now_ms % 21 == 0) {
+            see_steering(stick_us[0], now_ms);
             vehicle_received(&vehicle, STEERING, seen_us[0], car[0], now_ms);
         }
-        if (signal_on && (fast() || now_ms % 20 == 0))
-            see_throttle(misreading && !rnd(4) ? (uint16_t)rnd(fast() ? 1200 : 2600) : stick_us[1]);
+        if (!GAMEPAD && signal_on && (fast() || now_ms % 20 == 0)) {
+            uint16_t us = misreading && !rnd(4) ? (uint16_t)rnd(fast() ? 1200 : 2600) : stick_us[1];
+            see_throttle(us, now_ms);
+            vehicle_received(&vehicle, THROTTLE, us, car[4], now_ms);
+        }
         vehicle_tick(&vehicle, now_ms);
         check();
     }
 }
 
 static int print_command(char *text, const struct command *command) {
-    int n = sprintf(text, ">%c %u %u", command->kind, command->boot, command->sequence);
-    bool drive = command->kind == COMMAND_DRIVE;
+    bool drive = command->kind == COMMAND_DRIVE, sticks = command->kind == COMMAND_STICKS;
+    int n = sprintf(text, ">%c %u %u", command->kind, command->boot, sticks ? command->heard_ms : command->sequence);
     if (drive || command->kind == COMMAND_ARM) n += sprintf(text + n, " %u", command->heard_ms);
     if (command->kind == COMMAND_ARM) n += sprintf(text + n, " %u %u", command->asked_ms, command->car);
     for (int i = 0; command->kind == COMMAND_CAR && i < 9; i++) n += sprintf(text + n, " %u", command->numbers[i]);
-    if (drive) n += sprintf(text + n, " %u", command->steering_us);
-    if (drive || command->kind == COMMAND_LOWER) n += sprintf(text + n, " %u", command->throttle_us);
+    if (drive || sticks) n += sprintf(text + n, " %u", command->steering_us);
+    if (drive || sticks || command->kind == COMMAND_LOWER) n += sprintf(text + n, " %u", command->throttle_us);
     return n + sprintf(text + n, "*%08X\n", crc32(text, (size_t)n));
 }
 
@@ -187,7 +223,7 @@ static void drives(const uint16_t *other) {
 }
 
 /* genuine: what the line says if it is one that the host sent and that was not taken before. */
-static void feed(const uint8_t *bytes, int length, const struct command *genuine) {
+static void take(const uint8_t *bytes, int length, const struct command *genuine) {
     for (int i = 0; i < length; i++) {
         struct command command;
         enum reading reading = reader_take(&reader, bytes[i], now_ms, &command);
@@ -197,6 +233,7 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
             char said[160], cut[160];
             print_command(said, &command), print_command(cut, &half);
             if (!genuine && now_ms - half_ms <= 50 && !strcmp(said, cut)) genuine = &half;
+            if (genuine && command.kind == COMMAND_STICKS) see_sticks(&command);
             char before = vehicle.state;
             uint32_t sequence = vehicle.sequence;
             if (genuine && command.kind == COMMAND_DRIVE && before == AUTONOMOUS &&
@@ -232,8 +269,20 @@ static void feed(const uint8_t *bytes, int length, const struct command *genuine
         vehicle_tick(&vehicle, now_ms);
         check();
     }
+}
+
+static void feed(const uint8_t *bytes, int length, const struct command *genuine) {
+    take(bytes, length, genuine);
     driven += vehicle.state == AUTONOMOUS;
     lines++;
+}
+
+/* What the gamepad does now: the sticks, or 0 and 0. */
+static void relay(void) {
+    struct command sticks = {COMMAND_STICKS, vehicle.boot, 0, now_ms - rnd(15), signal_on ? stick_us[0] : 0u,
+                             signal_on ? stick_us[1] : 0u, 0, 0, {0}};
+    char text[160];
+    take((uint8_t *)text, print_command(text, &sticks), &sticks);
 }
 
 static void wiggle(void) {
@@ -280,6 +329,7 @@ static void start(void) { /* a reset: of the board alone */
     forget_wiggle();
     throttle_may_pass = wanted = false;
     at_rest = 0;
+    sticks_ms = 0;
     lowered_us = UINT32_MAX;
     before_state = 0;
 }
@@ -303,12 +353,13 @@ int main(int argc, char **argv) {
             genuine.kind = COMMAND_CAR;
             memcpy(genuine.numbers, rnd(4) ? CARS[rnd(CAR_COUNT)] : BAD_CARS[rnd(sizeof BAD_CARS / sizeof *BAD_CARS)], 18);
         }
+        if (GAMEPAD && !rnd(30)) genuine.kind = COMMAND_STICKS, genuine.heard_ms = now_ms - rnd(300);
         if (!rnd(40)) genuine.car = id_of(CARS[rnd(CAR_COUNT)]);
         int length = print_command(text, &genuine);
         unsigned kind = rnd(8);
         kinds[kind]++;
         if (kind == 0) { /* random bytes, often of the protocol's own alphabet */
-            static const char ALPHABET[] = "><DANQC 0123456789*ABCDEF\n";
+            static const char ALPHABET[] = "><DANQCS 0123456789*ABCDEF\n";
             length = 1 + (int)rnd(100);
             bool own = rnd(2);
             for (int i = 0; i < length; i++) text[i] = own ? ALPHABET[rnd(sizeof ALPHABET - 1)] : (char)rnd(256);
@@ -335,7 +386,7 @@ int main(int argc, char **argv) {
             else lines++;
         } else if (kind == 4) { /* well-formed, and not to be obeyed */
             struct command wrong = genuine;
-            switch (rnd(5)) {
+            switch (wrong.kind == COMMAND_STICKS ? 0 : rnd(5)) {
                 case 4:
                     wrong.kind = COMMAND_DRIVE;
                     wrong.heard_ms = now_ms - 151 - rnd(1u << 31);

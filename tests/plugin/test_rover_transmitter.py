@@ -10,7 +10,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, line
 from lerobot_robot_rover.line import FEATURES, line_to, named, unnamed, wait_for_humans
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
+from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.errors import ParamsError
 
 PORT = "/dev/ttyNONE"
@@ -23,7 +23,7 @@ class Link:
 
     opened = 0
     status: Telemetry | None = None
-    calibration = CALIBRATION
+    calibration, remedy = CALIBRATION, MISSING.get
 
     def __init__(self, port):
         assert port == PORT

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from lab.driving.bench import DrivingBench
 from lab.driving.cable import Change, dropping, flipping, lagging, whole_lines
-from lab.driving.pins import CONTINUES, REFUSED, STOPPED
+from lab.driving.pins import CAR, CONTINUES, REFUSED, STOPPED
 from lab.driving.policy import OTHER, PLAIN
 from lab.driving.row import FaultKind
 from rover_lib.onboard.car.servo_link import LATE_S, frame
@@ -44,7 +44,8 @@ def _fall_behind(bench: DrivingBench) -> float:
     """Fall behind slowly, so that lines keep coming. A cable that is 2 s late at once is silent for the Arduino."""
     behind = 0.25  # seconds in each second
     bench.cable.to_arduino = lagging(behind)
-    bench.wait(LATE_S / behind)
+    late_s = LATE_S - 0.05 * (CAR.human == "gamepad")  # its sticks are as old as the status that they answer
+    bench.wait(late_s / behind)
     return time.monotonic()
 
 
@@ -60,6 +61,7 @@ def _both_ways(bench: DrivingBench, change: Callable[[random.Random, float], Cha
     "a bit of 1 % of the bytes, in both directions",
     watch_s=2.0,
     limits=COMMANDS_LOST,
+    human="receiver",  # a gamepad's sticks go the same way, and are lost when 150 ms of them are
 )
 def _flip(bench: DrivingBench) -> None:
     _both_ways(bench, flipping, 0.01)
@@ -72,6 +74,7 @@ def _flip(bench: DrivingBench) -> None:
     "30 % of the lines, in both directions",
     watch_s=2.0,
     limits=COMMANDS_LOST,
+    human="receiver",  # a gamepad's sticks go the same way, and are lost when 150 ms of them are
 )
 def _drop(bench: DrivingBench) -> None:
     _both_ways(bench, dropping, 0.3)
@@ -105,6 +108,7 @@ def _replay(bench: DrivingBench) -> float:
     "every third line, in both directions",
     watch_s=2.0,
     limits=COMMANDS_LOST,
+    human="receiver",  # a gamepad's sticks go the same way, and are lost when 150 ms of them are
 )
 def _cut(bench: DrivingBench) -> None:
     def cutting() -> Change:

@@ -221,7 +221,7 @@ class Camera:
                         continue
                     refused = 0
                     if captured_s is not None:
-                        self._add(image, captured_s, picture if isinstance(picture, bytes) else None)
+                        self.add(image, captured_s, picture if isinstance(picture, bytes) else None)
                 raise CameraError(
                     f"{self.source}: it ended after {self.frames} frames", remedy="is the camera unplugged?"
                 )
@@ -235,7 +235,7 @@ class Camera:
             self._failure = failure
             self._changed.notify_all()
 
-    def _add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
+    def add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
         """Make a picture the newest frame. Raises CameraError if it is unfit, or has another size than before."""
         before = self._frame
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:

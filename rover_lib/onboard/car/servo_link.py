@@ -87,7 +87,7 @@ RESULTS = {
     "w": "refused: nobody has just wiggled the steering stick",
 }
 MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
-    "s": "switch the transmitter on, or hold L1 of the gamepad",
+    "s": "switch the transmitter on",
     "t": "let go of the throttle stick",
     "w": "move the steering stick far to both sides within 3 s and let go of it for a second, without any throttle",
     "-": "nothing is missing",
@@ -288,11 +288,7 @@ class ServoLink:
                 "port?",
             ) from error
         self._closing.clear()
-        try:
-            self._gamepad = open_gamepad() if self.car.human == "gamepad" else None
-        except RoverError:
-            self._release()
-            raise
+        self._gamepad = None
         with self._heard:
             self._hello = self._telemetry = self._turned = self._requested = self._failure = None
             self._unanswered.clear()
@@ -303,6 +299,8 @@ class ServoLink:
         try:
             hello = self._wait_for_hello()
             self._tell_car(hello)
+            if self.car.human == "gamepad":  # last, so that the firmware is known to be right even without one
+                self._gamepad = open_gamepad()
             return hello
         except BaseException:
             self._release()
@@ -431,9 +429,13 @@ class ServoLink:
             if telemetry.result in MISSING and telemetry.result != "-":
                 raise LinkError(
                     f"{self.port}: arming was {RESULTS[telemetry.result]}",
-                    remedy=f"{MISSING[telemetry.result]}, then try again",
+                    remedy=f"{self.remedy(telemetry.result)}, then try again",
                 )
         raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
+
+    def remedy(self, missing: str) -> str:
+        """Return what this car's human does about what is missing, a key of MISSING."""
+        return "hold L1 of the gamepad" if missing == "s" and self.car.human == "gamepad" else MISSING[missing]
 
     def neutral(self) -> Telemetry:
         """Stop the car until arm() if the host drives it; a human who drives goes on. Return the confirming status.

@@ -30,7 +30,7 @@ from rover_lib.onboard.car.csi import is_csi
 from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.ports import find_port, list_ports
-from rover_lib.onboard.car.servo_link import BOOT_S, MISSING, PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.car.servo_link import BOOT_S, PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import blank, frozen
@@ -392,7 +392,7 @@ def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S)
         ask("Move the steering stick far to both sides, and let go of it.")
         if (seen := _soon(link, lambda status: status.missing == "-", RITUAL_S)).missing != "-":
             yield Check(
-                "arming", "fail", "the receiver's pulses did not show it", f"{MISSING[seen.missing]}, and try again"
+                "arming", "fail", "the receiver's pulses did not show it", f"{link.remedy(seen.missing)}, and try again"
             )
             return
         yield Check("arming", "ok", "transmitter on, throttle at rest, stick wiggled: it could be armed for 30 s now")

@@ -22,7 +22,7 @@ from rover_lib.onboard.artifact.manifest import Artifact, car_of, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime, default_log, default_view
-from rover_lib.onboard.car.servo_link import MISSING, ServoLink, Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess, delay
@@ -298,7 +298,7 @@ def _arm_then(arm: Arm, begin: Callable[[], object]) -> Arm:
 def what_is_missing(link: ServoLink) -> str:
     """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest() does."""
     telemetry = link.latest()
-    return MISSING[telemetry.missing] if telemetry and telemetry.missing != "-" else ""
+    return link.remedy(telemetry.missing) if telemetry and telemetry.missing != "-" else ""
 
 
 def arm_capped(

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.camera import Camera, Frame
-from rover_lib.onboard.car.servo_link import MISSING, REASONS, ServoLink
+from rover_lib.onboard.car.servo_link import REASONS, ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.pilot import PolicyPilot
@@ -184,7 +184,7 @@ class Feed:
             return {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state, "why": why}
         with contextlib.suppress(RoverError):  # whoever needs the link reports that it is gone
             if link and (telemetry := link.latest()):
-                missing = "" if telemetry.missing == "-" else MISSING[telemetry.missing]
+                missing = "" if telemetry.missing == "-" else link.remedy(telemetry.missing)
                 pins = [telemetry.steering_us, telemetry.throttle_us]
                 why = REASONS.get(telemetry.reason, "")
                 return {"pins": pins, "who": telemetry.state.value, "why": why, "missing": missing}

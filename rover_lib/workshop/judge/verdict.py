@@ -89,7 +89,7 @@ def verdict(
         "compared": "least ms" if time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms" else "p50 ms",
         "modes": list(rows.values()),
         "failed": failed,
-        "cautions": _cautions(stages, params, rows, best, deploy is not None),
+        "cautions": _cautions(stages, params, rows, best, deploy is not None) + _allowed(deploy, refused),
     }
     return judged | {"next": _next(judged, best["mode"], stages, names)}
 
@@ -410,6 +410,16 @@ def _for_another_robot(refused: Mapping[str, str]) -> list[str]:
     return [f"{robot}, to benchmark only: {whys}."] if whys else []
 
 
+def _allowed(deploy: str | None, refused: Mapping[str, str]) -> list[str]:
+    """Say what a rover takes the artifact for only if it is told to, but for the mode, which the table shows."""
+    whys = "; ".join(why for kind, why in refused.items() if kind in MAY_DIFFER and kind != "mode")
+    return (
+        [f"Was it trained for this car? A rover takes it only if rover_allow says so: {whys}."]
+        if deploy and whys
+        else []
+    )
+
+
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     """Say why this mode was chosen, each reason in a sentence."""
     if best is fp32:
@@ -485,7 +495,13 @@ def _cautions(
         lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
     if units := (stages["load"]["checkpoint"].get("normalisation") or {}).get("units"):
         lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
-    if mirrored := stages["load"].get("steering", {}).get("mirrored", []):
+    steering = stages["load"].get("steering", {})
+    if steering.get("denied"):
+        lines.append(
+            f"The pictures show that positive steering turns {steering['side']}, and their car's file says otherwise: "
+            "is the camera's picture mirrored? `rover doctor` tells after a recorded minute."
+        )
+    if mirrored := steering.get("mirrored", []):
         lines.append(
             f"The pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them."
         )

@@ -365,13 +365,16 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
         read.append((i, values, lost, driver))
-    actions: dict[str, dict[int, float]] = {}
+    pairs = {}
     formulas = {}
     for name in ACTION_NAMES:
         rows_of = {i: values for i, values, lost, _ in read if name not in lost}
-        actions[name], formula = _read_actions(pwm.channel(name), rows_of, path, faults)
+        recorded, meant, formula = _read_actions(pwm.channel(name), rows_of, path, faults)
+        pairs[name] = recorded, meant
         if formula:
             formulas[name] = formula
+    # Too few readings to show a formula are of older firmware too, if the other channel's are.
+    actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
     controls = []
     for i, values, _, driver in read:
         pair = actions["steering"].get(i), actions["throttle"].get(i)
@@ -384,10 +387,10 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
 
 def _read_actions(
     channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
-) -> tuple[dict[int, float], Formula | None]:
-    """Return one channel's action by the number of its control, without those that were not measured.
+) -> tuple[dict[int, float], dict[int, float], Formula | None]:
+    """Return one channel's recorded actions by the number of their control, those that their pulses mean, and the
+    formula that the recorded ones follow, if it is another than the car's. Those that were not measured are left out.
 
-    If they follow another formula than the car's, they are recomputed from their pulses, and that formula is returned.
     Raises EpisodeError if they follow none.
     """
     name = channel.name
@@ -419,15 +422,32 @@ def _read_actions(
             )
         note = f"recorded as {formula} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
         faults.add(path, f"{name}_recomputed", note, int((~agrees).sum()))
-        return meant, formula
+        return meant, meant, formula
+    return recorded, meant, None
+
+
+def _take(
+    channel: Channel,
+    recorded: dict[int, float],
+    meant: dict[int, float],
+    recompute: bool,
+    path: Path,
+    faults: Faults,
+) -> dict[int, float]:
+    """Return the actions of one channel, as recorded, or where pulses deny them, as these mean them if `recompute`."""
+    name = channel.name
     for i, action in list(recorded.items()):
-        if not channel.low <= action <= channel.high:
+        if recompute and abs(action - meant[i]) > EXACT:
+            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; recomputed from the pulses"
+            faults.add(path, f"{name}_recomputed", note)
+            recorded[i] = meant[i]
+        elif not channel.low <= action <= channel.high:
             faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
             del recorded[i]
         elif abs(action - meant[i]) > EXACT:
             note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; taken as recorded"
             faults.add(path, f"{name}_disagrees_with_pulse", note)
-    return recorded, None
+    return recorded
 
 
 def _in_order(

@@ -31,8 +31,13 @@ class Formula:
         return cls(channel.neutral_pct, channel.span_pct, channel.low, channel.high)
 
     def __str__(self) -> str:
-        duty = f"(duty % - {self.neutral_pct:.3g})" if abs(self.neutral_pct) >= 0.005 else "duty %"
+        sign = "-" if self.neutral_pct > 0 else "+"
+        duty = f"(duty % {sign} {abs(self.neutral_pct):.3g})" if abs(self.neutral_pct) >= 0.005 else "duty %"
         return f"{duty} / {self.span_pct:.3g}"
+
+    def is_like(self, other: "Formula") -> bool:
+        """Whether both may be one, as each was found from the few readings of its recording."""
+        return abs(self.neutral_pct - other.neutral_pct) <= 0.15 and abs(self.span_pct / other.span_pct - 1) <= 0.02
 
     def actions(self, duties_pct: np.ndarray) -> np.ndarray:
         return ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)

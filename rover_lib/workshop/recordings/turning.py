@@ -17,9 +17,10 @@ from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordi
 
 @dataclass(frozen=True)
 class Sides:
-    """What several recordings say together. side: None if they are not sure."""
+    """What several recordings say together. side: None if they are not sure. said: what their car's file says."""
 
     turnings: tuple[Turning, ...]
+    said: str | None = None
 
     @property
     def side(self) -> str | None:
@@ -35,6 +36,11 @@ class Sides:
         """The episodes whose pictures, or steering, are mirrored beside most of the others'."""
         return [t.episode for t in self.turnings if self.side and t.side not in (None, self.side)]
 
+    @property
+    def denied(self) -> bool:
+        """Whether the pictures show another side than the car's file says, as if all of them were mirrored."""
+        return self.said is not None and self.side not in (None, self.said)
+
     def words(self) -> str:
         """Say it in one line; empty without a recording."""
         agree = sum(t.side == self.side for t in self.turnings if t.side)
@@ -43,6 +49,8 @@ class Sides:
         if self.side is None:
             return f"which side positive steering turns to: {len(self.turnings)} episodes show too little to be sure"
         text = f"positive steering turns {self.side}, as the pictures of {agree} of {len(self.turnings)} episodes show"
+        if self.denied:
+            text += f", and their car's file says {self.said}: is the camera's picture mirrored?"
         return f"{text}; mirrored: {', '.join(self.mirrored)}" if self.mirrored else text
 
 
@@ -62,4 +70,7 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
 
     # OpenCV releases the interpreter's lock, so threads help.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        return Sides(tuple(progress(pool.map(measure, episodes), desc="which way it steers", total=len(episodes))))
+        turnings = tuple(progress(pool.map(measure, episodes), desc="which way it steers", total=len(episodes)))
+    said = {s.car.positive for e in episodes for s in e.samples}
+    # A LeRobotDataset, which states its rate, has no car's file.
+    return Sides(turnings, said.pop() if len(said) == 1 and layout.rate_hz is None else None)

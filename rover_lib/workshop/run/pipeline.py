@@ -219,7 +219,12 @@ def write_load(
     if fit:
         metrics["fit"] = fit
     if sides and sides.turnings:
-        metrics["steering"] = {"side": sides.side, "mirrored": sides.mirrored, "words": sides.words()}
+        metrics["steering"] = {
+            "side": sides.side,
+            "mirrored": sides.mirrored,
+            "denied": sides.denied,
+            "words": sides.words(),
+        }
     source = recordings.source
     given = {
         "checkpoint": checkpoint.path.resolve(),

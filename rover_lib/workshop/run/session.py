@@ -16,7 +16,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.samples import Source
-from rover_lib.workshop.run.units import in_todays_units
+from rover_lib.workshop.run.units import Units, in_todays_units
 from rover_lib.workshop.untrusted import quote
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
@@ -31,12 +31,15 @@ class Opened:
     parts: Split
 
 
-def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent) -> Opened:
+def load(
+    checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent, units: Units | None = None
+) -> Opened:
     """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
     For a LeRobot policy, the cameras that the policy uses are read from a LeRobotDataset unless the user chose others,
     and the policy gets the dataset's order and rate of numbers. One that was trained on the actions of older firmware
-    gets today's units. Raises CheckpointError and EpisodeError.
+    gets today's units. units: those that an earlier call found, see `in_todays_units`. Raises CheckpointError and
+    EpisodeError.
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint)
@@ -46,7 +49,7 @@ def load(checkpoint: Path | str, episodes: Path | str | Source, progress: Progre
         source = replace(source, cameras=policy.config.cameras)
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
-    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration)
+    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration, units)
     _check_limits(recorded)  # after recorded_as, because its rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 
@@ -95,11 +98,13 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     For a policy of less than SMALL_GMAC, this sets torch to one thread; a benchmark sets its own number.
     """
     stage = read_stage(Path(run_dir) / "load.json", "load")
-    if sum(stage["metrics"]["checkpoint"]["macs_by_block"].values()) < SMALL_GMAC * 1e9:
+    given, loaded = stage["params"], stage["metrics"]["checkpoint"]
+    if sum(loaded["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
-    given = stage["params"]
-    again = load(given["checkpoint"], Source.loaded(given), progress)
-    loaded, now, root = stage["metrics"]["checkpoint"], again.checkpoint, again.recordings.root
+    # To find them again would take planning. A run of before they were kept says only in words that there are any.
+    units = loaded.get("units") if "units" in loaded.get("normalisation", {}) else {}
+    again = load(given["checkpoint"], Source.loaded(given), progress, units)
+    now, root = again.checkpoint, again.recordings.root
     layout = stage["metrics"].get("recordings", {}).get("layout")
     words = again.recordings.layout.words()
     what, found = "", None

@@ -18,19 +18,27 @@ from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
 FRAMES = 8  # planned twice, in FP32
+Units = Mapping[str, Sequence[float]]  # by action, neutral_pct and span_pct of the formula that the policy speaks
 BETTER = 0.5  # the files' reading must leave at most this share of the error; one of the two is off by 222 us
 
 
-def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequence[Sample]) -> Checkpoint:
+def in_todays_units(
+    policy: Checkpoint, recordings: Recordings, samples: Sequence[Sample], known: Units | None = None
+) -> Checkpoint:
     """Return the policy, in the units of today's actions if it was trained on others.
 
     These are what the recordings had before they were recomputed. Recordings of the recorded car that follow today's
     formula may be newer than what the policy learned from: then those of OLD are tried. samples: of the recordings, to
-    plan on; a LeRobotDataset has no other units.
+    plan on; a LeRobotDataset has no other units. known: what an earlier call found, as its report's "units" say, so
+    that nothing is planned again.
     """
     if policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
         return policy
-    car, few = car_of(recordings.samples), pick_evenly(samples, FRAMES)
+    car = car_of(recordings.samples)
+    if known is not None:
+        formulas = {n: Formula(at, span, OLD[n].low, OLD[n].high) for n, (at, span) in known.items()}
+        return _in_units_of(policy, car, formulas) if formulas else policy
+    few = pick_evenly(samples, FRAMES)
     recorded: dict[str, Formula] = {n: f for e in recordings.episodes for n, f in e.formulas.items()}
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
@@ -55,7 +63,8 @@ def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) 
     converted = replace(policy, config=_convert(policy.config, np.array(gains), np.array(offsets)))
     said = ", ".join(f"{name} = {formula}" for name, formula in formulas.items())
     words = normalisation(converted.config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
-    return replace(converted, report=policy.report | {"normalisation": words})
+    units = {name: [formula.neutral_pct, formula.span_pct] for name, formula in formulas.items()}
+    return replace(converted, report=policy.report | {"normalisation": words, "units": units})
 
 
 def _convert(config: ActConfig, gains: np.ndarray, offsets: np.ndarray) -> ActConfig:

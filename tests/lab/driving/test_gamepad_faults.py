@@ -1,6 +1,7 @@
 """A gamepad's human on the pins of an emulated Arduino: whatever fails between hand and board stops the car in 200 ms.
 
-The gamepad is FIFOs (lab/driving/virtual_gamepad.py); the relay is a process with a ServoLink, as a recording is.
+Here the human drives by hand; `python -m lab faults --car lab/cars/gamepad.yml` has the rows of a drive. The gamepad is
+FIFOs (lab/driving/virtual_gamepad.py); the relay is a process with a ServoLink, as a recording is.
 """
 
 import functools
@@ -22,7 +23,7 @@ pytestmark = [pytest.mark.emulated, pytest.mark.release, needs.simavr]  # in rea
 STOP_MS = 200
 CAP_US = 238  # of a stick at its end: the cap
 RELAY = """
-import sys, time
+import sys
 from pathlib import Path
 from lab.driving.priority import boost_priority
 from lab.driving.virtual_gamepad import plug_in
@@ -33,13 +34,7 @@ with ServoLink(sys.argv[2], car=Car(human="gamepad")) as link, boost_priority():
     print("open", flush=True)
     for line in sys.stdin:
         try:
-            if line == "arm\\n":
-                link.arm()
-            else:
-                end = time.monotonic() + 1.0
-                while time.monotonic() < end:
-                    link.send(1600, 200)
-                    time.sleep(0.02)
+            link.arm()
             print(link.latest().state.value, flush=True)
         except LinkError as error:
             print(error, error.remedy, flush=True)
@@ -76,7 +71,7 @@ def start_relay(board, pad):
 
 
 def hear(child):
-    heard = child.read(120.0).decode().strip()
+    heard = child.read_line(30.0).strip()
     assert heard, child.errors()
     return heard
 
@@ -92,12 +87,12 @@ def throttle(board, seconds):
     return changes, sum(e.pulse_us / 1e3 for e in events if e.kind == "stall")
 
 
-def stops_in_time(board, at_s, what, moving=True):
+def stops_in_time(board, at_s, what):
     """Whether the throttle was off soon enough after `at_s`, and stayed off for the rest of a second."""
     changes, stalled_ms = throttle(board, 1.0)
     off = [at for at, us in changes if us <= 124 and at > at_s]
-    assert bool(off) == moving, changes
-    stopped_ms = (off[0] - at_s) * 1e3 if off else 0.0
+    assert off, changes
+    stopped_ms = (off[0] - at_s) * 1e3
     print(f"{what}: throttle off after {stopped_ms:.1f} ms (simavr stood for {stalled_ms:.0f})")
     assert stopped_ms <= STOP_MS + stalled_ms
     assert all(us <= 124 for at, us in changes if at > at_s + STOP_MS / 1e3 + stalled_ms / 1e3)
@@ -130,23 +125,6 @@ def test_a_human_at_full_throttle_is_lost(board, pad, relay, fault):
     if fault == "relay stopped":
         os.kill(relay.pid, signal.SIGCONT)
         assert all(us <= 124 for _, us in throttle(board, 0.5)[0])
-
-
-@pytest.mark.parametrize("fault", ["let go", "pulled out", "out of reach", "relay stopped", "stick"])
-def test_a_car_that_the_host_drives_is_the_humans_at_once(board, pad, relay, fault):
-    assert arm_by_gesture(board, pad, relay) == "A"
-    relay.send_line("drive")
-    changes, _ = throttle(board, 0.5)
-    assert abs(changes[-1][1] - 200) <= 4
-    at_s = time.monotonic()
-    if fault == "stick":
-        pad.move(0.4, 0)
-    else:
-        FAULTS[fault](pad, relay)
-    stops_in_time(board, at_s, f"host, {fault}")
-    if fault == "relay stopped":
-        os.kill(relay.pid, signal.SIGCONT)
-    assert hear(relay) == ("M" if fault == "stick" else "S") or fault == "relay stopped"
 
 
 def test_nothing_arms_it_unattended(board, pad):

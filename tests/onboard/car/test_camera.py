@@ -165,7 +165,7 @@ def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen(at, axis):
     for _ in range(4):
         part = picture[strip] if axis == 0 else picture[:, strip]
         part[:] = rng.integers(0, 255, part.shape, np.uint8)
-        camera._add(picture.copy(), 0.0, None)
+        camera.add(picture.copy(), 0.0, None)
     assert camera.latest().repeats == 3
 
 
@@ -174,7 +174,7 @@ def test_no_picture_of_a_real_drive_counts_as_frozen():
     for episode in sorted(recorded.real_recordings().glob("episode_*")):
         camera = Camera("recorded")
         for jpeg in sorted((episode / "frames").glob("*.jpg")):
-            camera._add(decode_jpeg(jpeg.read_bytes()), 0.0, None)
+            camera.add(decode_jpeg(jpeg.read_bytes()), 0.0, None)
             assert camera.latest().repeats == 0
 
 
@@ -186,7 +186,7 @@ def test_a_film_that_begins_again_is_no_frozen_camera():
     def repeats() -> list[int]:
         shown = []
         for picture in pictures:
-            camera._add(picture, 0.0, None)
+            camera.add(picture, 0.0, None)
             shown.append(camera.latest().repeats)
         return shown
 

@@ -9,6 +9,7 @@ from lab.driving.virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError, Stick
+from rover_lib.onboard.car.servo_link import MISSING, ServoLink
 from rover_lib.onboard.errors import CarError
 
 
@@ -128,6 +129,10 @@ def test_car_yml_names_the_human(tmp_path):
     path.write_text(yaml_of(Car(human="gamepad")))
     assert read_car(path) == Car(human="gamepad")
     assert read_car(path).drives_like(Car()) and read_car(path).id == Car().id
+    assert [ServoLink("none", car=car).remedy("s") for car in (Car(), read_car(path))] == [
+        MISSING["s"],
+        "hold L1 of the gamepad",
+    ]
     path.write_text(path.read_text().replace("gamepad", "nobody"))
     with pytest.raises(CarError, match="human must be receiver or gamepad"):
         read_car(path)

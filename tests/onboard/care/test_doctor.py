@@ -302,6 +302,50 @@ def test_an_arduino(proc, monkeypatch, receiver, verdict, found):
     assert board.heard.count(">Q") >= 20
 
 
+class Held:
+    """An open gamepad of which somebody holds L1, or nobody."""
+
+    def __init__(self, held):
+        self.held = held
+
+    def sticks(self):
+        return (0.0, 0.0) if self.held else None
+
+    def close(self):
+        pass
+
+
+NODES = ("A (event0)", "B (event1, without motion sensors)")
+
+
+@pytest.mark.parametrize(
+    ("receiver", "opened", "name", "verdict", "found"),
+    [
+        ("1460 21316 124 1016", True, "transmitter", "ok", "steering 1460 us, throttle 124 us"),
+        ("1460 21316 200 1016", True, "transmitter", "warning", "arming will be refused"),
+        ("- - - -", True, "transmitter", "warning", "nobody holds L1: arming will be refused"),
+        ("- - - -", True, "gamepad", "ok", "A (event0), B (event1, without motion sensors): with L1 held"),
+        ("- - - -", False, "car", "fail", "no gamepad that can be used is connected, found none in /dev/input"),
+        ("- - - -", False, "Arduino", "fail", "no gamepad that can be used is connected"),
+    ],
+)  # fmt: skip
+def test_a_gamepad(proc, monkeypatch, receiver, opened, name, verdict, found):
+    gamepad_car = Car(human="gamepad")
+    monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
+    monkeypatch.setattr(doctor, "this_car", lambda: gamepad_car)
+    monkeypatch.setattr("rover_lib.onboard.car.servo_link.this_car", lambda: gamepad_car)
+    if opened:
+        for module in ("care.doctor", "car.servo_link"):
+            monkeypatch.setattr(f"rover_lib.onboard.{module}.open_gamepad", lambda: Held(receiver[0] != "-"))
+        monkeypatch.setattr(doctor, "list_gamepads", lambda: NODES)
+    with board_of(answer=talking(receiver), hello=f"<H 4 4.1.1-gamepad 7 0 e {gamepad_car.id}") as board:
+        checks = {
+            c.name: c for c in examine(camera=str(proc / "none"), port=board.port, host=Host(proc_root=proc), boot_s=2)
+        }
+    assert checks[name].verdict == verdict and found in checks[name].found
+    assert opened or checks[name].remedy.startswith("connect a DualShock 4")
+
+
 RESTING = "1456 21316 120 1016"
 
 

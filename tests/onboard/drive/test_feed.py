@@ -11,7 +11,7 @@ import pytest
 
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.car.servo_link import State, Telemetry
+from rover_lib.onboard.car.servo_link import MISSING, State, Telemetry
 from rover_lib.onboard.drive import feed as f
 from rover_lib.onboard.drive.flight_log import FlightLog, read_log
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
@@ -39,7 +39,7 @@ class Clock:
 
 
 class Link:
-    port, calibration = "fake", PwmCalibration()
+    port, calibration, remedy = "fake", PwmCalibration(), MISSING.get
 
     def __init__(self, clock):
         self.clock, self.said, self.status, self.sequence = clock, [], STATUS, 0

@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import itertools
 import json
 import math
 import os
@@ -758,10 +759,16 @@ def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp
     assert events.index("the human took over with the transmitter") < events.index(f"recorded: {episode}")
 
 
+def lacking(steps):
+    """Return a link whose statuses lack one of these after the other."""
+    latest = lambda: replace(STATUS, missing=next(steps))  # noqa: E731
+    return SimpleNamespace(latest=latest, request=lambda: None, remedy=MISSING.get)
+
+
 def test_a_human_in_a_terminal_is_told_what_is_missing():
     """In the order in which a human does it; said once each."""
     steps = iter(["s", "s", "t", "w", "w", "w", "-"])
-    link = SimpleNamespace(latest=lambda: replace(STATUS, missing=next(steps)), request=lambda: None)
+    link = lacking(steps)
     said, checked = [], []
     assert arm_when_ready(armed, link, threading.Event(), said.append, [lambda: checked.append(1)]) == "telemetry"
     assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
@@ -771,7 +778,7 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
 def test_a_human_in_a_terminal_may_go_away():
     stop = threading.Event()
     stop.set()
-    link = SimpleNamespace(latest=lambda: replace(STATUS, missing="s"), request=lambda: None)
+    link = lacking(itertools.repeat("s"))
     with pytest.raises(s.NotArmed):
         arm_when_ready(lambda: pytest.fail("armed"), link, stop, print)
 
@@ -780,7 +787,7 @@ def test_a_human_in_a_terminal_may_go_away():
 def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
     """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
     steps, now = iter(missing), iter([0.0, 20.0, 31.0])
-    link = SimpleNamespace(latest=lambda: replace(STATUS, missing=next(steps)), request=lambda: None)
+    link = lacking(steps)
     if missing == "-":
         next(now), next(now)
         now = iter([0.0, 3600.0])

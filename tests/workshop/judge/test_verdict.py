@@ -173,15 +173,20 @@ def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused
         assert says in judged["why"] and commands(judged) == ["rover benchmark runs/mine/policy_static.pt"]
     else:
         assert deploying[0].endswith(says or "policy_static.pt")
+    # A rover refused CarRacing's square pictures, and only a deploy command that was not printed said so.
+    asked = [c for c in judged["cautions"] if c.startswith("Was it trained for this car?")]
+    assert [c.rpartition(": ")[2] for c in asked] == (["c; p."] if "chunk" in refused else [])
 
 
 def test_recomputed_actions_and_throttle_beyond_the_limit_are_said(demo):
     demo["load"]["recordings"]["recomputed"] = "the actions of 5 of 6 episodes were recomputed"
     demo["compare"]["action_range"]["throttle"] = [0.0, 0.27]
+    demo["load"]["steering"] = {"side": "left", "mirrored": [], "denied": True}
     said = "\n".join(judge(demo)["cautions"])
     assert (
         "The actions of 5 of 6 episodes were recomputed." in said and "throttle up to 0.27" in said and "0.2:" in said
     )
+    assert "turns left, and their car's file says otherwise: is the camera's picture mirrored?" in said
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):

@@ -512,6 +512,28 @@ def test_a_real_recording_that_changed_its_formula_midway(tmp_path, share):
     assert found.recomputed()
 
 
+def test_one_formula_that_was_found_in_each_recording_is_named_once(tmp_path):
+    """Fitted to few readings it is another in the third digit each time, and six were listed of one firmware."""
+    record(tmp_path)
+    record(tmp_path, "episode_20260102_120000")
+    for i, folder in enumerate(sorted(tmp_path.iterdir())):
+        edit(folder, rewritten({"throttle": (-0.05 + 0.01 * i, 98.8 + 0.1 * i), "steering": (7 + 0.5 * i, 2.4)}))
+    said = load(tmp_path).recomputed()
+    assert "formula: steering = (duty % - 7) / 2.4, steering = (duty % - 7.5) / 2.4, throttle = (duty % + 0.0" in said
+    assert said.count("throttle = ") == 1
+
+
+def test_the_few_readings_of_one_channel_are_recomputed_where_the_other_channels_are(tmp_path):
+    """Seven readings, of many, showed no formula, and were taken as recorded beside a steering that was recomputed."""
+    whole = [s.chunk.tolist() for s in load(record(tmp_path)).samples]
+    folder = tmp_path / "episode_20260101_120000"
+    edit(folder, rewritten({"steering": (6.9, 2.1)}, share=0.6))
+    edit(folder, rewritten({"throttle": (5, 80)}, share=0.05))
+    recordings = load(tmp_path)
+    assert np.abs(np.array([s.chunk.tolist() for s in recordings.samples]) - whole).max() <= 1e-3
+    assert recordings.faults_by_kind().keys() == {"recomputed from the pulses"}
+
+
 def test_the_real_recordings_have_the_actions_of_their_pulses():
     recordings = load(real_recordings())
     assert len(recordings.episodes) == 6 and "5 of 6" in recordings.recomputed()

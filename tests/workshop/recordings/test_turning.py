@@ -53,6 +53,15 @@ def test_what_disagrees_with_the_others_is_mirrored():
     )
 
 
+def test_pictures_that_are_all_mirrored_are_held_against_the_cars_file():
+    """They were said to turn left, as if this car did, and nothing asked whether the camera was mirrored."""
+    all_turned = recordings(*(drive(f"e{i}", 8, seed=i) for i in range(3)))
+    sides = measure_sides(all_turned)
+    assert sides.denied and "their car's file says right: is the camera's picture mirrored?" in sides.words()
+    other = replace(all_turned, layout=replace(all_turned.layout, rate_hz=30.0))  # a dataset, whose car is not known
+    assert not measure_sides(other).denied and not measure_sides(recordings(drive("a", -8))).denied
+
+
 def test_the_real_recordings_turn_right_and_one_is_mirrored():
     sides = measure_sides(load_recordings(real_recordings()))
     assert sides.side == "right" and sides.mirrored == ["episode_20251005_192655"]

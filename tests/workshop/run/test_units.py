@@ -13,6 +13,8 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.formula import OLD
+from rover_lib.workshop.run import session, units
+from rover_lib.workshop.run.pipeline import write_load
 from rover_lib.workshop.run.units import in_todays_units
 
 PWM = PwmCalibration()
@@ -75,6 +77,24 @@ def test_a_policy_of_older_actions_on_newer_recordings(tiny, tmp_path):
     assert "converted" in in_todays_units(older, newer, newer.samples).report["normalisation"]["units"]
     another = replace(newer, episodes=tuple(_of_another_car(e) for e in newer.episodes))
     assert in_todays_units(older, another, another.samples) is older
+
+
+def test_what_notebook_01_found_is_not_planned_again(tiny, old_recordings, tmp_path, monkeypatch):
+    """Sixteen plans of a full-size policy take seconds, and five notebooks open a run."""
+    made = tmp_path / "run"
+    for policy in (speaks(tiny, 0.2, 1e-3), speaks(tiny, 0.05, 1e-3)):
+        monkeypatch.setattr(session, "load_checkpoint", lambda path, policy=policy: policy)
+        with monkeypatch.context() as first:
+            opened = session.load(policy.path, old_recordings.root)
+            write_load(made, opened)
+            first.setattr(units, "_error", lambda *given: pytest.fail("it was planned again"))
+            again = session.open_run(made).checkpoint
+        assert (again.config, again.report) == (opened.checkpoint.config, opened.checkpoint.report)
+    written = json.loads((made / "load.json").read_text())  # as of before they were kept
+    monkeypatch.setattr(session, "load_checkpoint", lambda path: speaks(tiny, 0.2, 1e-3))
+    written["metrics"]["checkpoint"]["normalisation"]["units"] = "trained on actions of older firmware"
+    (made / "load.json").write_text(json.dumps(written))
+    assert "units" in session.open_run(made).checkpoint.report
 
 
 def _of_another_car(episode):
