@@ -80,7 +80,7 @@ def make(kind, path):
 KINDS = ("of all six", "in old units", "collapsed", "copies its state", "straight ahead", "random")
 
 
-# The other kinds are held back by yardsticks that have tests of their own; make check-release sees them go the whole way.
+# Yardsticks with tests of their own hold the other kinds back; make check-release sees them go the whole way.
 @pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.release] * (k != "in old units")) for k in KINDS])
 def test_what_is_not_ready_is_never_asked_to_drive(kind, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "runs" / "bad"
