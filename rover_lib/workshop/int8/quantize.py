@@ -242,7 +242,8 @@ class Rangeable:
     """
 
     def __init__(self, graph: GraphModule, config: ActConfig, scheme: Scheme):
-        self.observers = [m for m in graph.modules() if isinstance(m, RangeObserver)]
+        called = {node.target for node in graph.graph.nodes}  # a second camera's observers stay behind, and saw nothing
+        self.observers = [m for n, m in graph.named_modules() if n in called and isinstance(m, RangeObserver)]
         of = {}  # each observer by a scale that is its own: by this it is found again behind the conversion
         for i, observer in enumerate(self.observers, 1):
             observer.choice, observer.of_frames = "frames", (-float(i), float(i))
