@@ -55,6 +55,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
 )
+from rover_lib.workshop.recordings.turning import measure_sides
 from rover_lib.workshop.swap_folder import lock_folder
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
@@ -214,6 +215,7 @@ def _write(
         "left_out_too_short": short,
         "left_out_nobody_drove": sum(s.driver == NOBODY for s in recordings.samples),
         "recomputed": recordings.recomputed() or "no action",
+        "steering": measure_sides(recordings, progress).words(),
         "faults": recordings.faults_by_kind(),
         "faults_while_reading": [asdict(fault) for fault in recordings.faults],
         "episodes_are": origins,

@@ -41,7 +41,7 @@ def lerobot_train(dataset, out, *options, cache, timeout=1800):
     return out / "checkpoints/last"
 
 
-@pytest.fixture(scope="module", params=["images", "video"])
+@pytest.fixture(scope="module", params=[pytest.param("images", marks=pytest.mark.release), "video"])
 def artifact(request, tmp_path_factory):
     """The static artifact that rover makes of a policy that LeRobot trained on a dataset of images, or of video."""
     folder = tmp_path_factory.mktemp(request.param)

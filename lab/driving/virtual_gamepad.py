@@ -135,7 +135,7 @@ class GamepadHuman:
 
     def _run(self) -> None:
         boost(threading.get_native_id())
-        while not self._over.wait(0.1):
+        while not self._over.wait(0.02):
             status = self._status()
             if not status or status.state is State.AUTONOMOUS:
                 continue

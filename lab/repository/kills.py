@@ -245,7 +245,9 @@ def _attempt(work: Work, inputs: Path, folder: Path, kill_after_s: float | None)
     """Do the work in a fork; return its exit code and its progress."""
     child, progress = _start(work, inputs, folder)
     if kill_after_s is not None:
-        time.sleep(kill_after_s)
+        end, look = time.monotonic() + kill_after_s, os.WEXITED | os.WNOWAIT | os.WNOHANG
+        while time.monotonic() < end and not os.waitid(os.P_PID, child, look):  # it may end long before
+            time.sleep(0.005)
         os.kill(child, signal.SIGKILL)
     return _end(child), struct.unpack_from("q", progress)[0]
 

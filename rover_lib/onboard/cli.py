@@ -475,6 +475,7 @@ def benchmark(
     what runs on the Pi.
     """
     from rover_lib.onboard.artifact.manifest import Artifact, distinct_names
+    from rover_lib.onboard.car.host import usable_cores
     from rover_lib.onboard.care.benchmark import BenchmarkOptions
     from rover_lib.onboard.care.benchmark import benchmark as measure
     from rover_lib.onboard.care.limits import check_gates
@@ -486,7 +487,8 @@ def benchmark(
     policies, contents, vectors = {}, {}, None
     for name, path in files.items():
         with Artifact(path) as artifact:
-            policies[name] = load_policy(artifact)
+            # In torch, XNNPACK's pool keeps the number that it begins with.
+            policies[name] = load_policy(artifact, threads=threads or usable_cores())
             contents[f"{name}{path.suffix}"] = artifact.content_hash
             vectors = artifact.parity if vectors is None else vectors
     assert vectors is not None, "click asks for an artifact at least"

@@ -131,20 +131,12 @@ def test_steering_lags():
     assert (world.state.x_m, world.state.y_m) == (0.0, 0.0), "a car without throttle stands"
 
 
-def test_a_car_that_stands_times_out():
+@pytest.mark.parametrize(("action", "outcomes"), [((0.0, 0.0), ["timeout"]), ((1.0, 0.09), ["left", "timeout"])])
+def test_a_car_that_stands_or_drives_away_hits_nothing(action, outcomes):
     world = World(2)
     while not world.done:
-        world.step(0.0, 0.0)
-    assert world.outcome == "timeout"
-    assert not world.hit
-
-
-def test_a_car_that_drives_away_has_left():
-    world = World(2)
-    while not world.done:
-        world.step(1.0, 0.09)
-    assert world.outcome in ("left", "timeout")
-    assert not world.hit
+        world.step(*action)
+    assert world.outcome in outcomes and not world.hit
 
 
 @pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1), (0.0, 1.1)])

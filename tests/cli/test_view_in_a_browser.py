@@ -37,7 +37,7 @@ def start(*words, tmp_path):
 def end(*processes):
     for process in processes:
         process.send_signal(signal.SIGINT)
-        process.wait(30)
+        process.wait(120)  # Python takes a second of processor to end, and may get little
         process.stdout.close()
 
 

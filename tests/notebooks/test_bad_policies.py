@@ -80,7 +80,8 @@ def make(kind, path):
 KINDS = ("of all six", "in old units", "collapsed", "copies its state", "straight ahead", "random")
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.release] * (k not in KINDS[1:3])) for k in KINDS])
+# Yardsticks with tests of their own hold the other kinds back; make check-release sees them go the whole way.
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.release] * (k != "in old units")) for k in KINDS])
 def test_what_is_not_ready_is_never_asked_to_drive(kind, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "runs" / "bad"
     make(kind, tmp_path / "best_model.pth")

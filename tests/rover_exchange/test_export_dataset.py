@@ -54,6 +54,7 @@ def test_lerobot_reads_it_back_and_so_do_we(recorded, tmp_path):
     report = export_dataset(recorded, tmp_path / "out")
     original = load(recorded)
     assert (report["episodes"], report["frames"], report["frames_a_second"]) == (3, 60, 30)
+    assert report["steering"].endswith("3 episodes show too little to be sure")  # nothing named mirrored ones here
     theirs = LeRobotDataset("local/out", tmp_path / "out", video_backend="pyav")
     assert theirs.meta.robot_type == "rover" and theirs.num_episodes == 3
     for sample, item in zip(original.samples, theirs, strict=True):

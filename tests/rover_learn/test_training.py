@@ -139,20 +139,18 @@ def test_two_processes_do_not_train_the_same(tmp_path):
         pass
 
 
-def test_a_damaged_file_is_named(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "left", "says"),
+    [
+        ("features.pt", slice(-200), r"features\.pt.*remove .* from the beginning"),
+        ("rows", slice(0), "rows are missing, found 0 of 2"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, name, left, says):
     with pytest.raises(Killed):
         train(tmp_path, kill_at=2)
-    file = tmp_path / "features.pt"
-    file.write_bytes(file.read_bytes()[:-200])
-    with pytest.raises(TrainingError, match=r"features\.pt.*remove .* from the beginning"):
-        train(tmp_path)
-
-
-def test_rows_that_are_gone_are_named(tmp_path):
-    with pytest.raises(Killed):
-        train(tmp_path, kill_at=2)
-    (tmp_path / "rows").write_bytes(b"")
-    with pytest.raises(TrainingError, match="rows are missing, found 0 of 2"):
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[left])
+    with pytest.raises(TrainingError, match=says):
         train(tmp_path)
 
 

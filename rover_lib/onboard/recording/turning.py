@@ -76,6 +76,8 @@ class Turning:
         return "right" if self.correlation < 0 else "left"
 
     def words(self) -> str:
+        if self.spread < LEAST_SPREAD:
+            return f"{self.episode}: steers too little to tell which way (spread {self.spread:.2f} of {LEAST_SPREAD})"
         if self.correlation is None:
             return f"{self.episode}: too few pictures that move to tell which way it steers"
         how = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"

@@ -242,8 +242,8 @@ class Rangeable:
     """
 
     def __init__(self, graph: GraphModule, config: ActConfig, scheme: Scheme):
-        # One that saw nothing is behind what conversion leaves out.
-        self.observers = [m for m in graph.modules() if isinstance(m, RangeObserver) and m.min_val <= m.max_val]
+        called = {node.target for node in graph.graph.nodes}  # a second camera's observers stay behind, and saw nothing
+        self.observers = [m for n, m in graph.named_modules() if n in called and isinstance(m, RangeObserver)]
         of = {}  # each observer by a scale that is its own: by this it is found again behind the conversion
         for i, observer in enumerate(self.observers, 1):
             observer.choice, observer.of_frames = "frames", (-float(i), float(i))

@@ -217,21 +217,13 @@ def test_arming_without_an_answer():
         assert len({b for b in board.heard if b.startswith(">A")}) >= 5  # again and again, each with its own number
 
 
-@pytest.mark.slow
-def test_a_status_from_before_is_no_answer():
-    def old(board, body):
-        board.status("A", "a", sequence=4294967290)
+@pytest.mark.parametrize("of", [pytest.param({"sequence": 4294967290}, marks=pytest.mark.slow), {"boot": 9}])
+def test_a_status_that_is_not_of_now_is_no_answer(of):
+    def other(board, body):
+        board.status("A", "a", **of)
 
     sentence = "no answer to arming"
-    with board_of(answer=old) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
-        link.arm()
-
-
-def test_a_status_of_another_start_is_no_answer():
-    def other(board, body):
-        board.status("A", "a", boot=9)
-
-    with board_of(answer=other) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match="no answer to"):
+    with board_of(answer=other) as board, ServoLink(board.port) as link, pytest.raises(LinkError, match=sentence):
         link.arm()
 
 

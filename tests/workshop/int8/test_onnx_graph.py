@@ -16,9 +16,9 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.int8.observe import calibrate
+from rover_lib.workshop.int8.observe import calibrate, restore_observed, set_ranges
 from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stack_stem
-from rover_lib.workshop.int8.quantize import int8_layers, quantize
+from rover_lib.workshop.int8.quantize import Rangeable, int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
 SHAPES = {
@@ -112,10 +112,15 @@ def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
         )
         for sample in memory_samples(10)
     ]
-    quantized = quantize(checkpoint, Scheme(), calibrate(checkpoint, samples[:8]))
+    calibration = calibrate(checkpoint, samples[:8])
+    quantized = quantize(checkpoint, Scheme(), calibration)
     inputs = [inputs_of(s, checkpoint.config) for s in samples[8:]]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], checkpoint.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
+    tried = Rangeable(graph := restore_observed(checkpoint, Scheme(), calibration), checkpoint.config, Scheme())
+    set_ranges(graph, Scheme(), calibration)
+    tried.take()
+    assert np.array_equal(predictions(tried.module, inputs).numpy(), torchs)
     own_error = np.abs(torchs - predictions(ACT(checkpoint.config, checkpoint.weights), inputs).numpy()).max()
     assert np.abs(answers(written, inputs, checkpoint.config, exact=True) - torchs).max() < own_error
     assert len(written.SerializeToString()) < 15e6  # 12 with one camera

@@ -284,37 +284,24 @@ def test_single_lost_readings_cost_no_frame(tmp_path):
     assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009
 
 
-def test_serial_burst_is_placed_by_the_arduinos_clock(tmp_path):
+@pytest.mark.parametrize("wraps", [False, True], ids=["later", "over the wrap"])
+def test_serial_burst_is_placed_by_the_arduinos_clock(tmp_path, wraps):
     folder = record(tmp_path)
     whole = load(tmp_path).samples
 
     def change(content):
         # The controls of the first 0.7 s waited in the buffer, and arrive 0.3 ms apart just before the 21st.
         controls = content["control_samples"]
-        for k, control in enumerate(controls[:20]):
-            control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
-
-    edit(folder, change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"serial_burst": 20}
-    assert "0.65 s" in recordings.faults[0].note
-    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
-
-
-def test_serial_burst_over_the_wrap_of_the_arduinos_clock(tmp_path):
-    folder = record(tmp_path)
-    whole = load(tmp_path).samples
-
-    def change(content):
-        controls = content["control_samples"]
         for k, control in enumerate(controls):
-            control["arduino_timestamp"] = (2**32 - 330 + 33 * k) % 2**32
+            if wraps:
+                control["arduino_timestamp"] = (2**32 - 330 + 33 * k) % 2**32
             if k < 20:
                 control["system_timestamp"] = controls[20]["system_timestamp"] - 0.0003 * (20 - k)
 
     edit(folder, change)
     recordings = load(tmp_path)
     assert kinds(recordings) == {"serial_burst": 20}
+    assert wraps or "0.65 s" in recordings.faults[0].note
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
 
 
@@ -623,26 +610,18 @@ def test_sync_window(tmp_path):
     assert len(load(tmp_path, sync_s=0.1).samples) == 40
 
 
-def test_a_hole_in_time_ends_chunks_and_states(tmp_path):
+@pytest.mark.parametrize(
+    ("gone", "samples"), [(slice(20, 30), 29), (slice(1, -1), 1)], ids=["a hole", "but two frames"]
+)
+def test_a_hole_in_time_ends_chunks_and_states(tmp_path, gone, samples):
     def change(content):
-        del content["frame_samples"][20:30]
+        del content["frame_samples"][gone]
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
     assert kinds(recordings) == {"hole_in_time": 1, "frame_without_state": 1}
-    assert len(recordings.samples) == 29
-    assert recordings.samples[19].is_pad.sum() == CHUNK - 1
-
-
-def test_two_frames_far_apart_are_no_neighbours(tmp_path):
-    def change(content):
-        content["frame_samples"] = [content["frame_samples"][0], content["frame_samples"][-1]]
-
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"hole_in_time": 1, "frame_without_state": 1}
-    assert len(recordings.samples) == 1
-    assert recordings.samples[0].is_pad.sum() == CHUNK - 1
+    assert len(recordings.samples) == samples
+    assert recordings.samples[min(samples - 1, 19)].is_pad.sum() == CHUNK - 1
 
 
 def test_duplicates(tmp_path):
