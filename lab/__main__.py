@@ -252,14 +252,16 @@ def real(recordings: Path, output: Path | None, runs: tuple[Path, ...], elsewher
 def kill_commands(ctx: click.Context, output: Path | None, each: int, only: tuple[str, ...]) -> None:
     """Kill what writes files at random moments, do it twice at once, and fill its disk (as root).
 
-    The exit code is 1 if anything is lost or half-written.
+    With --only, what OUTPUT says of other work stays. The exit code is 1 if anything is lost or half-written.
     """
     import tempfile
 
     from lab.repository import kills
-    from rover_lib.onboard.stage import write_stage
+    from rover_lib.onboard.stage import read_stage, write_stage
 
     metrics: dict[str, Any] = {}
+    if only and output and output.exists():
+        metrics = read_stage(output, "kills")["metrics"]
     with tempfile.TemporaryDirectory() as folder:
         inputs = kills.make_inputs(Path(folder))
         for work in (work for work in kills.WORKS if not only or work.name in only):

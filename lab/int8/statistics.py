@@ -94,8 +94,9 @@ def _judge(episodes: Path, folder: Path, seed: int, name: str, recipe: TrainingR
     judge = Chooser(checkpoint, calibration, pick_evenly(parts.held_out, 120), recordings.action_range())
     errors = judge.error(quantize(checkpoint, scheme, calibration).module)
     by_histogram = judge.error(quantize(checkpoint, how.scheme, calibration).module)
+    odd = describe_odd(calibration.frames, calibration.seen)
     return {
-        "odd": describe_odd(calibration.frames, calibration.seen),
+        "odd": {key: odd[key] for key in ("share_pct", "block", "times") if key in odd},
         "observer": scheme.observer,
         **errors,
         "passed": (worst(errors) or 0.0) <= LIMIT_PCT,

@@ -50,12 +50,21 @@ def tell_of(
         "recomputed": read.recomputed(),
         "faults": read.faults_by_kind(),
         "side": sides.words(),
-        "turnings": {t.episode: {k: getattr(t, k) for k in ("correlation", "sure", "spread")} for t in sides.turnings},
+        "turnings": shorten(
+            {t.episode: {k: getattr(t, k) for k in ("correlation", "sure", "spread")} for t in sides.turnings}
+        ),
         "camera": watch_pictures(read, progress),
-        "guesses_pct": guess_each(read),
+        "guesses_pct": shorten(guess_each(read)),
         "learned": learn_each(read, sides.mirrored, progress),
         "policies": {name: _policy(folder, elsewhere, progress) for name, folder in runs.items()},
     }
+
+
+def shorten(value: Any) -> Any:
+    """The same with four digits of each number: there are hundreds of episodes, and nobody reads more."""
+    if isinstance(value, dict):
+        return {key: shorten(each) for key, each in value.items()}
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[str, Any]:
