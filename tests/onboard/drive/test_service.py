@@ -545,7 +545,7 @@ class Link:
     """An Arduino that arms once the stick was wiggled, and whose human takes over after ten commands."""
 
     port, hello, garbled, calibration = "fake", None, 0, PwmCalibration()
-    opened, missing = 0, "w"
+    opened, missing, remedy = 0, "w", MISSING.get
     arms: ClassVar[list[float]] = []
     caps: ClassVar[list[int]] = []
 
