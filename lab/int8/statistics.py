@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lab.shorten import shorten
 from rover_learn.train import TrainingRecipe, _train
 from rover_learn.training import Resumable, threads
 from rover_lib.onboard.params import params
@@ -73,7 +74,9 @@ def judge_statistics(
     done = {(row["training"], row["statistics"]) for row in rows}
     todo = [(seed, name) for seed in range(trainings) for name in STATISTICS if (seed, name) not in done]
     for seed, name in progress(todo, desc="policies"):
-        rows.append({"training": seed, "statistics": name, **_judge(Path(episodes), folder, seed, name, recipe)})
+        rows.append(
+            {"training": seed, "statistics": name, **shorten(_judge(Path(episodes), folder, seed, name, recipe))}
+        )
         held = sum(row["passed"] for row in rows)
         gates = [gate("policies that hold, share", held / len(rows), ">=", MUST_HOLD)]
         write_stage(path, "statistics", params={"limit_pct": LIMIT_PCT}, metrics={"policies": rows, "gates": gates})

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from lab.shorten import shorten
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.drive.pilot import Sight
 from rover_lib.onboard.drive.plan import Settings
@@ -58,13 +59,6 @@ def tell_of(
         "learned": learn_each(read, sides.mirrored, progress),
         "policies": {name: _policy(folder, elsewhere, progress) for name, folder in runs.items()},
     }
-
-
-def shorten(value: Any) -> Any:
-    """The same with four digits of each number: there are hundreds of episodes, and nobody reads more."""
-    if isinstance(value, dict):
-        return {key: shorten(each) for key, each in value.items()}
-    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def watch_pictures(recordings: Recordings, progress: Progress = silent) -> dict[str, Any]:
