@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
+PACKAGES := rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world lab lerobot_robot_rover
 READY := $(VENV)/.ready
 # Each process runs whole test files or notebooks. More than four processes would cost more memory than they save time.
 # They go in the order of the folders: ansible and lab have the longest files, which would run alone if they came last.
@@ -85,7 +86,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff check --quiet
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
-	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware lab lerobot_robot_rover notebooks rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world tests
+	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware notebooks tests $(PACKAGES)
 
 # The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
 # The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.
@@ -108,7 +109,7 @@ check-release: lint $(DEMO)
 	$(MAKE) faults faults-cars random mutants kills pi-fast pi
 
 coverage: $(DEMO)
-	$(VENV)/bin/pytest --cov=rover_lib --cov=rover_exchange --cov=rover_look --cov=rover_hailo --cov=rover_learn --cov=balloon_world --cov=lab --cov=lerobot_robot_rover --cov-report=term
+	$(VENV)/bin/pytest $(PACKAGES:%=--cov=%) --cov-report=term
 
 # NAME=full needs no checkpoint: it makes one. The last file that it makes is policy_static.onnx.zip.
 count: $(READY)

@@ -27,7 +27,13 @@ def view(file: Path | None, drive: int, **options: Any) -> None:
     """
     if file is None:
         return open_view(**options, opened=open_browser)
-    watch(file, drive, options)
+    if {"flight log", "recordings"} & set(kinds_of(file)):
+        from rover_look.replay import load_replay
+
+        return open_view(**options, opened=open_browser, shown=load_replay(file, drive))
+    check_kind(file, "artifact")
+    (simulated,) = entry_points(group="rover.cars", name="world")
+    open_view(**options, opened=open_browser, shown=simulated.load().shown(file))
 
 
 @click.command(short_help="Summarize a flight log, and draw it.")
@@ -98,19 +104,3 @@ def open_browser(url: str) -> None:
     """Open a browser if there is a screen; without one, a browser would take over the terminal."""
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(url)
-
-
-def watch(file: Path, drive: int, options: dict[str, Any]) -> None:
-    """Do what `rover view FILE` asks for, until the view is ended.
-
-    drive: which drive of a flight log to show.
-    Raises KindError for a file that is neither an artifact nor a drive.
-    """
-    kinds = kinds_of(file)
-    if {"flight log", "recordings"} & set(kinds):
-        from rover_look.replay import load_replay
-
-        return open_view(**options, opened=open_browser, shown=load_replay(file, drive))
-    check_kind(file, "artifact")
-    (simulated,) = entry_points(group="rover.cars", name="world")
-    open_view(**options, opened=open_browser, shown=simulated.load().shown(file))
