@@ -132,6 +132,15 @@ def test_odd_frames_take_no_steps_from_the_others(dazzled, jumping, jumped):
     assert worst(table[list(table)[-1]]) < 0.8 * worst(table["minmax"])
 
 
+@pytest.mark.parametrize(("others", "share"), [((), 1 / 8), (range(32), 1 / 8), ((3, 11), 2 / 8)])
+def test_odd_frames_weigh_what_they_are_among_unseen_ones(dazzled, jumping, jumped, others, share):
+    """Training knows the frames that calibrate: of its own recordings' others it may meet five times as many odd ones."""
+    odd = frames.odd_samples(jumped.frames, jumped.seen, jumping)
+    chooser = Chooser(dazzled, jumped, memory_samples(6, seed=9), RANGE, odd, [jumping[i] for i in others])
+    of_odd = (chooser.weights * chooser.is_odd).sum() / chooser.weights.sum()
+    assert of_odd == pytest.approx(share)
+
+
 @pytest.mark.slow
 def test_a_policy_from_elsewhere_keeps_its_gates(tmp_path):
     """In 3 to 4 % of these frames layer4 is 50 to 270 times larger; every other observer is 2 and 10 % off."""
