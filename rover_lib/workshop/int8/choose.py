@@ -1,7 +1,7 @@
 """Which observer, and which blocks stay in float: chosen by measuring, on frames that calibration has not seen.
 
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range(), odd, unseen)
+    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range(), odd)
     scheme, by_observer = chooser.observer(Scheme("static"))
     sensitivity = chooser.sensitivity(scheme)
     mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=0.2, max_cost_pct=5)
@@ -21,14 +21,13 @@ from torch.fx import GraphModule, Interpreter, Node
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.frames import ODD, ODD_FRAMES, odd_share, usual
+from rover_lib.workshop.int8.frames import ODD, odd_share, usual
 from rover_lib.workshop.int8.observe import Calibration, restore_observed, set_ranges, times_of
 from rover_lib.workshop.int8.quantize import Rangeable, convert, forget_graphs
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import pick_evenly
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
 # A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an
@@ -61,11 +60,10 @@ def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) 
 class Chooser:
     """The float policy and its answers on a few samples, prepared once for many conversions.
 
-    odd: some of the odd frames that calibration met. unseen: frames of other episodes; the odd ones among them take
-    part first, as training and calibration know theirs. Together with the odd ones among the samples they weigh in
-    every error what odd frames weigh in the recordings: their share of what calibration saw, or of unseen frames, if
-    that is larger. warnings: a sentence for each action that is not judged. Raises QuantizeError without samples, and
-    where no action changes in the recordings.
+    odd: some of the odd frames that calibration met. Together with the odd ones among the samples they weigh in every
+    error what odd frames weigh in the recordings: their share of what calibration saw, or of the samples, if that is
+    larger. warnings: a sentence for each action that is not judged. Raises QuantizeError without samples, and where no
+    action changes in the recordings.
     """
 
     def __init__(
@@ -75,7 +73,6 @@ class Chooser:
         samples: Sequence[Sample],
         action_range: Mapping[str, Range],
         odd: Sequence[Sample] = (),
-        unseen: Sequence[Sample] = (),
     ):
         if not samples:
             raise QuantizeError(
@@ -88,26 +85,17 @@ class Chooser:
             )
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
-        self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
-        self.is_odd = torch.zeros(len(samples), dtype=torch.bool)
-        share = self._take_odd(odd, unseen) if odd else 0.0
+        self.inputs = [inputs_of(s, checkpoint.config) for s in (*samples, *odd)]
         self.reference = predictions(ACT(checkpoint.config, checkpoint.weights), self.inputs)
+        self.is_odd = torch.arange(len(self.inputs)) >= len(samples)
         self.weights = torch.ones(len(self.inputs))
         if odd:
+            graph = restore_observed(checkpoint, Scheme(smooth=calibration.smooth), calibration)
+            unseen = times_of(graph, calibration, self.inputs[: len(samples)]) > ODD
+            self.is_odd[: len(samples)] = unseen
+            share = max(odd_share(calibration.frames), unseen.float().mean().item())
             for of_all, kind in ((1 - share, ~self.is_odd), (share, self.is_odd)):
                 self.weights[kind] = of_all * len(kind) / kind.sum().clamp(min=1)
-
-    def _take_odd(self, odd: Sequence[Sample], unseen: Sequence[Sample]) -> float:
-        """Add ODD_FRAMES odd frames to the inputs, of the unseen ones first; return what share of all frames is odd."""
-        of_samples, others = len(self.inputs), [inputs_of(s, self.checkpoint.config) for s in unseen]
-        graph = restore_observed(self.checkpoint, Scheme(smooth=self.calibration.smooth), self.calibration)
-        times = times_of(graph, self.calibration, [*self.inputs, *others])
-        odd_others = [i for i in times[of_samples:].argsort().tolist() if times[of_samples + i] > ODD]
-        added = [others[i] for i in pick_evenly(odd_others, ODD_FRAMES)]
-        added += [inputs_of(s, self.checkpoint.config) for s in pick_evenly(odd, ODD_FRAMES - len(added))]
-        self.inputs += added
-        self.is_odd = torch.cat((times[:of_samples] > ODD, torch.ones(len(added), dtype=torch.bool)))
-        return max(odd_share(self.calibration.frames), (times > ODD).float().mean().item())
 
     def errors(self, module: nn.Module) -> Tensor:
         """(frames, actions): each frame's mean absolute difference to its own plan in FP32, in units of the actions."""

@@ -21,7 +21,7 @@ from rover_lib.workshop.recordings.samples import pick_evenly
 Extremes = Mapping[str, Tensor]
 Frame = tuple[str, int]  # episode, row
 ODD = 10.0  # times the median frame's largest value; frames of policies that keep their gates with min-max stay below
-ODD_FRAMES = 8  # at most this many odd frames take part in choosing, beside those among the usual choosing frames
+ODD_FRAMES = 8  # at most this many odd frames of the calibration take part in choosing
 
 
 def oddness(extremes: Extremes) -> dict[str, Tensor]:

@@ -36,9 +36,9 @@ from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
-# Where calibration met odd frames, so many others tell how many of them are odd: training, and what it measured, knows
-# the frames that calibrate, and on others of the same car a policy met up to five times as many odd ones.
-SHARE_FRAMES = 64
+# Odd frames need more: their errors are far apart, and on 16, ranges were chosen that were half as bad again
+# on others. They also tell what share is odd: of the frames that calibrate, which training knows, it is a quarter.
+ODD_CHOOSING_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,8 @@ def prepare_chooser(
     """A chooser on this many frames that calibration has not seen, and on some of the odd ones that it met."""
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    frames_of_others = parts.choosing or parts.calibration
-    few, more = pick_evenly(frames_of_others, frames), pick_evenly(frames_of_others, SHARE_FRAMES)
-    return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd, more)
+    few = pick_evenly(parts.choosing or parts.calibration, ODD_CHOOSING_FRAMES if odd else frames)
+    return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
 def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
