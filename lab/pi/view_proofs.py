@@ -15,7 +15,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from balloon_world.simulated_arduino import PinEvent
 from lab.driving.page import Page
@@ -23,6 +23,7 @@ from lab.driving.pins import STOPPED_THROTTLE_US
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.pulses import READ_S, Pins, stopped
+from lab.pi.report import Row
 from lab.pi.service_proofs import READY_S, STATE, VENV, arm, show
 from rover_lib.onboard.drive.feed import DRIVING, WAITING
 from rover_lib.onboard.drive.service import UNIT
@@ -38,15 +39,6 @@ ATTEMPTS = 3  # how often a drive is tried if this machine was too busy; if it w
 BUSY = ("the Arduino has not answered for", "the newest plan is too old to drive by")
 LOOPBACK = "0100007F"  # 127.0.0.1, as the kernel writes it
 LISTENS = "0A"
-
-
-class Row(NamedTuple):
-    """What was wanted of the view, what was found, and whether the wanted holds."""
-
-    row: str
-    wanted: str
-    found: Any
-    holds: bool
 
 
 def view_beside_a_drive(pi: Container, pins: Pins, port: int, stop_s: float) -> list[Row]:
