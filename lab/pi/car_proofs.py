@@ -96,7 +96,7 @@ def offer_camera(pi: Container) -> None:
 
 
 def camera_rows(pi: Container, pins: Pins) -> list[Row]:
-    """Return the rows about what provisioning installs for a Pi camera, and a drive whose camera's program is killed."""
+    """Return the rows about what provisioning installs for a Pi camera, and a drive whose rpicam-vid is killed."""
     package = pi.inside("dpkg-query", "--show", "--showformat=${Status}", PACKAGE, check=False).stdout
     told = show(pi, "DeviceAllow", "SupplementaryGroups", "ExecStart")
     found = [package, *re.findall(r"char-\w+ r\w*", told["DeviceAllow"]), *told["SupplementaryGroups"].split()]
@@ -172,7 +172,7 @@ def describe_gamepad(sys: Path) -> None:
 
 
 def _devices(pi: Container) -> Row:
-    """Return the row about what the unit lets the service open. Whoever may open NODE is told that there is no device."""
+    """Return the row about what the unit lets the service open. Who may open NODE is told that there is no device."""
     unit = unit_for((pi.root / "etc/systemd/system" / UNIT).read_text(), f"/bin/sh -c {shlex.quote(LOOK)}")
     units = {
         "No such device": unit,
