@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lab.pi.deployment_bench import (
     STATE,
@@ -47,7 +47,6 @@ ROOM = 4 << 20  # bytes free on a full disk
 TRIES = 2  # how often a row is tried if its moment was missed
 WORKERS = 2  # how many rovers are broken at the same time; each keeps a core busy
 RETRY_S = 30  # how long Ansible tries to reach a rover that does not answer
-NOBODY = 9  # a port on which no sshd listens
 
 Say = Callable[[str], None]
 
@@ -159,15 +158,6 @@ def _two_at_once(bench: DeploymentBench) -> None:
         second[0].result()
 
 
-def _wrong_clock(years: int) -> Callable[[DeploymentBench], dict[str, str]]:
-    def inject(bench: DeploymentBench) -> dict[str, str]:
-        bench.set_clock(years)
-        bench.deploy()
-        return {"date": bench.pi.inside("date", "+%Y").stdout.strip()}
-
-    return inject
-
-
 def _tamper_in_use(bench: DeploymentBench) -> dict[str, Any]:
     flip(bench.releases.policy)
     shown, wrong = bench.status(bench.healthy())
@@ -180,24 +170,6 @@ def _roll_back(bench: DeploymentBench) -> None:
     bench.outputs.append(play.output)
     if play.ok:
         raise EmulationError(f"{bench.pi.name}: rolled back to nothing")
-
-
-class Nobody(NamedTuple):
-    """A line of the inventory for a rover that does not exist."""
-
-    name: str
-    key: Path
-    port: int = NOBODY
-
-
-def _nobody_there(bench: DeploymentBench) -> dict[str, Any]:
-    nobody = Nobody("nobody", bench.pi.key)
-    play = bench.deploy(others=[nobody])
-    table = bench.play("status", others=[nobody]).output
-    if f"{bench.pi.name}: deployed" not in play.output or play.code == 0 or "does not answer" not in table:
-        what = f"{bench.pi.name} was not deployed to or reported, because nobody is not there"
-        raise EmulationError(f"{what}: {play.end}")
-    return {"status_of_nobody": "does not answer"}
 
 
 # The table
@@ -276,10 +248,6 @@ FAULTS = [
                     "health check fails, and the next deployment replaces it"),
     DeploymentFault("rollback with nothing to roll back to", _roll_back, "there is no release to roll back to",
                     "rollback.yml on a rover with one release, then deploy.yml", fresh=True),
-    *(DeploymentFault(f"clock wrong by {years:+d} years", _wrong_clock(years), ": deployed",
-                      "libfaketime is loaded into all that systemd and sshd start") for years in (-20, 20)),
-    DeploymentFault("a host in the inventory that does not exist", _nobody_there, r"nobody: unreachable",
-                    "after this one, which gets its model"),
 ]  # fmt: skip
 
 
@@ -304,7 +272,7 @@ def break_deployments(
     with rovers([f"breaks{i + 1}" for i in range(WORKERS)], layers, artifacts) as benches:
 
         def work(bench: DeploymentBench) -> None:
-            give_first_model([bench])
+            give_first_model(bench)
             while waiting and not bench.stop.is_set():
                 fault = waiting.pop(0)
                 row = _row(fault, bench)
