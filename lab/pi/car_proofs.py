@@ -20,6 +20,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from balloon_world.simulated_arduino import PinEvent
@@ -60,6 +61,7 @@ def ioctl(fd, request, given):
         given[1:3] = array.array("i", [-{FULL}, {FULL}])
 gamepad.fcntl = types.SimpleNamespace(ioctl=ioctl)
 """
+DEVICES = "/sys/fs/cgroup/devices"  # of cgroup v1: systemd-nspawn mounts it read-only, so that all devices are allowed
 PLUG = f"""mkdir -p /dev/input /run/systemd/system/{UNIT}.d
 mknod -m 660 {NODE} c 13 73
 ln -s {BENCH}/pad /dev/input/event0
@@ -68,7 +70,8 @@ chmod 660 {BENCH}/pad {BENCH}/motion
 chown root:input {NODE} {BENCH}/pad {BENCH}/motion
 mount --bind {BENCH}/sys /sys/class/input
 printf '[Service]\\nEnvironment=PYTHONPATH={BENCH} ROVER_CAR={BENCH}/car.yml\\n' > /run/systemd/system/{UNIT}.d/car.conf
-systemctl daemon-reload
+! [ -e {DEVICES} ] || mount -o remount,bind,rw {DEVICES}
+systemctl daemon-reexec
 """
 
 
@@ -105,7 +108,7 @@ def camera_rows(pi: Container, pins: Pins) -> list[Row]:
     rows = [Row("rover_camera=csi, installed", ", ".join(wanted), found, set(wanted) <= set(found))]
     with _driving(pi, pins) as armed_s:
         camera = pi.pid_of(int(pi.inside("pgrep", "--newest", "--full", "stand_in.py").stdout))
-        kill = lambda: os.kill(camera, signal.SIGKILL)  # noqa: E731
+        kill = partial(os.kill, camera, signal.SIGKILL)
         return [*rows, _stops(pi, pins, armed_s, "stand-in for rpicam-vid killed", "rpicam-vid has ended", kill)]
 
 
@@ -156,19 +159,14 @@ def neutral_row(before: Sequence[PinEvent], events: Sequence[PinEvent], at_s: fl
 
 def describe_gamepad(sys: Path) -> None:
     """Make a folder that says of a VirtualGamepad, as event0 and event1, what sysfs says of a gamepad."""
-    for event, axes, keys, properties in (
-        ("event0", 1 << STEERING | 1 << THROTTLE, 1 << BTN_L1, 0),
-        ("event1", 0, 0, SENSORS),
-    ):
+    pad = f"{1 << STEERING | 1 << THROTTLE:x}", f"{1 << BTN_L1 % 64:x} 0 0 0 0", "0"
+    for event, about in {"event0": pad, "event1": ("0", "0", f"{SENSORS:x}")}.items():
         device = sys / event / "device"
         (device / "capabilities").mkdir(parents=True)
-        (device / "name").write_text("stand-in\n")
-        (device / "capabilities/abs").write_text(f"{axes:x}\n")
-        (device / "capabilities/key").write_text(
-            " ".join(f"{keys >> 64 * i & (1 << 64) - 1:x}" for i in (4, 3, 2, 1, 0))
-        )
-        (device / "properties").write_text(f"{properties:x}\n")
         (device / "device").symlink_to("../..")
+        names = "capabilities/abs", "capabilities/key", "properties", "name"
+        for name, text in zip(names, (*about, "stand-in"), strict=True):
+            (device / name).write_text(text)
 
 
 def _devices(pi: Container) -> Row:
