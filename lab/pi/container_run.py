@@ -334,11 +334,9 @@ class _Run:
         with self.report.step("the view"):
             installed = environment(pi.root, self.engine)
             needs, unhashed = installed["of_view"], installed["unhashed"]
-            self.report.rows(
-                "view", [Row("what the view needs", "all by hash", unhashed or needs, bool(needs) and not unhashed)]
-            )
+            installed_row = Row("what the view needs", "all by hash", unhashed or needs, bool(needs) and not unhashed)
             port, stop_s = self.variables["rover_view_port"], self.report.gates["view_stop_s"]
-            self.report.rows("view", view_beside_a_drive(pi, pins, port, stop_s))
+            self.report.rows("view", [installed_row, *view_beside_a_drive(pi, pins, port, stop_s)])
 
     def no_view(self, pi: Container) -> None:
         """Provision without the view again, and prove that it is gone."""

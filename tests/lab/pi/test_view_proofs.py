@@ -17,12 +17,10 @@ class StandIn:
 
     def __init__(self, root: Path, state: str = "loaded"):
         self.name, self.root, self.state = "rover1", root, state
-        self.asked: list[tuple] = []
         (root / "etc/rover").mkdir(parents=True)
         (root / "etc/passwd").write_text("root:x:0:0:root:/root:/bin/sh\n")
 
     def inside(self, *command: object, check: bool = True) -> SimpleNamespace:
-        self.asked.append(command)
         found = self.state if VIEW_UNIT in command else "loaded"
         names = next((str(c).partition("=")[2] for c in command if str(c).startswith("--property=")), "")
         values = {"LoadState": found, "ActiveState": "active", "NRestarts": "0", "UnitFileState": "enabled"}
