@@ -47,18 +47,21 @@ def test_the_package_has_what_apt_wants(tmp_path):
     assert "--metadata-format" in subprocess.run(alone, capture_output=True, text=True, check=True).stdout
 
 
+CUT, LINE = PinEvent(1.0, "reset", "", 0, 0), PinEvent(1.7, "line", "", 0, 0)
+
+
 def pulses(at_s: float, **us: float) -> list[PinEvent]:
     return [PinEvent(at_s, "pulse", pin, each, 1016.0) for pin, each in us.items()]
 
 
 @pytest.mark.parametrize("before, events, holds", [
-    ([], pulses(1.8, **NEUTRAL_US), True),
-    (pulses(0.5, **NEUTRAL_US), pulses(1.8, **NEUTRAL_US), False),
-    ([], [*pulses(1.8, **NEUTRAL_US), PinEvent(1.7, "line", "", 0, 0)], False),
-    ([], pulses(1.8, throttle=NEUTRAL_US["throttle"]), False),
-    ([], pulses(1.8, steering=1500, throttle=NEUTRAL_US["throttle"]), False),
+    ([], [*pulses(0.9, throttle=209), CUT, *pulses(1.8, **NEUTRAL_US)], True),
+    (pulses(0.5, **NEUTRAL_US), [CUT, *pulses(1.8, **NEUTRAL_US)], False),
+    ([], [CUT, LINE, *pulses(1.8, **NEUTRAL_US)], False),
+    ([], [CUT, *pulses(1.8, throttle=NEUTRAL_US["throttle"])], False),
+    ([], [CUT, *pulses(1.8, steering=1500, throttle=NEUTRAL_US["throttle"])], False),
+    ([], pulses(1.8, **NEUTRAL_US), False),
 ])  # fmt: skip
-def test_neutral_counts_only_if_nobody_has_told_it(before, events, holds):
-    row = car_proofs.neutral_row(before, events, 1.0)
-    assert row.holds == holds and row.found["lines"] == (len(events) > 2)
-    assert row.found["after_ms"].get("throttle") == 800
+def test_neutral_counts_only_from_power_on_and_untold(before, events, holds):
+    row = car_proofs.neutral_row(before, events)
+    assert row.holds == holds and row.found["from_ms"] == [800] * len(row.found["from_ms"])
