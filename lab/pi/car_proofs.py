@@ -38,18 +38,13 @@ from rover_lib.onboard.drive.service import UNIT, WAITING
 from rover_lib.workshop.run_program import run
 
 PACKAGE = "rpicam-apps-lite"  # of Raspberry Pi OS, which Debian lacks
-CONTROL = f"""Package: {PACKAGE}
-Version: 0~stand-in
-Architecture: all
-Maintainer: rover
-Description: stand-in for rpicam-vid
-"""
+CONTROL = f"Package: {PACKAGE}\nVersion: 0~stand-in\nArchitecture: all\nMaintainer: rover\nDescription: stand-in\n"
 VARIABLES = {"rover_camera": "csi", "rover_gamepad": True}  # what provisioning needs for all rows
 STOPPED_MS = 200.0  # from what ends a drive to throttle off
 AT_SPEED_S = 1.0
 ATTEMPTS = 3  # how often a drive is tried if it ends by itself, because this machine is too busy for it
 SIDE_S, GESTURE_S = 0.4, 60.0
-POWER_ON_S = 3.0  # the boot loader takes up to 2 s of it
+POWER_ON_S = 3.0  # how long the pins are watched; the emulated Arduino has no boot loader then
 GAMEPAD_CAR = Path(__file__).parents[1] / "cars" / "gamepad.yml"
 NODE = "/dev/input/event9"  # as evdev names and numbers them; nobody has plugged this one in
 LOOK = f'echo "PROBED $(head -c1 {NODE} 2>&1)"'
@@ -65,8 +60,7 @@ gamepad.fcntl = types.SimpleNamespace(ioctl=ioctl)
 DEVICES = "/sys/fs/cgroup/devices"  # of cgroup v1: systemd-nspawn mounts it read-only, so that all devices are allowed
 PLUG = f"""mkdir -p /dev/input /run/systemd/system/{UNIT}.d
 mknod -m 660 {NODE} c 13 73
-ln -s {BENCH}/pad /dev/input/event0
-ln -s {BENCH}/motion /dev/input/event1
+ln -s {BENCH}/pad /dev/input/event0; ln -s {BENCH}/motion /dev/input/event1
 chmod 660 {BENCH}/pad {BENCH}/motion
 chown root:input {NODE} {BENCH}/pad {BENCH}/motion
 mount --bind {BENCH}/sys /sys/class/input
@@ -207,10 +201,10 @@ def _driving(pi: Container, pins: Pins, pad: VirtualGamepad | None = None) -> It
 
     pad: whoever holds it makes the gesture; without one, the Arduino's human does.
     """
-    pi.inside("systemctl", "reset-failed", UNIT, check=False)
-    pi.inside("systemctl", "start", UNIT)
     try:
         for left in reversed(range(ATTEMPTS)):
+            pi.inside("systemctl", "reset-failed", UNIT, check=False)
+            pi.inside("systemctl", "restart", UNIT)
             if pad:
                 wait_for(partial(_gesture, pi, pad), GESTURE_S)
             with contextlib.ExitStack() if left == 0 else contextlib.suppress(EmulationError):

@@ -22,7 +22,7 @@ print(gamepad.open_gamepad(lambda: gamepad.list_gamepads(Path("dev"), Path("sys"
 
 def test_fifos_pass_for_the_kernels_gamepad(tmp_path):
     (tmp_path / "dev").mkdir()
-    with VirtualGamepad(tmp_path) as pad:
+    with VirtualGamepad(tmp_path):
         car_proofs.describe_gamepad(tmp_path / "sys")
         for fifo, event in (("pad", "event0"), ("motion", "event1")):
             (tmp_path / "dev" / event).symlink_to(tmp_path / fifo)
@@ -31,13 +31,11 @@ def test_fifos_pass_for_the_kernels_gamepad(tmp_path):
         run = partial(subprocess.run, cwd=tmp_path, capture_output=True, text=True)
         assert "Inappropriate ioctl" in run([sys.executable, "-c", OPENS]).stderr
         assert run([sys.executable, "-c", car_proofs.ANSWERS + OPENS]).stdout == "True\n"
-        pad.unplug()
 
 
 def test_the_package_has_what_apt_wants(tmp_path):
-    pi = SimpleNamespace(bench=tmp_path, root=tmp_path)
     (tmp_path / "etc/apt/sources.list.d").mkdir(parents=True)
-    car_proofs.offer_camera(pi)
+    car_proofs.offer_camera(SimpleNamespace(bench=tmp_path, root=tmp_path))
     about = dict(line.split(": ") for line in (tmp_path / "debs/Packages").read_text().splitlines())
     deb = tmp_path / "debs" / about["Filename"]
     assert int(about["Size"]) == deb.stat().st_size
@@ -59,7 +57,6 @@ def pulses(at_s: float, **us: float) -> list[PinEvent]:
     (pulses(0.5, **NEUTRAL_US), [CUT, *pulses(1.8, **NEUTRAL_US)], False),
     ([], [CUT, LINE, *pulses(1.8, **NEUTRAL_US)], False),
     ([], [CUT, *pulses(1.8, throttle=NEUTRAL_US["throttle"])], False),
-    ([], [CUT, *pulses(1.8, steering=1500, throttle=NEUTRAL_US["throttle"])], False),
     ([], pulses(1.8, **NEUTRAL_US), False),
 ])  # fmt: skip
 def test_neutral_counts_only_from_power_on_and_untold(before, events, holds):
