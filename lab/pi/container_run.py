@@ -4,7 +4,7 @@
 
 It goes from a flashed card to a driving service: provision, twice and in check mode; deploy, status, benchmark, drive,
 a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, and what systemd
-does if a loop hangs, if the camera is gone, and at boot. The Pi is a container (container.py); its Arduino is the real
+does if a loop hangs, if the camera is gone, and at boot; at last, a Pi camera and a gamepad (car_proofs.py). The Pi is a container (container.py); its Arduino is the real
 firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come from the network by this machine's
 own settings, as they would for a newcomer. Provisioning without internet is tested in the whole machine (`make pi`).
 
@@ -93,7 +93,7 @@ def run_container(
     """Run everything, and write the report to `output` whatever fails.
 
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
-    provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
+    provision, deploy, one fault of a deployment and armed drives, as CI has no more time. view: with `short`, include
     the view's service, which other runs always include. faults: include the faults of deployments, which
     run only with torch. pieces: only provision, cut off after each of so many tasks. say: called with a line for
     each step.
