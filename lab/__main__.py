@@ -312,7 +312,7 @@ def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
 @click.argument("output", type=FILE, default="runs/pi-fast.json")
 @click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
 @click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", help="Of the Pi.")
-@click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, drive three times.")
+@click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, and drive.")
 @click.option("--view", is_flag=True, help="With --short: the view's service beside a drive too.")
 @click.option(
     "--faults/--no-faults",

@@ -3,10 +3,11 @@
     report = run_container("runs/pi-fast.json", "runs/demo")
 
 It goes from a flashed card to a driving service: provision, twice and in check mode; deploy, status, benchmark, drive,
-a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, and what systemd
-does if a loop hangs, if the camera is gone, and at boot; at last, a Pi camera and a gamepad (car_proofs.py). The Pi is a container (container.py); its Arduino is the real
-firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come from the network by this machine's
-own settings, as they would for a newcomer. Provisioning without internet is tested in the whole machine (`make pi`).
+a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, what systemd does
+if a loop hangs, if the camera is gone, and at boot, and how a Pi camera and a gamepad end a drive. The Pi is a
+container (container.py); its Arduino is the real firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's
+packages come from the network by this machine's own settings, as they would for a newcomer. Provisioning without
+internet is tested in the whole machine (`make pi`).
 
 Times of the emulated programs say nothing about a Pi: they are some ten times slower. systemd and the Arduino take
 their real time. An INT8 plan takes half a second here, which is too long to drive by. So the small policy of the fault
