@@ -3,8 +3,10 @@
 from typing import Any
 
 
-def shorten(value: Any) -> Any:
-    """The same with four digits of each number: nobody reads more."""
+def shorten(value: Any, digits: int = 4) -> Any:
+    """The same with so many digits of each number: nobody reads more."""
     if isinstance(value, dict):
-        return {key: shorten(each) for key, each in value.items()}
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+        return {key: shorten(each, digits) for key, each in value.items()}
+    if isinstance(value, list):
+        return [shorten(each, digits) for each in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value

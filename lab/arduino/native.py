@@ -9,6 +9,7 @@ import ctypes
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
 from rover_lib.onboard.car.car import Car
@@ -22,92 +23,40 @@ WIGGLE_US = (1750, 1750, 1750, 1150, 1150, 1150)  # the stick's pulses, 21 ms ap
 LET_GO_MS = 1050  # a little longer than the firmware wants the stick to rest after a wiggle
 
 
-class Command(ctypes.Structure):
-    """As in protocol.h."""
-
-    _fields_ = (
-        ("kind", ctypes.c_char),
-        *(
-            (name, ctypes.c_uint32)
-            for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "asked_ms", "car")
-        ),
-        ("numbers", ctypes.c_uint16 * 9),
-    )
+TYPES: dict[str, Any] = {
+    **{"char": ctypes.c_char, "bool": ctypes.c_bool},
+    **{"u8": ctypes.c_uint8, "u16": ctypes.c_uint16, "u32": ctypes.c_uint32},
+}
 
 
-class Reader(ctypes.Structure):
-    """As in protocol.h."""
-
-    _fields_ = (
-        ("line", ctypes.c_char * 87),
-        ("length", ctypes.c_uint8),
-        ("noise", ctypes.c_bool),
-        ("started_ms", ctypes.c_uint32),
-    )
-
-
-class Line(ctypes.Structure):
-    """As in protocol.h."""
-
-    _fields_ = (("text", ctypes.c_char * 128), ("length", ctypes.c_uint8))
+def _struct(name: str, members: str) -> type[ctypes.Structure]:
+    """Make a C struct of the firmware's, and a type of that name. members: such as 'u8 a b; u16 c[2]; bool d'."""
+    fields = []
+    for kind, *names in (member.split() for member in members.split(";")):
+        for field, _, n in (each.rstrip("]").partition("[") for each in names):
+            fields.append((field, TYPES[kind] * int(n) if n else TYPES[kind]))
+    TYPES[name] = type(name, (ctypes.Structure,), {"_fields_": fields})
+    return TYPES[name]
 
 
-class CarNumbers(ctypes.Structure):
-    """As `struct car` in vehicle.h."""
-
-    _fields_ = (("numbers", ctypes.c_uint16 * 9),)
-
-
-class Received(ctypes.Structure):
-    """As in vehicle.h."""
-
-    _fields_ = (
-        ("pulse_us", ctypes.c_uint16),
-        ("period_us", ctypes.c_uint16),
-        ("at_ms", ctypes.c_uint32 * 8),
-        ("oldest", ctypes.c_uint8),
-        ("seen", ctypes.c_uint8),
-        ("present", ctypes.c_bool),
-    )
-
-
-class Moment(ctypes.Structure):
-    """As in vehicle.h."""
-
-    _fields_ = (("seen", ctypes.c_bool), ("at_ms", ctypes.c_uint32))
-
-
-class Vehicle(ctypes.Structure):
-    """As in vehicle.h."""
-
-    _fields_ = (
-        *((name, ctypes.c_char) for name in ("state", "reason", "result")),
-        ("car", CarNumbers),
-        ("car_id", ctypes.c_uint32),
-        ("car_told", ctypes.c_bool),
-        ("boot", ctypes.c_uint16),
-        ("sequence", ctypes.c_uint32),
-        ("steering_us", ctypes.c_uint16),
-        ("throttle_us", ctypes.c_uint16),
-        ("received", Received * 2),
-        ("wiggle", Moment * 3),
-        ("still_us", ctypes.c_uint16),
-        ("still_ms", ctypes.c_uint32),
-        ("throttle_off_rest", ctypes.c_uint8),
-        ("throttle_free", ctypes.c_bool),
-        ("rest_us", ctypes.c_uint16 * 2),
-        ("throttle_moved", ctypes.c_uint8),
-        ("cap_us", ctypes.c_uint16),
-        ("lowered_us", ctypes.c_uint16),
-        ("wanted_us", ctypes.c_uint16 * 2),
-        ("commanded_ms", ctypes.c_uint32),
-        ("slewed_ms", ctypes.c_uint32),
-        ("driven_ms", ctypes.c_uint32),
-        ("paused_ms", ctypes.c_uint32),
-        ("wary", ctypes.c_bool),
-        ("sticks_ms", ctypes.c_uint32),
-        *((name, ctypes.c_uint16) for name in ("bad_lines", "old_commands", "out_of_range", "lost_bytes")),
-    )
+# As in protocol.h
+Command = _struct(
+    "Command", "char kind; u32 boot sequence heard_ms steering_us throttle_us asked_ms car; u16 numbers[9]"
+)
+Reader = _struct("Reader", "char line[87]; u8 length; bool noise; u32 started_ms")
+Line = _struct("Line", "char text[128]; u8 length")
+# As in vehicle.h
+CarNumbers = _struct("CarNumbers", "u16 numbers[9]")
+Received = _struct("Received", "u16 pulse_us period_us; u32 at_ms[8]; u8 oldest seen; bool present")
+Moment = _struct("Moment", "bool seen; u32 at_ms")
+Vehicle = _struct(
+    "Vehicle",
+    "char state reason result; CarNumbers car; u32 car_id; bool car_told; u16 boot; u32 sequence;"
+    "u16 steering_us throttle_us; Received received[2]; Moment wiggle[3]; u16 still_us; u32 still_ms;"
+    "u8 throttle_off_rest; bool throttle_free; u16 rest_us[2]; u8 throttle_moved; u16 cap_us lowered_us wanted_us[2];"
+    "u32 commanded_ms slewed_ms driven_ms paused_ms; bool wary; u32 sticks_ms;"
+    "u16 bad_lines old_commands out_of_range lost_bytes",
+)
 
 
 @functools.cache

@@ -3,53 +3,36 @@
 It is not libcamera, and proves nothing about a camera. It takes only options that rpicam-apps' core/options.cpp and
 core/video_options.hpp have, and writes what output/output.cpp does. ROVER_CSI names the JPEGs. ROVER_CSI_FAULT is for
 tests: `silent` gives nothing, `cut N` ends the Nth JPEG half way, `gone` finds no camera, `freeze N` and `die N` do so
-after N.
+after N. An emulated Pi runs this file alone, so it needs nothing else.
 """
 
 import argparse
 import os
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from rover_lib.onboard.car.camera import _fifo
-from rover_lib.onboard.car.csi import PROGRAM
-
-OPTIONS = (
-    "camera",
-    "width",
-    "height",
-    "framerate",
-    "timeout",
-    "codec",
-    "quality",
-    "output",
-    "verbose",
-    "metadata",
-    "metadata-format",
-    "shutter",
-    "gain",
-    "ev",
-    "exposure",
-    "awb",
-    "rotation",
-)
+PROGRAM = "rpicam-vid"
+OPTIONS = ["camera", "width", "height", "framerate", "timeout", "codec", "quality", "output", "verbose", "metadata"]
+OPTIONS += ["metadata-format", "shutter", "gain", "ev", "exposure", "awb", "rotation"]
 
 
 def install(folder: Path) -> Path:
     """Make a program of this module in a folder, for PATH, and return the folder."""
     program = folder / PROGRAM
-    paths = f"import sys; sys.path[:0] = {[p for p in sys.path if p]!r}"
-    program.write_text(f"#!{sys.executable}\n{paths}\nfrom {__name__} import main; main()\n")
+    program.write_text(f"#!{sys.executable}\n{Path(__file__).read_text()}")
     program.chmod(0o755)
     return folder
 
 
 def _pictures(source: Path, rate_hz: float) -> Iterator[bytes]:
     if source.is_fifo():
-        yield from (jpeg for jpeg, _ in _fifo(source, threading.Event()) if isinstance(jpeg, bytes))
+        pending = b""
+        with source.open("rb", buffering=0) as fifo:
+            while data := fifo.read(1 << 20):
+                *whole, pending = (pending + data).split(b"\xff\xd9")
+                yield from (jpeg + b"\xff\xd9" for jpeg in whole)
         return
     while True:
         for path in sorted(source.glob("*.jpg")):
@@ -80,3 +63,7 @@ def main() -> None:
             sys.stdout.buffer.flush()
             entries.write(f"ExposureTime={o.shutter or 9000}\nSensorTimestamp={stamp_ns}\nDigitalGain=1.000000\n\n")
             entries.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -17,7 +17,7 @@ from rover_lib.onboard.car.servo_link import State, Telemetry
 
 FULL = 32767
 EVERY_S = 0.004  # between two reports of its motion sensors
-WIGGLE = (0.6, -0.6, 0.0)  # of the steering stick, each for 0.15 s; then it must rest for a second
+WIGGLE = (0.6, -0.6, 0.0)  # of the steering stick; then it must rest for a second
 
 
 class VirtualGamepad:
@@ -71,11 +71,11 @@ class VirtualGamepad:
         self.send(ABS, STEERING, round(steering * FULL))
         self.send(ABS, THROTTLE, round(-throttle * FULL))
 
-    def wiggle(self) -> None:
-        """Make the gesture before arming, and wait until it counts."""
+    def wiggle(self, side_s: float = 0.15) -> None:
+        """Make the gesture before arming, for so long at each side, and wait until it counts."""
         for steering in WIGGLE:
             self.move(steering, 0)
-            time.sleep(0.15)
+            time.sleep(side_s)
         time.sleep(1.1)
 
     def send(self, kind: int, code: int, value: int, age_s: float = 0.0) -> None:

@@ -3,10 +3,11 @@
     report = run_container("runs/pi-fast.json", "runs/demo")
 
 It goes from a flashed card to a driving service: provision, twice and in check mode; deploy, status, benchmark, drive,
-a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, and what systemd
-does if a loop hangs, if the camera is gone, and at boot. The Pi is a container (container.py); its Arduino is the real
-firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come from the network by this machine's
-own settings, as they would for a newcomer. Provisioning without internet is tested in the whole machine (`make pi`).
+a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, what systemd does
+if a loop hangs, if the camera is gone, and at boot, and how a Pi camera and a gamepad end a drive. The Pi is a
+container (container.py); its Arduino is the real firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's
+packages come from the network by this machine's own settings, as they would for a newcomer. Provisioning without
+internet is tested in the whole machine (`make pi`).
 
 Times of the emulated programs say nothing about a Pi: they are some ten times slower. systemd and the Arduino take
 their real time. An INT8 plan takes half a second here, which is too long to drive by. So the small policy of the fault
@@ -23,7 +24,7 @@ runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     sandbox        {exposure, writable, probes: [{probe, inside, outside}]}; inside: "" means that it worked
     service        {hang: {...}, start_limit: {...}, boot: {...}}, in seconds, see the functions of those names
     drive          {ticks, driven, ended} of the fetched flight log; recorded: {episodes, left, frames, commands}
-    view           [{row, wanted, found, holds}], see view_proofs.py
+    view, car      [{row, wanted, found, holds}], see view_proofs.py and car_proofs.py
     pieces         {cut_after, changed_after, undone, stale} of provisioning that is cut off, see cut_plays.py
     faults         [{fault, model_after, healthy, healed_by_rerun, ...}], see deployment_faults.py
     gates          [{gate, wanted, found, holds}], the limits from lab/params.yml
@@ -47,6 +48,7 @@ from lab.arduino.emulator import NICE as ARDUINO_NICE
 from lab.arduino.emulator import EmulatedArduino
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
+from lab.pi.car_proofs import VARIABLES, camera_rows, gamepad_rows, offer_camera
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.cut_plays import provision_in_pieces
 from lab.pi.debian_image import debian_image
@@ -55,9 +57,9 @@ from lab.pi.deployment_faults import break_deployments, row_of, wrong_rows
 from lab.pi.emulation import EmulationError, emulation, free_port, interruptible, require, require_arduino, wait_for
 from lab.pi.playbooks import Play
 from lab.pi.pulses import Pins, moving
-from lab.pi.report import PiReport
+from lab.pi.report import PiReport, Row
 from lab.pi.service_proofs import READY_S, STATE, VENV, environment, hang, sandbox, show, start_limit
-from lab.pi.view_proofs import Row, view_again, view_beside_a_drive, view_gone
+from lab.pi.view_proofs import view_again, view_beside_a_drive, view_gone
 from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.drive.flight_log import read_log
@@ -92,7 +94,7 @@ def run_container(
     """Run everything, and write the report to `output` whatever fails.
 
     demo: a run's folder with ARTIFACTS. engine: what computes the policy on the Pi, as in rover_engine. short: only
-    provision, deploy, one fault of a deployment and an armed drive, as CI has no more time. view: with `short`, include
+    provision, deploy, one fault of a deployment and armed drives, as CI has no more time. view: with `short`, include
     the view's service, which other runs always include. faults: include the faults of deployments, which
     run only with torch. pieces: only provision, cut off after each of so many tasks. say: called with a line for
     each step.
@@ -149,15 +151,17 @@ class _Run:
         if pieces:
             return self.cut_off(pieces)
         with Container(ROVER, nice=NICE) as pi:
+            offer_camera(pi)
             with self.report.step("boot"):
                 pi.boot()
             with _car(pi) as pins:
                 if short:
-                    self.variables["rover_view"] = view
+                    self.variables |= {**VARIABLES, "rover_view": view}
                     self.one_fault(pi, static)
                     if view:
                         self.view(pi, pins)
                         self.no_view(pi)
+                    self.car(pi, pins)
                     return self.environment(pi)
                 driving_s = self.playbooks(pi, static, other)
                 self.metrics["driving_after_s"] = round(driving_s - begun, 1)
@@ -309,8 +313,10 @@ class _Run:
         self.view(pi, pins)
         self.boot(pi, pins)
         with self.report.step("the view again"):
-            self.rows(view_again(pi, self.variables["rover_view_port"]))
+            self.report.rows("view", view_again(pi, self.variables["rover_view_port"]))
+        self.variables |= VARIABLES
         self.no_view(pi)
+        self.car(pi, pins)
 
     def environment(self, pi: Container) -> None:
         """Check what is installed, without the view."""
@@ -329,22 +335,23 @@ class _Run:
         with self.report.step("the view"):
             installed = environment(pi.root, self.engine)
             needs, unhashed = installed["of_view"], installed["unhashed"]
-            self.rows([Row("what the view needs", "all by hash", unhashed or needs, bool(needs) and not unhashed)])
+            installed_row = Row("what the view needs", "all by hash", unhashed or needs, bool(needs) and not unhashed)
             port, stop_s = self.variables["rover_view_port"], self.report.gates["view_stop_s"]
-            self.rows(view_beside_a_drive(pi, pins, port, stop_s))
+            self.report.rows("view", [installed_row, *view_beside_a_drive(pi, pins, port, stop_s)])
 
     def no_view(self, pi: Container) -> None:
         """Provision without the view again, and prove that it is gone."""
         self.variables["rover_view"] = False
         self.play("provision", pi, "provision, without the view")
         with self.report.step("no view"):
-            self.rows(view_gone(pi, self.variables["rover_view_port"]))
+            self.report.rows("view", view_gone(pi, self.variables["rover_view_port"]))
 
-    def rows(self, rows: list[Row]) -> None:
-        """Make a gate of each row, and add them all to the report's `view`."""
-        for row in rows:
-            self.metrics.setdefault("view", []).append(row._asdict())
-            self.report.gate(row.row, row.wanted, row.found, row.holds)
+    def car(self, pi: Container, pins: Pins) -> None:
+        """Prove what a Pi camera, a gamepad and a power cut of the Arduino end in."""
+        with self.report.step("camera of the Pi"):
+            self.report.rows("car", camera_rows(pi, pins))
+        with self.report.step("gamepad, and the Arduino's power"):
+            self.report.rows("car", gamepad_rows(pi))
 
     def boot(self, pi: Container, pins: Pins) -> None:
         """Prove that the service is disabled at boot by default, and that with rover_start_at_boot it starts disarmed.

@@ -21,14 +21,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lab.debian import fetch_packages, unpack_packages
 from lab.pi import playbooks
 from lab.pi.container import Container
 from lab.pi.emulation import EmulationError, wait_for
 from lab.pi.network import Network
 from lab.pi.playbooks import Play
 from rover_lib.onboard.care.release import POLICY, Releases, pack
-from rover_lib.workshop.cache import cache_folder, key_of
 
 STATE = "var/lib/rover"  # on the rover; it has models/, which has incoming/
 ROVER = "/opt/rover/venv/bin/rover"
@@ -37,7 +35,6 @@ LOOK_S = 0.001  # between looks at the disk
 PLAY_S = 1800.0
 CHECK_S = 600.0
 INTO_CHECK_S = 1.0  # how long a health check runs before something is done to it
-LIBRARY = "/usr/lib/aarch64-linux-gnu/faketime/libfaketimeMT.so.1"  # from Debian's libfaketime
 CGROUPS = Path("/sys/fs/cgroup")
 
 
@@ -253,14 +250,14 @@ class DeploymentBench:
                 if release.name != self.releases.current:
                     shutil.rmtree(release)
 
-    def play(self, book: str, *, others: Sequence[playbooks.Host] = (), name: str = "", **variables: Any) -> Play:
-        """Run a playbook on this rover, and on others after it. name: a folder of its own, as on another laptop."""
+    def play(self, book: str, *, name: str = "", **variables: Any) -> Play:
+        """Run a playbook on this rover. name: a folder of its own, as on another laptop."""
         if self.stop.is_set():
             raise EmulationError("told to stop")
         folder = self.folder / (name or "laptop")
         folder.mkdir(exist_ok=True)
         given = {"rover_packed": str(folder / "packed"), **variables}
-        return playbooks.run(book, [self.network, *others], folder=folder, variables=given, timeout_s=PLAY_S)
+        return playbooks.run(book, [self.network], folder=folder, variables=given, timeout_s=PLAY_S)
 
     def deploy(self, artifact: Path | None = None, **more: Any) -> Play:
         """Run deploy.yml with an artifact, or else with the target's; keep what it printed in `outputs`."""
@@ -302,20 +299,6 @@ class DeploymentBench:
         self.disk_then = self.disk
         if not moment(self.disk_then):
             raise Missed(f"{self.pi.name}: the power was cut a moment too late", found=vars(self.disk_then))
-
-    def set_clock(self, years: int) -> None:
-        """Set the clock by a number of years, until the row is over: libfaketime shifts it in new aarch64 programs.
-
-        The monotonic clock of what systemd starts does not change, just as when a real clock is set.
-        """
-        copied = self.pi.root / LIBRARY.lstrip("/")
-        preload, settings = self.pi.root / "etc/ld.so.preload", self.pi.root / "etc/faketimerc"
-        copied.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(_faketime() / LIBRARY.lstrip("/"), copied)
-        settings.write_text(f"{years:+d}y\n")
-        preload.write_text(f"{LIBRARY}\n")
-        self.undo.callback(preload.unlink, missing_ok=True)
-        self.undo.callback(settings.unlink, missing_ok=True)
 
     def proves(self) -> bool:
         """Return whether a health check is running, by its control group, which is quicker than to ask systemctl."""
@@ -443,24 +426,9 @@ def in_parallel(task: Callable[[DeploymentBench], Any], benches: Sequence[Deploy
             raise
 
 
-def give_first_model(benches: Sequence[DeploymentBench]) -> None:
-    """Deploy a model to the rovers that have none of ours in use. Raises EmulationError if that fails."""
-    without = [bench for bench in benches if bench.mode_in_use()[0] not in bench.artifacts]
-    if not without:
-        return
-    first = without[0]
-    artifact = next(iter(first.artifacts.values()))
-    play = first.play("deploy", others=[bench.network for bench in without[1:]], rover_artifact=str(artifact))
-    if not play.ok:
-        raise EmulationError(f"{first.pi.name}: the first model cannot be deployed: {play.end}")
-
-
-def _faketime() -> Path:
-    """Return the folder of Debian's unpacked libfaketime for aarch64, from the cache or made now."""
-
-    def make(folder: Path) -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            packages = fetch_packages(Path(scratch), ["libfaketime"])
-            unpack_packages([p for p in packages if p.name.startswith("libfaketime_")], folder)
-
-    return cache_folder("pi-faketime", key_of({"library": LIBRARY}), make)
+def give_first_model(bench: DeploymentBench) -> None:
+    """Deploy a model to a rover that has none of ours in use. Raises EmulationError if that fails."""
+    if bench.mode_in_use()[0] not in bench.artifacts:
+        play = bench.play("deploy", rover_artifact=str(next(iter(bench.artifacts.values()))))
+        if not play.ok:
+            raise EmulationError(f"{bench.pi.name}: the first model cannot be deployed: {play.end}")

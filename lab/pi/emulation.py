@@ -131,11 +131,14 @@ def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
     """Make a control group, and give a function with which a process enters it before it executes its program.
 
     Without groups, the systemds of two containers would take each other's processes for their own. Afterwards the group
-    is removed, and what is left in it is killed. None of cgroup v1's controllers is used: its cpu controller admits no
-    real-time processes.
+    is removed, and what is left in it is killed. Of cgroup v1's controllers only that of devices is used, which
+    DevicePolicy= needs; its cpu controller admits no real-time processes.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
-    folders = [Path(m[1], name) for m in mounts if m[2] == "cgroup2" or (m[2] == "cgroup" and "name=" in m[3])]
+    used = {"name=systemd", "devices"}
+    folders = [
+        Path(m[1], name) for m in mounts if m[2] == "cgroup2" or (m[2] == "cgroup" and used & {*m[3].split(",")})
+    ]
     try:
         for folder in folders:
             folder.mkdir(exist_ok=True)

@@ -10,6 +10,7 @@ Its times say nothing about a Pi. The machine's clock and the Arduino's run `slo
 
 import contextlib
 import json
+import re
 import shutil
 import tempfile
 import time
@@ -268,11 +269,8 @@ class _Run:
     def journal(self) -> list[str]:
         """Return the last lines of the service's journal about something that is unplugged, missing or plugged in."""
         output = self.sudo(f"journalctl --unit={UNIT} --output=cat --no-pager --lines=60")
-        return [
-            line
-            for line in output.splitlines()
-            if "unplugged" in line or "plugged in" in line or "no such camera" in line
-        ][-4:]
+        about = re.compile("unplugged|plugged in|no such camera")
+        return [line for line in output.splitlines() if about.search(line)][-4:]
 
     def doctor(self) -> dict[str, Any]:
         """Run `rover doctor` on the rover; return whether the car would drive, and each check."""
@@ -300,13 +298,8 @@ class _Run:
         kernel, cores, features, memory, debian = output.splitlines()[:5]
         if "asimddp" not in features:
             self.wrong(f"the machine has no SDOT, which INT8 policies use: {features}")
-        return {
-            "kernel": kernel,
-            "cores": int(cores),
-            "sdot": "asimddp" in features,
-            "memory": memory.split()[1],
-            "debian": debian,
-        }
+        about = {"kernel": kernel, "cores": int(cores), "sdot": "asimddp" in features}
+        return about | {"memory": memory.split()[1], "debian": debian}
 
     def clock(self) -> float:
         """Return the host's monotonic time at which the machine's was 0, to some milliseconds of the machine's time."""

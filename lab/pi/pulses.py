@@ -109,7 +109,9 @@ def stopped(events: Sequence[PinEvent], at_s: float, slow: float = 1.0) -> dict[
     throttle = [e for e in events if e.pin == "throttle" and e.kind == "pulse"]
     steering = [e for e in events if e.pin == "steering" and e.kind == "pulse"]
     moving = [i for i, e in enumerate(throttle) if e.pulse_us > STOPPED_THROTTLE_US]
-    drove = any(at_s - slow < throttle[i].monotonic_s <= at_s for i in moving)
+    before = [e for e in throttle if e.monotonic_s <= at_s]
+    recent = [e for e in before if e.monotonic_s > at_s - slow] or before[-1:]  # if only changes are told
+    drove = any(e.pulse_us > STOPPED_THROTTLE_US for e in recent)
     off = throttle[moving[-1] + 1].monotonic_s if moving and moving[-1] + 1 < len(throttle) else None
     last_line = max((s for s in lines if off is None or s < off), default=None)
     centred = bool(steering) and abs(steering[-1].pulse_us - NEUTRAL_US["steering"]) <= STEP_US

@@ -2,13 +2,22 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lab.params import lab_params
 from rover_lib.onboard.stage import write_stage
+
+
+class Row(NamedTuple):
+    """What was wanted of something, what was found, and whether the wanted holds."""
+
+    row: str
+    wanted: str
+    found: Any
+    holds: bool
 
 
 @dataclass
@@ -49,6 +58,12 @@ class PiReport:
     def limit(self, name: str, found: float | None, most: float, unit: str) -> None:
         """Add a gate that holds if the figure is not None and at most `most`."""
         self.gate(name, f"at most {most} {unit}", found, found is not None and found <= most)
+
+    def rows(self, of: str, rows: Sequence[Row]) -> None:
+        """Make a gate of each row, and add them all to the metric `of`."""
+        for row in rows:
+            self.metrics.setdefault(of, []).append(row._asdict())
+            self.gate(row.row, row.wanted, row.found, row.holds)
 
     @contextlib.contextmanager
     def step(self, name: str) -> Iterator[dict[str, Any]]:

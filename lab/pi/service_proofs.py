@@ -153,9 +153,9 @@ def sandbox(pi: Container) -> dict[str, Any]:
         for home in homes:
             (pi.root / home.lstrip("/")).chmod(0o755)
         installed = (pi.root / "etc/systemd/system" / UNIT).read_text()
-        inside = _probe(pi, "rover-probe.service", unit_for(installed, argv))
+        inside = json.loads(probe(pi, "rover-probe.service", unit_for(installed, argv)))
         plain = ["[Service]", "Type=oneshot", "User=rover", "StateDirectory=rover-drive", f"ExecStart={escaped(argv)}"]
-        outside = _probe(pi, "rover-probe-outside.service", "\n".join(plain) + "\n")
+        outside = json.loads(probe(pi, "rover-probe-outside.service", "\n".join(plain) + "\n"))
     finally:
         for home, mode in before.items():
             (pi.root / home.lstrip("/")).chmod(mode)
@@ -197,7 +197,8 @@ def escaped(argv: str) -> str:
     return argv.replace("%", "%%").replace("$", "$$")
 
 
-def _probe(pi: Container, name: str, unit: str) -> dict[str, Any]:
+def probe(pi: Container, name: str, unit: str) -> str:
+    """Start a unit once; return what its program printed after "PROBED "."""
     (pi.root / "etc/systemd/system" / name).write_text(unit)
     try:
         pi.inside("systemctl", "daemon-reload")
@@ -206,7 +207,7 @@ def _probe(pi: Container, name: str, unit: str) -> dict[str, Any]:
         found = [line for line in journal.splitlines() if line.startswith("PROBED ")]
         if not found:
             raise EmulationError(f"{name} could not look: {started.stderr} {journal[-800:]}")
-        return json.loads(found[-1].removeprefix("PROBED "))
+        return found[-1].removeprefix("PROBED ")
     finally:
         (pi.root / "etc/systemd/system" / name).unlink()
 

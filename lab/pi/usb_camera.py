@@ -65,16 +65,10 @@ def configuration_descriptor() -> bytes:
     frame = _descriptor(0x24, 0x07, 1, 0, *size, *_words(bits, bits, MAX_FRAME, INTERVAL), 1, *_words(INTERVAL))
     formats = _descriptor(0x24, 0x06, 1, 1, 0, 1, 0, 0, 0, 0) + frame + _descriptor(0x24, 0x0D, 1, 1, 4)
     stream = _descriptor(0x24, 0x01, 1, *(14 + len(formats)).to_bytes(2, "little"), ENDPOINT, 0, 2, 0, 0, 0, 1, 0)
-    body = b"".join(
-        [
-            _descriptor(0x0B, CONTROL_INTERFACE, 2, VIDEO, 3, 0, 0),
-            _descriptor(0x04, CONTROL_INTERFACE, 0, 0, VIDEO, 1, 0, 0),
-            control + units,
-            _descriptor(0x04, STREAMING_INTERFACE, 0, 1, VIDEO, 2, 0, 0),
-            stream + formats,
-            _descriptor(0x05, ENDPOINT, BULK_TYPE, *PACKET.to_bytes(2, "little"), 0),
-        ]
-    )
+    body = _descriptor(0x0B, CONTROL_INTERFACE, 2, VIDEO, 3, 0, 0)
+    body += _descriptor(0x04, CONTROL_INTERFACE, 0, 0, VIDEO, 1, 0, 0) + control + units
+    body += _descriptor(0x04, STREAMING_INTERFACE, 0, 1, VIDEO, 2, 0, 0) + stream + formats
+    body += _descriptor(0x05, ENDPOINT, BULK_TYPE, *PACKET.to_bytes(2, "little"), 0)
     return struct.pack("<BBHBBBBB", 9, 2, 9 + len(body), 2, 1, 0, 0x80, 250) + body
 
 

@@ -2,8 +2,8 @@
 
     python -m lab.repository.publish       # what `make notebooks` does
 
-results/<run>/<stage>.json is what the run left, less paths of this machine and the hashes of every recorded frame. What
-quotes a number reads it there.
+results/<run>/<stage>.json is what the run left, less paths of this machine, the hashes of every recorded frame, and the
+digits of a number after its sixth. What quotes a number reads it there.
 """
 
 import hashlib
@@ -19,6 +19,7 @@ from typing import Any
 import nbformat
 from PIL import Image
 
+from lab.shorten import shorten
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, NotebookError
 
@@ -37,6 +38,7 @@ OF_LABORATORY = (  # in runs/, where make leaves them
     "faults.json",
     "faults-crawler.json",
     "faults-inverted.json",
+    "faults-gamepad.json",
     "random.json",
     "mutants.json",
     "kills.json",
@@ -46,6 +48,7 @@ OF_LABORATORY = (  # in runs/, where make leaves them
 IMAGE_LIMIT = 120_000  # bytes; larger pictures are committed with 256 colours
 NOTEBOOK_LIMIT = 1_000_000  # bytes, of a committed notebook
 RESULT_LIMIT = 200_000  # bytes, of a committed JSON
+DIGITS = 6  # of each number: pages, notebooks and tests read four
 MANY_INPUTS = 40  # hashes of files; more of them are summed up in one
 ABSOLUTE = re.compile(r"/(?:home|root|tmp|Users|work|var|opt|mnt)/|[A-Z]:\\\\")
 
@@ -118,7 +121,7 @@ def _result(path: Path) -> str:
     if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
         lines = "".join(f"{sha256}  {name}\n" for name, sha256 in sorted(inputs.items()))
         content["inputs"] = {f"{len(inputs)} files": hashlib.sha256(lines.encode()).hexdigest()}
-    text = json.dumps(_names_only(content), indent=1) + "\n"
+    text = json.dumps(shorten(_names_only(content), DIGITS), indent=1) + "\n"
     if (shown := ABSOLUTE.search(text)) is not None:
         around = text[max(shown.start() - 40, 0) : shown.end() + 40]
         raise NotebookError(f"{path.name}: shows a path of this machine", found=around, remedy="write names, not paths")

@@ -308,13 +308,13 @@ def test_publishing_leaves_the_json_behind_the_outputs(one_notebook, tmp_path):
     written(tmp_path / "mine", "01_load", ("work", "print(1)", [stream("1\n")]))
     inputs = {f"frame_{i:06d}.jpg": "0" * 64 for i in range(1000)}
     given = {"checkpoint": tmp_path / "mine" / "best_model.pth"}
-    write_stage(tmp_path / "mine" / "load.json", "load", params=given, metrics={"samples": 3}, inputs=inputs)
+    write_stage(tmp_path / "mine" / "load.json", "load", params=given, metrics={"mae": [1 / 3]}, inputs=inputs)
     (tmp_path / "mine" / "other.json").write_text("{}")
     _, path = publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
     assert path == tmp_path / "results" / "mine" / "load.json"
     assert [p.name for p in path.parent.iterdir()] == ["load.json"]
     content = read_stage(path, "load")
-    assert content["params"] == {"checkpoint": "best_model.pth"} and content["metrics"] == {"samples": 3}
+    assert content["params"] == {"checkpoint": "best_model.pth"} and content["metrics"] == {"mae": [0.333333]}
     assert list(content["inputs"]) == ["1000 files"]
     write_stage(tmp_path / "mine" / "load.json", "load", params={}, metrics={"note": f"see {tmp_path}/x"})
     with pytest.raises(runs.NotebookError, match="shows a path of this machine"):

@@ -144,13 +144,8 @@ def test_as_root_what_is_missing_is_installed(monkeypatch):
 def test_what_nobody_vouches_for_is_found(tmp_path):
     site = tmp_path / "opt" / "rover" / "venv" / "lib" / "python3.11" / "site-packages"
     torch = next(iter(hashed(playbooks.REPOSITORY / "requirements_pi.txt")["torch"]))
-    for name, version in (
-        ("torch", torch),
-        ("numpy", "0.1"),
-        ("lerobot", "0.4.4"),
-        ("rover_policy", "0.1"),
-        ("pip", "23"),
-    ):
+    versions = {"torch": torch, "numpy": "0.1", "lerobot": "0.4.4", "rover_policy": "0.1", "pip": "23"}
+    for name, version in versions.items():
         (site / f"{name}-{version}.dist-info").mkdir(parents=True)
         (site / f"{name}-{version}.dist-info" / "METADATA").write_text(f"Name: {name}\nVersion: {version}\n")
     found = environment(tmp_path)

@@ -1,27 +1,15 @@
 """What the view's rows on an emulated Pi make of what they see, without a Pi: `make pi-fast` has one."""
 
-import asyncio
-import contextlib
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
-from aiohttp import web
+import pytest
 
 from lab.pi import container, view_proofs
-from lab.pi.view_proofs import (
-    FILES,
-    TOKEN,
-    VIEW_UNIT,
-    VIEW_USER,
-    spoilt,
-    status,
-    view_gone,
-)
-from rover_lib.onboard.view.server import Address, View
+from lab.pi.emulation import free_port
+from lab.pi.view_proofs import FILES, TOKEN, VIEW_UNIT, VIEW_USER, spoilt, view_gone
 
 ROOT = Path(__file__).parents[3]
-SECRET = "a" * 24
 
 
 class StandIn:
@@ -29,57 +17,21 @@ class StandIn:
 
     def __init__(self, root: Path, state: str = "loaded"):
         self.name, self.root, self.state = "rover1", root, state
-        self.asked: list[tuple] = []
         (root / "etc/rover").mkdir(parents=True)
         (root / "etc/passwd").write_text("root:x:0:0:root:/root:/bin/sh\n")
 
     def inside(self, *command: object, check: bool = True) -> SimpleNamespace:
-        self.asked.append(command)
         found = self.state if VIEW_UNIT in command else "loaded"
         names = next((str(c).partition("=")[2] for c in command if str(c).startswith("--property=")), "")
         values = {"LoadState": found, "ActiveState": "active", "NRestarts": "0", "UnitFileState": "enabled"}
         return SimpleNamespace(stdout="".join(f"{name}={values.get(name, '')}\n" for name in names.split(",")))
 
 
-@web.middleware
-async def everybody(self, request, handler):
-    """A guard that lets everybody in."""
-    return await handler(request)
-
-
-@contextlib.contextmanager
-def served(token: str = SECRET):
-    """A real view's port."""
-    ready, ended, ports = threading.Event(), asyncio.Event(), []
-
-    async def run() -> None:
-        async with contextlib.AsyncExitStack() as stack:
-            url = await View(Address(0), token).open(stack)
-            ports.append(int(url.split(":")[2].split("/")[0]))
-            ready.set()
-            await ended.wait()
-
-    loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
-    thread.start()
-    try:
-        assert ready.wait(10)
-        yield ports[0]
-    finally:
-        loop.call_soon_threadsafe(ended.set)
-        thread.join(10)
-
-
-def test_the_doors_of_a_view_are_shut_and_one_that_is_open_is_seen(monkeypatch):
-    with served() as port:
-        rows = view_proofs._doors(port, SECRET)
-        assert [row.holds for row in rows] == [True] * 3, rows
-        assert not view_proofs._doors(port, "b" * 24)[1].holds  # not its token
-    monkeypatch.setattr(View, "_guard", everybody)
-    with served() as port:
-        shut = view_proofs._doors(port, SECRET)[0]
-        assert not shut.holds and shut.found["no token"] == 200, shut
-    assert status(port, "/") == 0 and [row.holds for row in view_proofs._doors(port, SECRET)] == [False] * 3
+@pytest.mark.parametrize("guarded", [True, False])
+def test_a_door_that_is_open_is_seen(monkeypatch, guarded):
+    monkeypatch.setattr(view_proofs, "status", lambda port, path: 403 if guarded and path != "/?token=abc" else 200)
+    monkeypatch.setattr(view_proofs, "listening", lambda port: [view_proofs.LOOPBACK if guarded else "00000000"])
+    assert [row.holds for row in view_proofs._doors(1, "abc")] == [guarded] * 2
 
 
 def test_a_drive_that_this_machine_spoilt_is_no_fault_of_the_view():
@@ -92,8 +44,7 @@ def test_a_drive_that_this_machine_spoilt_is_no_fault_of_the_view():
 
 def test_what_is_left_of_a_view_is_found(tmp_path):
     pi = StandIn(tmp_path, "not-found")
-    with served() as port:
-        pass
+    port = free_port()
     assert all(row.holds for row in view_gone(pi, port))
     for path in (*FILES, "/opt/rover/venv/lib/python3.11/site-packages/aiohttp"):
         (tmp_path / path.lstrip("/")).parent.mkdir(parents=True, exist_ok=True)
