@@ -61,8 +61,9 @@ class Chooser:
     """The float policy and its answers on a few samples, prepared once for many conversions.
 
     odd: some of the odd frames that calibration met. Together with the odd ones among the samples they weigh in every
-    error what odd frames weigh in the recordings. warnings: a sentence for each action that is not judged. Raises
-    QuantizeError without samples, and where no action changes in the recordings.
+    error what odd frames weigh in the recordings: their share of what calibration saw, or of the samples, if that is
+    larger. warnings: a sentence for each action that is not judged. Raises QuantizeError without samples, and where no
+    action changes in the recordings.
     """
 
     def __init__(
@@ -90,8 +91,9 @@ class Chooser:
         self.weights = torch.ones(len(self.inputs))
         if odd:
             graph = restore_observed(checkpoint, Scheme(smooth=calibration.smooth), calibration)
-            self.is_odd[: len(samples)] = times_of(graph, calibration, self.inputs[: len(samples)]) > ODD
-            share = odd_share(calibration.frames)
+            unseen = times_of(graph, calibration, self.inputs[: len(samples)]) > ODD
+            self.is_odd[: len(samples)] = unseen
+            share = max(odd_share(calibration.frames), unseen.float().mean().item())
             for of_all, kind in ((1 - share, ~self.is_odd), (share, self.is_odd)):
                 self.weights[kind] = of_all * len(kind) / kind.sum().clamp(min=1)
 

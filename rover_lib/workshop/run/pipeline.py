@@ -36,6 +36,9 @@ from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
+# Odd frames need more: their errors are far apart, and on 16, ranges were chosen that were half as bad again
+# on others. They also tell what share is odd: of the frames that calibrate, which training knows, it is a quarter.
+ODD_CHOOSING_FRAMES = 64
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def prepare_chooser(
     """A chooser on this many frames that calibration has not seen, and on some of the odd ones that it met."""
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    few = pick_evenly(parts.choosing or parts.calibration, frames)
+    few = pick_evenly(parts.choosing or parts.calibration, ODD_CHOOSING_FRAMES if odd else frames)
     return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
