@@ -927,16 +927,11 @@ def test_fewer_than_asked_is_said(many):
     assert len(chosen) == 7
     assert note == "asked for 200 calibration samples, found only 7: all are used"
     assert choose_calibration(many.samples[:7], 7)[1] is None
+    with pytest.raises(EpisodeError, match="cannot choose"):
+        choose_calibration((), 10)
 
 
 def test_equal_samples_are_not_taken_twice(many):
     same = tuple(replace(many.samples[0]) for _ in range(30))
     chosen, _ = choose_calibration(same, 10)
     assert len({id(s) for s in chosen}) == 10
-
-
-def test_nothing_to_choose(many):
-    with pytest.raises(EpisodeError, match="cannot choose"):
-        choose_calibration((), 10)
-    with pytest.raises(EpisodeError, match="cannot choose"):
-        choose_calibration(many.samples, 0)
