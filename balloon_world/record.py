@@ -35,12 +35,7 @@ FIRST_WORLD = 1_000_000  # far from the worlds that trials drive in
 CONTROL_LATENCY_S = 0.004  # how long after its frame a control arrives over the serial line
 
 
-def record_episodes(
-    out_dir: Path | str,
-    count: int = 80,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> Path:
+def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progress: Progress = silent) -> Path:
     """Let the expert drive through `count` worlds, with shoves that it corrects; record an episode folder per drive.
 
     out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is.

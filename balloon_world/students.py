@@ -148,13 +148,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
                 remedy="'rover quantize' or 'rover run' makes it anew",
             )
         runs.append(
-            _Run(
-                student.name,
-                student / ARTIFACT,
-                own_manifest,
-                content["metrics"]["students"][1],
-                _counts(student),
-            )
+            _Run(student.name, student / ARTIFACT, own_manifest, content["metrics"]["students"][1], _counts(student))
         )
     return runs
 

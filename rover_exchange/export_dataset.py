@@ -144,12 +144,7 @@ def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
 
 
 def _write(
-    recordings: Recordings,
-    root: Path,
-    rate_hz: int,
-    video: bool,
-    size: tuple[int, int] | None,
-    progress: Progress,
+    recordings: Recordings, root: Path, rate_hz: int, video: bool, size: tuple[int, int] | None, progress: Progress
 ) -> dict[str, Any]:
     os.environ.setdefault("SVT_LOG", "1")  # without it the AV1 encoder prints its settings at every episode
     # Imported here, because it takes seconds that no other command should wait for.

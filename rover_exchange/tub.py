@@ -29,7 +29,7 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture
+from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture, nothing_usable
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
     Episode,
@@ -39,9 +39,10 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
 )
-from rover_lib.workshop.untrusted import quote
+from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
+MOST_HZ = 250.0  # no car's camera is faster
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
 
 
@@ -65,7 +66,10 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     """
     tub = Path(tub)
     faults = Faults(tub)
-    records = {record.index: record for record in _read_records(tub, faults)}
+    records: dict[int, _Record] = {}
+    for record in _read_records(tub, faults):
+        if records.setdefault(record.index, record) is not record:
+            faults.add(tub, "duplicate_record", f"record {record.index} is there again; the first one counts")
     ordered = [records[index] for index in sorted(records)]
     negative, moving = sum(r.throttle < 0 for r in ordered), sum(r.throttle != 0 for r in ordered)
     if throttle is None and 4 * negative > 3 * moving:
@@ -79,6 +83,10 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     times_s = [r.time_s for r in ordered if r.time_s is not None]
     steps_s = np.diff(times_s)
     usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
+    if usual_s * MOST_HZ < 1:
+        raise EpisodeError(
+            f"{tub}: most records come {usual_s:.3g} s after another", remedy="write their times in milliseconds"
+        )
     runs: list[list[_Record]] = []
     for record in ordered:
         if not runs or _ends(runs[-1][-1], record, min(HOLE_INTERVALS * usual_s, HOLE_S), tub, faults):
@@ -98,8 +106,8 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
             name = f"{run[0].session or 'session'} from {run[0].index}"
             episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))
     if not episodes:
-        worst = ", ".join(f"{fault.kind} {fault.count} times" for fault in faults.listed()) or "it is empty"
-        raise EpisodeError(f"{tub}: no usable record in it ({worst})", remedy="copy the whole tub, images included")
+        remedy = "copy the whole tub, images included"
+        raise nothing_usable(f"{tub}: no usable record in it", faults.listed(), remedy)
     return Recordings(tub, tuple(episodes), faults.listed(), Source(tub))
 
 
@@ -149,6 +157,8 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
     manifest = tub / "manifest.json"
     if manifest.is_file():
         paths, deleted = _read_manifest(manifest)
+        for other in sorted({p.name for p in tub.glob("*.catalog")} - set(paths)):
+            faults.add(tub, "catalog_not_listed", f"{quote(other)} is not in the manifest; not read")
         for name in dict.fromkeys(paths):  # each once
             if Path(name).name != name or not (tub / name).is_file():
                 faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
@@ -168,7 +178,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
 
 def _read(path: Path) -> str:
     try:
-        return read_plain(path, DATA_BYTES).decode(errors="replace")
+        return read_plain(path, DATA_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as e:
         raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy="copy it again") from None
 
@@ -181,11 +191,12 @@ def _read_manifest(path: Path) -> tuple[list[str], set[Any]]:
         except (ValueError, RecursionError):
             break
         if isinstance(last, dict) and isinstance(last.get("paths"), list):
-            deleted = last.get("deleted_indexes", [])
-            whole = isinstance(deleted, list) and all(isinstance(i, int) for i in deleted)
-            if whole and all(isinstance(p, str) for p in last["paths"]):
-                return last["paths"], set(deleted)
-            break
+            deleted = last.get("deleted_indexes") or []
+            try:
+                return list(map(str, last["paths"])), set(map(int, deleted))
+            except (ValueError, TypeError):
+                found = quote_all(deleted) if isinstance(deleted, list) else quote(deleted)
+                raise EpisodeError(f"{path}: its deleted_indexes are no numbers of records", found=found) from None
     raise EpisodeError(f"{path}: does not say which catalogs there are", remedy="is it a tub of donkeycar 4 or later?")
 
 
@@ -206,7 +217,7 @@ def _read_record(
         ms = row.get("_timestamp_ms", row.get("milliseconds", _as_ms(row.get("timestamp"))))
         values = row[ANGLE], row[THROTTLE]
         if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
-            raise ValueError(f"{quote(values)} with {quote(row[PICTURE])}")
+            raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")
         if not is_whole(number) or not (ms is None or is_number(ms)):
             raise ValueError(f"number {quote(number)}, time {quote(ms)}")
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:

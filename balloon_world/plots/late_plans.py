@@ -9,18 +9,7 @@ from matplotlib.patches import Circle
 
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import (
-    BLACK,
-    BLUE,
-    MIST,
-    RED,
-    SLATE,
-    Note,
-    claim,
-    legend,
-    legend_below,
-    new_figure,
-)
+from rover_lib.workshop.plots.style import BLACK, BLUE, MIST, RED, SLATE, Note, claim, legend, legend_below, new_figure
 
 HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
 

@@ -27,12 +27,7 @@ SECTIONS: dict[str, tuple[click.Command, ...]] = {
     ),
     "Teach": (),
     "Recordings": (ROVERS["label"],),
-    "A rover's models, and arming it": (
-        prepare.wheelhouse,
-        ROVERS["release"],
-        ROVERS["arm-car"],
-        ROVERS["heartbeat"],
-    ),
+    "A rover's models, and arming it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
 }
 # Sections, by the group of entry points that adds to them.
 MORE = {"rover.teach": "Teach", "rover.look": "Look", "rover.recordings": "Recordings"}

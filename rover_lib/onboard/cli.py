@@ -191,9 +191,7 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
     click.option(
-        "--throttle-limit",
-        type=Number(0, 1),
-        help="Largest throttle [default: params.yml; with --replay: none].",
+        "--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml; with --replay: none]."
     ),
     click.option(
         "--blend-ticks",
@@ -390,12 +388,7 @@ def doctor(
 @click.option("--wheelbase-m", type=float, help="Distance between the axles [default: the balloon world's].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def calibrate(
-    port: str,
-    output: Path | None,
-    name: str,
-    field_of_view_deg: float | None,
-    wheelbase_m: float | None,
-    force: bool,
+    port: str, output: Path | None, name: str, field_of_view_deg: float | None, wheelbase_m: float | None, force: bool
 ) -> None:
     """Guide a human with the transmitter through both sticks, measure the pulses, and write them as car.yml.
 

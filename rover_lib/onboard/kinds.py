@@ -13,13 +13,14 @@ import os
 import stat
 import zipfile
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, HEF, ONNX
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import RoverError, printable
 
 CALLED = {
     "artifact": "an artifact",
@@ -62,6 +63,8 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
     ("run", "recordings"): "give the recordings that it was made of, which its load.json names",
 }
 PARTS = ("checkpoint part", "dataset part")
+NOTHING = {*PARTS, "document", "pointer", "stage"}  # what cannot be given for the folder that holds it
+MOST_INSIDE = 500  # paths that are looked at
 REFUSED = {
     "document": "give a file or folder that it describes",
     "pointer": "git lfs pull, where it was cloned, or download the file itself",
@@ -125,6 +128,19 @@ def refuse_part(path: Path | str) -> None:
         raise KindError(f"{path}: this is {CALLED[kind]}", remedy=f"give its folder, {os.path.relpath(folder)}")
     if kind in REFUSED:
         raise KindError(f"{path}: this is {CALLED[kind]}", remedy=REFUSED[kind])
+
+
+def refuse_holder(folder: Path | str) -> None:
+    """Raise KindError for a folder that is nothing itself, but holds what is: checkpoints, or a cache of the Hub."""
+    for level in ("*", "*/*", "*/*/*"):
+        inside = [p for p in islice(sorted(Path(folder).glob(level)), MOST_INSIDE) if not set(kinds_of(p)) <= NOTHING]
+        if inside:
+            names = ", ".join(os.path.relpath(p, folder) for p in inside[:4]) + (" ..." if len(inside) > 4 else "")
+            raise KindError(
+                f"{folder}: holds {CALLED[kinds_of(inside[0])[0]]}, and is none itself",
+                found=printable(names),
+                remedy=f"give {'that' if len(inside) == 1 else 'one of them'}, as in {inside[0]}",
+            )
 
 
 def refuse_pointer(path: Path, error: type[RoverError]) -> None:

@@ -59,8 +59,7 @@ class Affine:
 def imagenet() -> Affine:
     """Return the normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
     return Affine(
-        tuple(1 / s for s in IMAGENET_STD),
-        tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True)),
+        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
     )
 
 

@@ -152,7 +152,7 @@ def test_what_it_cannot_be_run_with(artifact, config, meta, sentence):
 def test_a_packed_folder_is_a_pretrained_policy(artifact, tmp_path, monkeypatch):
     folder = pack(artifact, tmp_path / "packed", n_action_steps=5)
     assert sorted(p.name for p in folder.iterdir()) == [
-        *("config.json", artifact.name, "policy_postprocessor.json", "policy_preprocessor.json"),
+        *("config.json", artifact.name, "policy_postprocessor.json", "policy_preprocessor.json")
     ]
     with pytest.raises(ParamsError, match="is there already; name a new folder"):
         pack(artifact, folder)

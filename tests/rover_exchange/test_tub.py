@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+import shutil
 from datetime import datetime, timedelta
 
 import cv2
@@ -180,6 +182,22 @@ def test_what_is_broken_is_counted(tmp_path):
         read_tub(root, LEFT)
     (root / "manifest.json").unlink()
     with pytest.raises(EpisodeError, match="no donkeycar tub"):
+        read_tub(root, LEFT)
+
+
+def test_what_no_donkeycar_writes_is_told(tmp_path):
+    root = tub(tmp_path / "tub", records(40), deleted=["5"], per_catalog=20)
+    first, last = root / "catalog_0.catalog", root / "catalog_1.catalog"
+    first.write_text("\ufeff" + first.read_text() + last.read_text().replace('"_index": 20', '"_index": 7'))
+    shutil.copy(last, root / "catalog_2.catalog")
+    found = kinds(read_tub(root, LEFT))
+    assert found == {"deleted_record": 1, "records_missing": 1, "duplicate_record": 20, "catalog_not_listed": 1}
+    for path in (first, last):
+        path.write_text(re.sub(r'_ms": (.{10})', r'_ms": \1.', path.read_text()))
+    with pytest.raises(EpisodeError, match="come 5e-05 s after another; write their times in milliseconds"):
+        read_tub(root, LEFT)
+    (root / "manifest.json").write_text('{"paths": ["catalog_0.catalog"], "deleted_indexes": [[1, 2]]}')
+    with pytest.raises(EpisodeError, match="its deleted_indexes are no numbers of records, found a list of 2"):
         read_tub(root, LEFT)
 
 

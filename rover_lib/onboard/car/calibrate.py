@@ -115,11 +115,7 @@ def measure(
         "right_us": ends["right"],
         "positive": positive or ("right" if ends["right"] > ends["left"] else "left"),
     }
-    throttle = {
-        "period_us": rest.throttle_period_us,
-        "neutral_us": rest.throttle_us,
-        "forward_us": ends["forward"],
-    }
+    throttle = {"period_us": rest.throttle_period_us, "neutral_us": rest.throttle_us, "forward_us": ends["forward"]}
     if _goes_back(rest, ends) and not fast:
         throttle["reverse_us"] = ends["back"]
     return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")

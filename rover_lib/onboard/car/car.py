@@ -181,10 +181,7 @@ class Car:
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
         content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m", "human"})
         steering = _section(
-            content["steering"],
-            f"{where}: steering",
-            {"period_us", "left_us", "neutral_us", "right_us"},
-            {"positive"},
+            content["steering"], f"{where}: steering", {"period_us", "left_us", "neutral_us", "right_us"}, {"positive"}
         )
         # In files that do not say it, +1 is what they call left; of the recorded car they did not know it (below).
         positive = steering.get("positive", "left")
@@ -222,9 +219,7 @@ class Car:
                 name=name,
                 pwm=PwmCalibration(
                     steering=_channel(
-                        "steering",
-                        us["steering.period_us"],
-                        ends_us if positive == "left" else ends_us[::-1],
+                        "steering", us["steering.period_us"], ends_us if positive == "left" else ends_us[::-1]
                     ),
                     throttle=_channel(
                         "throttle",

@@ -96,11 +96,7 @@ class Host:
 
     def reading(self) -> dict[str, Any]:
         """Return temperature, clock and throttling now."""
-        return {
-            "temperature_c": self.temperature_c(),
-            "clock_mhz": self.clock_mhz(),
-            "throttled": self.throttled(),
-        }
+        return {"temperature_c": self.temperature_c(), "clock_mhz": self.clock_mhz(), "throttled": self.throttled()}
 
 
 def usable_cores() -> int:

@@ -106,10 +106,7 @@ class Channel:
         If it did, the pulse is longer than 0 and shorter than its period, and the period is within 25 % of the nominal
         one: neither 0 nor two periods taken for one. Raises PwmError for what is not a finite number.
         """
-        pulse_us, period_us = (
-            _finite(pulse_us, f"{self.name} pulse"),
-            _finite(period_us, f"{self.name} period"),
-        )
+        pulse_us, period_us = (_finite(pulse_us, f"{self.name} pulse"), _finite(period_us, f"{self.name} period"))
         return 0 < pulse_us < period_us and 0.75 * self.period_us < period_us < 1.25 * self.period_us
 
     def action(self, pulse_us: float, period_us: float | None = None) -> float | None:
@@ -199,8 +196,7 @@ class PwmCalibration:
         Raises PwmError for pulses that are None, and for strings, NaN and infinities.
         """
         return Actions(
-            self.steering.action(steering_us, steering_period_us),
-            self.throttle.action(throttle_us, throttle_period_us),
+            self.steering.action(steering_us, steering_period_us), self.throttle.action(throttle_us, throttle_period_us)
         )
 
     def us_per_unit(self, action_name: str) -> float:

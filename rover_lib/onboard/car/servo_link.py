@@ -222,12 +222,7 @@ class ServoLink:
     """
 
     def __init__(
-        self,
-        port: str,
-        *,
-        car: Car | None = None,
-        boot_s: float = BOOT_S,
-        clock: Callable[[], float] = time.monotonic,
+        self, port: str, *, car: Car | None = None, boot_s: float = BOOT_S, clock: Callable[[], float] = time.monotonic
     ):
         """port: "" means the only Arduino's. car: None means this machine's. Raises CarError if its car.yml cannot be
         read, and PortError if it is not clear which port is meant.

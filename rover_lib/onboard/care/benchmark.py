@@ -116,11 +116,7 @@ class BenchmarkOptions:
         if self.warmup < 0 or self.iterations < 1:
             counts = f"{self.warmup} and {self.iterations}"
             raise ParamsError("warmup must be from 0 and iterations from 1", found=counts)
-        for name, value in (
-            ("duration_s", self.duration_s),
-            ("at_most_s", self.at_most_s),
-            ("rate_hz", self.rate_hz),
-        ):
+        for name, value in (("duration_s", self.duration_s), ("at_most_s", self.at_most_s), ("rate_hz", self.rate_hz)):
             if value is not None and not 0 < value < math.inf:
                 raise ParamsError(f"{name} must be above 0", found=value)
         if self.threads is not None and self.threads < 0:
@@ -301,11 +297,7 @@ class _Run:
         p50_ms, reference_p50_ms = (float(np.percentile(x, 50)) for x in (times_ms, reference_ms))
         paired = np.asarray(reference_ms) / np.maximum(times_ms, 1e-9)
         low, high = np.percentile(paired, (5, 95)).tolist()
-        return {
-            "speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None,
-            "speedup_p5": low,
-            "speedup_p95": high,
-        }
+        return {"speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None, "speedup_p5": low, "speedup_p95": high}
 
     def host_metrics(self) -> dict[str, Any]:
         """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""

@@ -583,10 +583,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
             drives[-1].machine.append(row)
     drives = [part for drive_ in drives for part in drive_.split()]
     if not drives:
-        raise LogError(
-            f"{path}: no line of a flight log in it, {damaged} of something else",
-            remedy=NAME_A_LOG,
-        )
+        raise LogError(f"{path}: no line of a flight log in it, {damaged} of something else", remedy=NAME_A_LOG)
     if not -len(drives) <= drive < len(drives):
         raise LogError(
             f"{path}: no drive {drive}, it has {len(drives)}", remedy=f"choose from 0 to {len(drives) - 1}, or -1"

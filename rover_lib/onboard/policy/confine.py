@@ -71,12 +71,7 @@ def memory_mb(artifact: Path | str, threads: int) -> float:
 def filter_of(processor: str) -> bytes:
     """Return the kernel's filter for a processor of PROCESSORS: 8 bytes per instruction, see linux/filter.h."""
     column, architecture = PROCESSORS[processor]
-    program = [
-        _step(LOAD, 4),
-        _step(JUMP_EQUAL, architecture, 1, 0),
-        _step(RETURN, REFUSE | EPERM),
-        _step(LOAD, 0),
-    ]
+    program = [_step(LOAD, 4), _step(JUMP_EQUAL, architecture, 1, 0), _step(RETURN, REFUSE | EPERM), _step(LOAD, 0)]
 
     def when(call: tuple[int | None, ...], *steps: bytes) -> None:
         if (number := call[column]) is not None:

@@ -156,8 +156,7 @@ def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
         raise ArtifactError(e.what, found=e.found, remedy=e.remedy) from None
     except (IndexError, RuntimeError) as e:
         raise ArtifactError(
-            f"{policy.path}: its parity vectors do not run ({' '.join(str(e).split())[-200:]})",
-            remedy="quantize again",
+            f"{policy.path}: its parity vectors do not run ({' '.join(str(e).split())[-200:]})", remedy="quantize again"
         ) from None
 
 

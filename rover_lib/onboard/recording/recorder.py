@@ -60,9 +60,7 @@ class Recorder:
         self._to_system_s = time.time() - self.start_s
         self._frame_s = 0.75 / rate_hz  # a frame that comes sooner is left out: the camera is faster
         self._writer = _new_episode(
-            Path(folder),
-            self.start_s + self._to_system_s,
-            replace(about, fps=min(rate_hz, camera.wanted_hz)),
+            Path(folder), self.start_s + self._to_system_s, replace(about, fps=min(rate_hz, camera.wanted_hz))
         )
         self.folder = self._writer.folder
         self.path: Path | None = None  # the episode's folder, once it exists

@@ -17,7 +17,7 @@ from torch import Tensor
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.kinds import refuse_part
+from rover_lib.onboard.kinds import refuse_holder, refuse_part
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
@@ -182,7 +182,9 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     refuse_part(path)
     if path.is_dir() or path.name == "last":
-        path, notes = lerobot_folder(path) or (path, [])
+        if (found_at := lerobot_folder(path)) is None:
+            refuse_holder(path)
+        path, notes = found_at or (path, [])
         found = _check_policy(path, read_lerobot(path))
         return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
     if not path.is_file():

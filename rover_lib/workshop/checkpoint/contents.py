@@ -55,6 +55,8 @@ def named_weights(path: Path, state: dict[Any, Any], file_bytes: int) -> tuple[d
         raise CheckpointError(
             f"{path}: these weights are not tensors: {quote_all(odd)}", remedy="save policy.state_dict() as it is"
         )
+    # A batch norm counts its batches; LeRobot's are frozen and drop the count.
+    state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
     begins = {k.removesuffix(FIRST_WEIGHT) for k in state if k.endswith(FIRST_WEIGHT)}
     prefix = begins.pop() if len(begins) == 1 else "model."
     if outside := [k for k in state if not k.startswith(prefix)]:

@@ -56,7 +56,8 @@ def read_trainer(path: Path) -> Contents:
                 found=quote_all(content),
                 remedy="is this a trainer checkpoint, or only its weights?",
             )
-    raw, (weights, notes) = content["config"], named_weights(path, content["model_state_dict"], file_bytes)
+    raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
+    weights, notes = named_weights(path, content["model_state_dict"], file_bytes)
     if missing := sorted(TRAINER_KEYS - set(raw)):
         raise CheckpointError(
             f"{path}: the config lacks {missing}", remedy="it cannot be read off the weights, add them"

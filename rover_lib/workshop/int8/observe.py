@@ -17,12 +17,7 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.ao.quantization import (
-    PerChannelMinMaxObserver,
-    QConfig,
-    QConfigMapping,
-    float_qparams_weight_only_qconfig,
-)
+from torch.ao.quantization import PerChannelMinMaxObserver, QConfig, QConfigMapping, float_qparams_weight_only_qconfig
 from torch.ao.quantization.backend_config import get_qnnpack_backend_config
 from torch.ao.quantization.fx.custom_config import PrepareCustomConfig
 from torch.ao.quantization.observer import UniformQuantizationObserverBase
@@ -56,11 +51,7 @@ class RangeObserver(UniformQuantizationObserverBase):
 
     def __init__(self, *, dtype: torch.dtype, quant_min: int, quant_max: int, choice: str, percentile: float):
         super().__init__(
-            dtype=dtype,
-            qscheme=torch.per_tensor_affine,
-            quant_min=quant_min,
-            quant_max=quant_max,
-            eps=SMALLEST_SCALE,
+            dtype=dtype, qscheme=torch.per_tensor_affine, quant_min=quant_min, quant_max=quant_max, eps=SMALLEST_SCALE
         )
         self.choice, self.percentile, self.observing = choice, percentile, True
         self.frames: list[Tensor] = []
@@ -177,11 +168,7 @@ class Calibration:
 
 
 def calibrate(
-    checkpoint: Checkpoint,
-    samples: Sequence[Sample],
-    *,
-    smooth: float | None = 0.5,
-    progress: Progress = silent,
+    checkpoint: Checkpoint, samples: Sequence[Sample], *, smooth: float | None = 0.5, progress: Progress = silent
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
@@ -325,11 +312,7 @@ def _qconfig(scheme: Scheme) -> QConfig:
         dtype=dtype, quant_min=low, quant_max=high, choice=scheme.observer, percentile=scheme.percentile
     )
     weight = PerChannelMinMaxObserver.with_args(
-        dtype=torch.qint8,
-        qscheme=torch.per_channel_symmetric,
-        quant_min=-127,
-        quant_max=127,
-        eps=SMALLEST_SCALE,
+        dtype=torch.qint8, qscheme=torch.per_channel_symmetric, quant_min=-127, quant_max=127, eps=SMALLEST_SCALE
     )
     return QConfig(activation, weight)
 

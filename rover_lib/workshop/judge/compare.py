@@ -372,13 +372,7 @@ def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str,
         found = passed = None
     else:
         passed = bool(RELATIONS[relation](found, limit))
-    return {
-        "gate": name,
-        "relation": relation,
-        "limit": limit,
-        "found": found,
-        "passed": passed,
-    }
+    return {"gate": name, "relation": relation, "limit": limit, "found": found, "passed": passed}
 
 
 def hits_needed(limits: Mapping[str, Any], trials: int | None) -> int:

@@ -286,11 +286,7 @@ def _list_failures(
 
 
 def _remedies(
-    key: str,
-    stages: Stages,
-    params: Mapping[str, Any],
-    names: Names,
-    rows: Mapping[str, Mapping[str, Any]],
+    key: str, stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """Say what to do about a gate that static INT8 misses, the cheapest remedy first."""
     if key in ("size_mb", "model_size_mb"):
@@ -442,11 +438,7 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _because(
-    row: Mapping[str, Any],
-    best: Mapping[str, Any],
-    limits: Mapping[str, Any],
-) -> str:
+def _because(row: Mapping[str, Any], best: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Say in one phrase why a mode is the one to deploy, or why it is not worth it."""
     if row is best:
         return "the one to deploy"

@@ -96,14 +96,7 @@ def worst_frames(
                 known = ~worst.sample.is_pad
                 ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")
             ax.plot(times_s, worst.reference[:, i], color=BLACK, lw=1.8, label="FP32")
-            ax.plot(
-                times_s,
-                worst.other[:, i],
-                color=COLOURS.get(mode, BLUE),
-                lw=1.8,
-                ls="--",
-                label=f"{mode} INT8",
-            )
+            ax.plot(times_s, worst.other[:, i], color=COLOURS.get(mode, BLUE), lw=1.8, ls="--", label=f"{mode} INT8")
             ax.set_ylabel(f"{name}", fontsize=9)
             low, high = report.action_range[name]
             ax.set_ylim(low - 0.05 * (high - low + 1e-6), high + 0.05 * (high - low + 1e-6))
@@ -128,11 +121,7 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
         ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
         ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
         ax.annotate(
-            f"{v['hits']} of {v['trials']}",
-            (1.01, y),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            fontsize=10,
+            f"{v['hits']} of {v['trials']}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=10
         )
     ax.set_yticks(range(len(rows)), [NAMES.get(m, m) for m in rows])
     ax.set_ylim(len(rows) - 0.5, -0.5)

@@ -62,10 +62,7 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
     left.invert_yaxis()
     left.set(xscale="log", xlabel="largest channel / median channel")
     left.set_title(f"the {len(layers)} most uneven projections", fontsize=11)
-    for key, colour, label in (
-        (f"{side}_max", MIST, "before"),
-        (f"{side}_max_scaled", SLATE, "after channel scales"),
-    ):
+    for key, colour, label in ((f"{side}_max", MIST, "before"), (f"{side}_max_scaled", SLATE, "after channel scales")):
         x = np.sort(np.asarray(layers[worst][key]))[::-1]
         right.plot(np.arange(1, len(x) + 1), 100 * x / x[0], color=colour, lw=1.8, label=label)
     right.set(xlabel="channel, largest first", ylabel="activation (% of the largest)", ylim=(0, 105))

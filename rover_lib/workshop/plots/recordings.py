@@ -114,8 +114,7 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     draw = _drive if car else _motion
     draw([fig.add_subplot(grid[1 + row, :]) for row in range(rows)], samples, actions)
     fig.suptitle(
-        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames",
-        fontsize=11,
+        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames", fontsize=11
     )
     return fig
 
@@ -154,10 +153,7 @@ def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) 
     steering_us, throttle_us = zip(*pulses, strict=True)
     unit = "{} pulse (us)" if samples[0].pulses_us else "{} pulse (us, computed)"
     upper, lower = fields
-    rows = (
-        (upper, actions[:, 0], actions[:, 1], "{} (share of full)"),
-        (lower, steering_us, throttle_us, unit),
-    )
+    rows = ((upper, actions[:, 0], actions[:, 1], "{} (share of full)"), (lower, steering_us, throttle_us, unit))
     for ax, steering, throttle, unit in rows:
         other = ax.twinx()
         ax.plot(times_s, steering, color=COLOURS["steering"], lw=1.5)
@@ -194,10 +190,7 @@ def faults(recordings: Recordings) -> Figure | Note:
 
 
 def calibration_coverage(
-    pool: Sequence[Sample],
-    chosen: Sequence[Sample],
-    held_out: Sequence[Sample],
-    names: Sequence[str] = ACTION_NAMES,
+    pool: Sequence[Sample], chosen: Sequence[Sample], held_out: Sequence[Sample], names: Sequence[str] = ACTION_NAMES
 ) -> Figure:
     """Draw which recorded actions the calibration samples cover, beside those that judge later."""
     first_two = list(names[:2])
@@ -227,14 +220,7 @@ def calibration_coverage(
         bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
         for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
             values = np.concatenate([s.chunk[:, i] for s in samples])
-            ax.hist(
-                values,
-                bins,
-                weights=np.full(len(values), 100 / len(values)),
-                color=colour,
-                histtype=style,
-                lw=1.5,
-            )
+            ax.hist(values, bins, weights=np.full(len(values), 100 / len(values)), color=colour, histtype=style, lw=1.5)
         ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)")
         ax.set_title(f"{names[i]} over whole plans", fontsize=11)
     legend_below(fig, fields[0], 3)

@@ -164,9 +164,7 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
 MOST_ACTIONS = 3  # a figure shows at most this many beside each other
 
 
-def few_actions(
-    table: Mapping[str, Mapping[str, float | None]],
-) -> tuple[dict[str, dict[str, float | None]], str]:
+def few_actions(table: Mapping[str, Mapping[str, float | None]]) -> tuple[dict[str, dict[str, float | None]], str]:
     """Return a table of <action>_mae_pct as it can be drawn, and what it then has, in words.
 
     If there are more than MOST_ACTIONS actions, only the worst of each row is kept.

@@ -33,6 +33,8 @@ import json
 import math
 import os
 import stat
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -43,6 +45,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL, Channel, PwmCalibration
 from rover_lib.onboard.errors import CarError, EpisodeError
+from rover_lib.onboard.kinds import refuse_holder
 from rover_lib.onboard.recording.episode import (
     BURST_MIN,
     CONTROL_FIELDS,
@@ -61,13 +64,18 @@ from rover_lib.onboard.recording.episode import (
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
-from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, Formula, formula_of
+from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, Formula, formulas_of, half_unit_of
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
 from rover_lib.workshop.untrusted import quote, quote_all
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
+# Faults of which one is enough to leave a recording out, and those that follow from another.
+FOLLOWING = ("absent", "nothing_usable")
+DECISIVE = ("no_formula", "no_car", "no_overlap", "not_seconds", "coarse_times", "wrong_header", "broken_json")
+LAST_S = 1e11  # Unix time is a hundredth of it
+FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 Item = TypeVar("Item")
 
@@ -125,10 +133,7 @@ class _Frame:
 
 
 def load_recordings(
-    root: Path | str | Source,
-    chunk: int = 32,
-    sync_s: float = 0.05,
-    progress: Progress = silent,
+    root: Path | str | Source, chunk: int = 32, sync_s: float = 0.05, progress: Progress = silent
 ) -> Recordings:
     """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also from the Hub.
 
@@ -164,12 +169,10 @@ def load_recordings(
         ) from None
     if {"data", "meta"} <= {p.name for p in folders}:
         raise EpisodeError(f"{root}: a LeRobotDataset without meta/info.json", remedy=lerobot_dataset.COPY_AGAIN)
-    if several := [p.name for p in folders if lerobot_dataset.is_dataset(p)]:
-        remedy = "give one of them, or merge them (lerobot-edit-dataset)"
-        raise EpisodeError(f"{root}: holds LeRobotDatasets, each by itself", found=quote_all(several), remedy=remedy)
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
+        refuse_holder(root)
         remedy = finish if killed else "give the folder that holds episode_YYYYMMDD_HHMMSS"
         raise EpisodeError(
             f"{root}: no episode folders in it", found=f"{len(killed)} killed ones" if killed else None, remedy=remedy
@@ -183,18 +186,28 @@ def load_recordings(
     )
     episodes = tuple(episode for episode in read if episode)
     if not episodes:
-        kinds: dict[str, int] = {}
-        for fault in faults.listed():
-            kinds[fault.kind] = kinds.get(fault.kind, 0) + fault.count
-        most = sorted(kinds, key=lambda kind: (-kinds[kind], kind))[:6]
-        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
-        notes = {fault.kind: fault.note for fault in reversed(faults.listed())}
-        raise EpisodeError(
-            f"{root}: no usable sample in {len(folders)} episode folder(s) ({worst or 'they are empty'})",
-            found=next((notes[kind] for kind in ("no_formula", *most) if notes.get(kind)), None),
-            remedy="record again, or copy the whole folders, frames included",
+        if {fault.kind for fault in faults.listed()} == {"no_data"}:
+            refuse_holder(root)
+        raise nothing_usable(
+            f"{root}: no usable sample in {len(folders)} episode folder(s)",
+            faults.listed(),
+            "record again, or copy the whole folders, frames included",
         )
     return Recordings(root, episodes, faults.listed(), source)
+
+
+def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeError:
+    """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
+    kinds: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for fault in faults:
+        if fault.handled == "left out":
+            kinds[fault.kind] += fault.count
+            first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
+    most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind in FOLLOWING, -kinds[kind], kind))[:6]
+    worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
+    found = first[most[0]] if most else ""
+    return EpisodeError(f"{what} ({worst or 'empty'})", found=found or None, remedy="" if "; " in found else remedy)
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
@@ -220,11 +233,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         return None
     frames = _read_frames(folder, *tables["frame_samples"], faults)
     if not controls or not frames:
-        faults.add(
-            folder,
-            "nothing_usable",
-            f"{len(controls)} usable controls and {len(frames)} usable frame entries",
-        )
+        faults.add(folder, "nothing_usable", f"{len(controls)} usable controls and {len(frames)} usable frame entries")
         return None
     source = tables["control_samples"][0]
     controls = _place_bursts(controls, source, faults)
@@ -327,7 +336,8 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[
     rows: list[dict[str, Any]] = []
     try:
         if missing := [name for name in fields if name not in (table.fieldnames or ())]:
-            faults.add(path, "wrong_header", f"no column {missing[0]}")
+            begins = quote(data[:80].decode(errors="replace"))
+            faults.add(path, "wrong_header", f"no column {missing[0]} in its first line, {begins}")
             return []
         rows.extend(table)
     except csv.Error as e:
@@ -357,7 +367,7 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
             continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan:
             faults.add(path, "not_finite", f"control {i}: {nan[0]} is {quote(row.get(nan[0]))}")
-        if "system_timestamp" in nan:
+        if "system_timestamp" in nan or _is_no_second(values["system_timestamp"], f"control {i}", path, faults):
             continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
@@ -381,6 +391,14 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
         pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
         controls.append(_Control(*times_s, pair, driver, pulses))
+    system_s, arduino_s = (np.abs(np.diff([getattr(c, s) for c in controls])) for s in ("system_s", "arduino_s"))
+    if len(controls) > LEAST_READINGS:
+        # Most of a backlog's steps are too short, but not all of the recording's.
+        usual_s, live_s = np.nanmedian(arduino_s), np.quantile(system_s, 0.9)
+        if usual_s > 0 < live_s and not 0.1 < live_s / usual_s < 10:
+            note = f"its steps are {1000 * usual_s:.3g}, the system's clock's {1000 * live_s:.3g} ms; it is not used"
+            faults.add(path, "arduino_clock_not_in_ms", note, len(controls))
+            controls = [replace(c, arduino_s=math.nan) for c in controls]
     went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
     return _in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
@@ -408,31 +426,48 @@ def _read_actions(
             continue
         recorded[i], meant[i] = action, expected
         duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
-    found, duties = np.array(list(recorded.values())), np.array(list(duties_pct.values()))
-    agrees = np.abs(found - np.array(list(meant.values()))) <= EXACT
+    found, expects, duties = (np.array(list(of.values())) for of in (recorded, meant, duties_pct))
+    _refuse_other_pulses(channel, rows, duties_pct)
+    half_unit = half_unit_of(found)
+    off = np.abs(found - expects)
+    agrees = off <= EXACT + half_unit
     # Firmware may have been changed within a recording, so only what disagrees must follow another formula.
-    formula = formula_of(channel, found[~agrees], duties[~agrees])
-    if formula or (len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS):
-        first = next(i for i, ok in zip(recorded, agrees, strict=True) if not ok)
+    formulas = formulas_of(channel, found[~agrees], duties[~agrees], half_unit)
+    unlike = len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS
+    rounded = half_unit and not formulas and agrees.mean() >= FOLLOWS and (off > EXACT).any()
+    if formulas or unlike or rounded:
+        wrong = off > EXACT if rounded else ~agrees
+        first = next(i for i, is_wrong in zip(recorded, wrong, strict=True) if is_wrong)
         seen = f"control {first}: {recorded[first]:g} recorded, its pulse says {meant[first]:.4f}"
-        if formula is None:
+        if unlike and not formulas:
             raise EpisodeError(
                 f"{name} follows no formula of its pulses: {100 * agrees.mean():.0f} % the car's, the rest no line",
                 found=seen,
+                remedy="correct them, or record again",
             )
-        note = f"recorded as {formula} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
-        faults.add(path, f"{name}_recomputed", note, int((~agrees).sum()))
-        return meant, meant, formula
+        said = f"recorded as {', then as '.join(map(str, formulas))} instead of {Formula.of(channel)}"
+        note = f"{f'rounded to {2 * half_unit:g}' if rounded else said}; {seen}; recomputed from the pulses"
+        faults.add(path, f"{name}_recomputed", note, int(wrong.sum()))
+        return meant, meant, formulas[0] if formulas else None
     return recorded, meant, None
 
 
+def _refuse_other_pulses(channel: Channel, rows: dict[int, dict[str, float]], duties_pct: dict[int, float]) -> None:
+    """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
+    (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
+    pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
+    far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
+    if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
+        row = rows[far[0]]
+        raise EpisodeError(
+            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us",
+            found=f"control {far[0]}: {row[f'{channel.name}_raw_us']:g} us of {row[f'{channel.name}_period_us']:g} us",
+            remedy="write pulses and periods in microseconds, or say which car it is in metadata.car",
+        )
+
+
 def _take(
-    channel: Channel,
-    recorded: dict[int, float],
-    meant: dict[int, float],
-    recompute: bool,
-    path: Path,
-    faults: Faults,
+    channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
 ) -> dict[int, float]:
     """Return the actions of one channel, as recorded, or where pulses deny them, as these mean them if `recompute`."""
     name = channel.name
@@ -503,10 +538,7 @@ def _place_bursts(controls: list[_Control], path: Path, faults: Faults) -> list[
             placed.append(replace(control, system_s=time_s))
             moved += 1
     faults.add(
-        path,
-        "serial_burst",
-        f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived",
-        moved,
+        path, "serial_burst", f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived", moved
     )
     faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
     return sorted(placed, key=lambda c: c.system_s)
@@ -524,16 +556,14 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
-        number, time_s, name = (
-            number_of(row.get("frame_id")),
-            number_of(row.get("timestamp")),
-            row.get("image_path"),
-        )
+        number, time_s, name = (number_of(row.get("frame_id")), number_of(row.get("timestamp")), row.get("image_path"))
         if number is None or time_s is None or not isinstance(name, str) or not name:
             faults.add(path, "wrong_type", f"frame {i}: {quote_all(row.get(name) for name in FRAME_FIELDS)}")
             continue
         if math.isnan(number) or math.isnan(time_s):
             faults.add(path, "not_finite", f"frame {i}: {quote(row.get('timestamp'))}")
+            continue
+        if _is_no_second(time_s, f"frame {i}", path, faults):
             continue
         if number in numbers:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
@@ -550,7 +580,18 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             kept.append(frame)
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
+    if 2 * len(kept) < len(frames):
+        note = f"{len(frames)} frames have {len(kept)} different times; write them to the millisecond"
+        faults.add(path, "coarse_times", note, len(kept))
+        return []
     return kept
+
+
+def _is_no_second(time_s: float, which: str, path: Path, faults: Faults) -> bool:
+    """Whether a time is none in seconds since 1970, but in milliseconds: a fault then says so."""
+    if time_s > LAST_S:
+        faults.add(path, "not_seconds", f"{which} was at {time_s:.0f}, which is no time in seconds; divide by 1000")
+    return time_s > LAST_S
 
 
 def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> bool:
@@ -563,7 +604,7 @@ def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Fa
             faults.add(path, "frame_missing", f"{quote(name)} is no file")
             return False
         with picture.open("rb") as f:
-            head = f.read(2)
+            head = f.read(12)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
             problem = _jpeg_problem(head, f.read())
     except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
@@ -580,8 +621,8 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
 
     cv2 would only warn of a file that was cut short, and return a picture.
     """
-    if head != b"\xff\xd8":
-        return "no JPEG: its start marker is missing"
+    if not head.startswith(b"\xff\xd8"):
+        return f"no JPEG: it begins with {quote(head)}"
     if not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
         return "cut short: its end marker is missing"
     return None

@@ -12,8 +12,8 @@ import json
 import math
 import struct
 import warnings
-from collections.abc import Iterator, Mapping, Set
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Set
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,10 +52,7 @@ NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", 
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
 SUCCESS = "next.success"
 REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
-DRIVEN_BY, OUTCOMES = (
-    "driven_by",
-    "outcomes",
-)  # who drove where nobody intervened; what the drive came to, or null
+DRIVEN_BY, OUTCOMES = ("driven_by", "outcomes")  # who drove where nobody intervened; what the drive came to, or null
 CAR = "car"  # and of them all, the content of their car.yml
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 TEMPLATES = {"data_path": f"data/{FILE}.parquet", "video_path": f"videos/{{video_key}}/{FILE}.mp4"}  # of LeRobot
@@ -126,7 +123,7 @@ class _Pictures:
                 f"{path}: its frame {row} of '{camera.key}' has another shape than meta/info.json says, "
                 f"{(*camera.size, 3)}",
                 found=shape,
-                remedy="record pictures of one size in one dataset",
+                remedy="record pictures of one size, in colour, in one dataset",
             )
 
 
@@ -182,12 +179,11 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
-    return Recordings(
-        root, tuple(episodes), (*faults, *of_videos, *_odd_stats(dataset.meta.stats, columns, layout)), source, layout
-    )
+    odd = _odd_stats(dataset.meta.stats, columns, layout, [camera.key for camera in cameras])
+    return Recordings(root, tuple(episodes), (*faults, *of_videos, *odd), source, layout)
 
 
-def _odd_stats(stats: Any, columns: Mapping[str, np.ndarray], layout: Layout) -> Iterator[Fault]:
+def _odd_stats(stats: Any, columns: Mapping[str, np.ndarray], layout: Layout, keys: Iterable[str]) -> Iterator[Fault]:
     """Yield a fault for statistics by which LeRobot's trainer would normalise wrongly. We compute our own."""
     odd = []
     for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
@@ -202,6 +198,12 @@ def _odd_stats(stats: Any, columns: Mapping[str, np.ndarray], layout: Layout) ->
                 fits = False
             if not (fits and (np.abs(found - expected) <= within).all()):  # written so that NaN does not fit
                 odd.append(f"{key}'s {name}")
+    for key in keys:
+        said = (stats or {}).get(key) or {}
+        for name in ("mean", "std"):  # of some frames only; LeRobot's trainer takes ImageNet's unless told otherwise
+            with suppress(ValueError, TypeError, AttributeError):
+                found = np.asarray(said.get(name, 0.5), np.float64)
+                odd += [f"{key}'s {name}"] * (not ((found >= 0) & (found <= 1)).all())
     if odd:
         note = f"{odd[0]} is not that of the frames, and lerobot-train would normalise by it; compute them again"
         yield Fault("meta/stats.json", "odd_statistics", len(odd), note)
@@ -467,6 +469,11 @@ def _check_tables(root: Path, features: Mapping[str, Any], read: Set[str]) -> No
     """
     from pyarrow import parquet  # imported here, so that our own recordings do not wait for it
 
+    if old := [*root.glob("data/*/episode_*.parquet"), *root.glob("videos/*/*/episode_*.mp4")]:
+        raise EpisodeError(
+            f"{root}: {INFO} says v3, and {old[0].relative_to(root)} is of v2.1",
+            remedy="it was converted by half: convert the original again, into an empty folder",
+        )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
             raise _broken(f"{root}: has no {pattern}")
@@ -531,6 +538,13 @@ def _check_video_times(root: Path, meta: Any, key: str) -> list[Fault]:
             stream = opened.streams.video[0]
             end_s = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else np.inf
             frames, rate = stream.frames, float(stream.average_rate or meta.fps)
+            with suppress(av.FFmpegError):  # a damaged one is told when its last picture is read
+                turned = next((frame.rotation for frame in opened.decode(stream)), 0)
+                if turned:
+                    raise EpisodeError(
+                        f"{video}: says that it is to be shown turned by {turned} degrees, which some decoders do",
+                        remedy="encode it as it is to be seen, and train on that",
+                    )
         used = int(length[numbers].sum())
         if 0 < frames < used or rate < (1 - UNEVEN) * meta.fps:
             raise _broken(
@@ -569,7 +583,10 @@ def _said_of(path: Path, what: str) -> Iterator[None]:
         cause = e.__cause__ or e  # datasets wraps pyarrow's error
         reason = " ".join(str(cause).split())[:160]
         text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
-        raise _broken(f"{path}: {what} ({text})") from None
+        error = _broken(f"{path}: {what} ({text})")
+        if "FrameTimestampError" in text:  # of a film whose frames do not come at one rate
+            error.remedy = "encode it again with a frame at each of the dataset's times, i / fps"
+        raise error from None
 
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
@@ -599,7 +616,8 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
     for key, labels in ((STATE, layout.state_names), (ACTION, layout.action_names)):
         lows, highs = action_limits(labels, car)
         for i, name in enumerate(labels):
-            low, high = (lows[i], highs[i]) if key == ACTION else (-np.inf, np.inf)
+            # A state of these names is what the car is told when it drives: its last action.
+            low, high = (lows[i], highs[i]) if key == ACTION or labels == ACTION_NAMES else (-np.inf, np.inf)
             values = columns[key][:, i]
             if broken := np.flatnonzero(~np.isfinite(values)).tolist():
                 raise EpisodeError(

@@ -23,10 +23,7 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.car.servo_link import ServoLink, State
 
 with_firmware = [pytest.mark.emulated, needs.simavr]
-BOARDS = [
-    pytest.param(StandIn, id="stand-in"),
-    pytest.param(board, id="firmware", marks=with_firmware),
-]
+BOARDS = [pytest.param(StandIn, id="stand-in"), pytest.param(board, id="firmware", marks=with_firmware)]
 
 
 @pytest.fixture

@@ -13,10 +13,7 @@ from uno import CUT, LINE_IN, RESET, Uno, line, pulses, widths
 from rover_lib.onboard.car import car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 
-pytestmark = [
-    pytest.mark.emulated,
-    needs.simavr,
-]
+pytestmark = [pytest.mark.emulated, needs.simavr]
 
 # Who may arm, which lines are commands, and what noise does are the state machine's alone: tests/firmware has that.
 NEUTRAL = {"steering": 1456, "throttle": 120}

@@ -466,12 +466,7 @@ def test_a_fault_that_is_none():
 @needs.simavr
 def test_some_faults_on_the_pins(tmp_path):
     """One of each kind, one whose line only the next start writes, and a recording's replay; `make faults` has all."""
-    names = [
-        "camera frozen",
-        "SIGKILL",
-        "human takes over by steering",
-        "old line replayed",
-    ]
+    names = ["camera frozen", "SIGKILL", "human takes over by steering", "old line replayed"]
     outcome = faults.run_faults([*names, "bytes"])
     assert outcome.wrong == []
     assert outcome.bytes["steering_steps"] == outcome.bytes["throttle_steps"] == outcome.bytes["steps"]

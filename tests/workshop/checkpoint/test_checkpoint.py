@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.kinds import kinds_of
+from rover_lib.onboard.kinds import KindError, kinds_of
 from rover_lib.workshop.act import ACT, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
@@ -64,6 +64,21 @@ def test_without_its_optimizer_it_is_the_same_policy(tiny, tiny_policy, tmp_path
     found = load_checkpoint(write(content, tmp_path / "weights.pth"))
     assert found.config == tiny.config and found.report["optimizer_mb"] == 0
     assert all(torch.equal(v, tiny.weights[k]) for k, v in found.weights.items() if k != "action_head.weight")
+
+
+def test_numbers_of_numpy_and_counts_of_batches_are_no_obstacle(tiny_policy, tmp_path):
+    """The config's whole numbers were "a int64", and the count that LeRobot drops was a weight that is no float."""
+    content = trainer_content(tiny_policy)
+    content["config"] = {k: np.int64(v) if type(v) is int else v for k, v in content["config"].items()}
+    content["model_state_dict"]["model.backbone.bn1.num_batches_tracked"] = torch.tensor(7)
+    (tmp_path / "a").mkdir()
+    write(content, tmp_path / "a/best_model.pth")
+    assert load_checkpoint(tmp_path / "a/best_model.pth").config.chunk == 32
+    for place in ("", "a"):  # a folder that holds it, and one that holds that
+        with pytest.raises(
+            KindError, match=r"holds a trainer's checkpoint, and is none itself, found .*best_model.pth"
+        ):
+            load_checkpoint(tmp_path / place)
 
 
 def test_reads_scalars_of_old_and_new_numpy(tiny_policy, tmp_path):

@@ -267,9 +267,7 @@ def test_embedding_tables_would_be_weight_only(tiny):
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [{"mode": "int4"}, {"kind": "odd"}, {"observer": "guess"}, {"smooth": 1.5}, {"percentile": 0.0}],
-    ids=str,
+    "bad", [{"mode": "int4"}, {"kind": "odd"}, {"observer": "guess"}, {"smooth": 1.5}, {"percentile": 0.0}], ids=str
 )
 def test_a_scheme_that_exists_is_valid(bad):
     with pytest.raises(QuantizeError, match=next(iter(bad))):

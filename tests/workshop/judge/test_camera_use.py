@@ -39,10 +39,7 @@ class Known:
 def samples(count):
     """The k-th shows k and was at k / 100."""
     return [
-        SimpleNamespace(
-            frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8),
-            state=np.full(2, k / 100, np.float32),
-        )
+        SimpleNamespace(frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8), state=np.full(2, k / 100, np.float32))
         for k in range(count)
     ]
 

@@ -17,7 +17,6 @@ from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.stage import plain
 from rover_lib.workshop import plots
 from rover_lib.workshop.judge import compare
-from rover_lib.workshop.recordings.samples import pick_evenly
 
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
@@ -167,15 +166,6 @@ def test_figures_leave_out_what_is_not_judged(still):
 
 
 @pytest.mark.filterwarnings("error")
-def test_choices_are_drawn_without_what_is_not_judged():
-    table = {name: {"steering_mae_pct": 0.5, "throttle_mae_pct": None} for name in ("minmax", "histogram")}
-    steps = [{"float_blocks": [], "cost_pct": 0.0, "steering_mae_pct": 0.5, "throttle_mae_pct": None}]
-    for figure in (plots.errors_by_choice(table, "observers"), plots.sensitivity(table, steps, 1.0)):
-        figure.draw_without_rendering()
-        words = [t.get_text() for ax in figure.axes for t in (ax.get_legend().get_texts() if ax.get_legend() else ())]
-        assert "steering" in words and "throttle: not judged" in words
-
-
 def test_other_actions_are_keyed_by_name_and_have_no_pulses():
     names = ("action_0", "action_1")
     policy, other = Fixed(np.zeros((3, 2)), names=names), Fixed(np.zeros((3, 2)), names=names)
@@ -195,11 +185,6 @@ def test_other_actions_are_keyed_by_name_and_have_no_pulses():
 def test_refusals_are_sentences(samples, other, ranges, words):
     with pytest.raises(PolicyError, match=words):
         compare.fidelity(Fixed(np.zeros((3, 2))), {"static": other}, samples, ranges)
-
-
-def test_picking_evenly_keeps_first_and_last():
-    assert pick_evenly(range(100), 4) == (0, 33, 66, 99)
-    assert pick_evenly(range(3), 4) == (0, 1, 2)
 
 
 def test_frames_of_drives_become_observations():

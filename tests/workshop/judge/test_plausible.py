@@ -68,11 +68,6 @@ def test_statistics_of_other_states_are_said(tiny, driven):
     assert [w for w in told if w.startswith("state throttle: the policy is told up to ")]
 
 
-def test_an_action_that_never_changes_is_left_out(tiny, driven):
-    fit = fits(tiny, driven, ranges(driven) | {"throttle": (0.1, 0.1)})
-    assert [a.name for a in fit.actions] == ["steering"]
-
-
 @pytest.mark.parametrize(("hz", "warned"), [(28.0, False), (33.0, False), (15.0, True), (60.0, True)])
 def test_recordings_of_another_rate_are_said(tiny, driven, hz, warned):
     """The trainer's file does not say how fast it plans, which is 30 steps a second. Of 15, it drives twice as fast."""

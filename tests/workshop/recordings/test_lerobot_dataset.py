@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -26,6 +27,7 @@ from pyarrow import compute, parquet
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
+from rover_lib.onboard.kinds import KindError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -83,10 +85,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (
-            info(codebase_version="v2.1"),
-            "only v3 is read; convert it once by LeRobot's own `python -m lerobot.",
-        ),
+        (info(codebase_version="v2.1"), "only v3 is read; convert it once by LeRobot's own `python -m lerobot."),
         (info(codebase_version="v4.0"), "only v3 is known here"),
         (info(codebase_version=3), "does not name a version"),
         (info(fps=0), "does not give a number of frames per second"),
@@ -121,7 +120,8 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
 
 def test_a_folder_of_datasets_and_one_without_its_info_are_told_apart(tmp_path):
     written(tmp_path / "a", info())
-    assert "holds LeRobotDatasets, each by itself, found a; give one" in refused(tmp_path)
+    with pytest.raises(KindError, match=r"holds a LeRobotDataset, and is none itself, found a; give that, as in .*/a$"):
+        load_recordings(tmp_path)
     (tmp_path / "a/meta/info.json").unlink()
     (tmp_path / "a/data").mkdir()
     assert "a LeRobotDataset without meta/info.json" in refused(tmp_path / "a")
@@ -361,6 +361,15 @@ def film(path, frames, fps):
         target.mux(stream.encode())
 
 
+def turned(path):
+    """Writes a film, and into its header that it is to be shown turned by a quarter."""
+    film(path, 33, FPS)
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 44
+    data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, SIZE[0] << 16, 0, 1 << 30)
+    path.write_bytes(data)
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -433,6 +442,11 @@ def cut(path):
                                 (lambda i: i.convert("RGBA"), "(72, 128, 4)"))),
         ("video", "data/chunk-000/file-000.parquet", column("timestamp", 0.002),
          "1 frames have another time than their picture in the video, found frame 0 is 2.00 ms off"),
+        ("video", f"{VIDEO}chunk-000/file-000.mp4", turned, "is to be shown turned by -90 degrees"),
+        ("image", "data/chunk-000/file-000.parquet", column("observation.state", [30.0, 0.1]),
+         "steering of 'observation.state' is 30 in frame 0 and 0 more, a rover's lies from -1 to 1"),
+        ("image", "data/chunk-000/file-000.parquet", lambda p: shutil.copy(p, p.with_name("episode_000000.parquet")),
+         "says v3, and data/chunk-000/episode_000000.parquet is of v2.1; it was converted by half"),
         ("video", "meta/info.json",
          lambda p: edit(p, lambda c: c["features"][CAM].update(info={"is_depth_map": True})), "is not a colour camera"),
         *(("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p, a=args: film(p, *a), says)
@@ -462,6 +476,8 @@ def edit(path, change):
               (lambda c: c["action"].update(std=None, max="a", min=[1, 1, 1]), 3, "min"),
               (lambda c: c["action"].update(mean=[50.0, 50.0]), 1, "mean"),
               (lambda c: c.pop("action"), 4, "min"))),
+        ("image", "meta/stats.json", lambda p: edit(p, lambda c: c[CAM].update(std=[[[math.nan]]], mean=[[[127.0]]])),
+         ("odd_statistics", 2, f"{CAM}'s mean is")),
         ("image", "meta/stats.json", lambda p: p.unlink(), ("odd_statistics", 8, "observation.state's min is")),
         ("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p: film(p, 40, FPS),
          ("more_frames", 7, "has 40 frames, 33 of them in data")),
