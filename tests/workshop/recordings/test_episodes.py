@@ -71,6 +71,24 @@ def load(root, **options):
 # ---- a faultless recording -------------------------------------------------------------------------------
 
 
+def test_actions_are_the_nearest_controls(tmp_path):
+    folder = record(tmp_path)
+    content = json.loads((folder / "episode_data.json").read_text())
+    for sample, frame in zip(load(tmp_path).samples, content["frame_samples"], strict=True):
+        nearest = min(content["control_samples"], key=lambda c: abs(c["system_timestamp"] - frame["timestamp"]))
+        expected = [nearest["steering_normalized"], nearest["throttle_normalized"]]
+        assert sample.chunk[0].tolist() == np.float32(expected).tolist()
+
+
+def test_frame_ids_need_not_start_at_1(tmp_path):
+    def change(content):
+        for frame in content["frame_samples"]:
+            frame["frame_id"] += 816
+
+    edit(record(tmp_path), change)
+    assert load(tmp_path).faults == ()
+
+
 def test_pairs_of_a_faultless_recording(tmp_path):
     record(tmp_path)
     recordings = load(tmp_path)
