@@ -331,8 +331,7 @@ def _train_rounded(work: _Work, room: _Room, policy: BatchedPolicy, saved: Resum
     if not path.exists():
         calibration, scheme = _calibrate(work, student)
         save_torch(path, {"calibration": calibration.__dict__, "scheme": asdict(scheme)})
-    kept = _read_phase(path)
-    rounded = RoundedPolicy(student, Scheme.of(kept["scheme"]), Calibration(**kept["calibration"])).to(work.device)
+    rounded = RoundedPolicy(student, *_ranges_before(folder)).to(work.device)
     exact = BatchedPolicy(work.config, student.weights).to(work.device)
 
     def off(batch: Batch) -> Tensor:
@@ -342,6 +341,12 @@ def _train_rounded(work: _Work, room: _Room, policy: BatchedPolicy, saved: Resum
         return ((rounded(policy.named_weights(), pictures, states) - wanted).abs() * room.units).mean()
 
     room.train(saved, "qat", policy, work.recipe.qat_rate, off)
+
+
+def _ranges_before(folder: Path) -> tuple[Scheme, Calibration]:
+    """How the student was rounded before phase four."""
+    kept = _read_phase(folder / "ranges.pt")
+    return Scheme.of(kept["scheme"]), Calibration(**kept["calibration"])
 
 
 def _checkpoint(work: _Work, weights: dict[str, Tensor]) -> Checkpoint:
@@ -356,13 +361,6 @@ def _calibrate(work: _Work, student: Checkpoint) -> tuple[Calibration, Scheme]:
     calibration = calibrate(student, samples, smooth=how.scheme.smooth, progress=work.progress)
     chooser = quantization.prepare_chooser(student, work.opened, calibration)
     return calibration, chooser.observer(how.scheme, how.observers, work.progress)[0]
-
-
-def _quantize(work: _Work, weights: dict[str, Tensor]) -> tuple[QuantizedPolicy, Calibration]:
-    """A student in static INT8, and what calibrated it."""
-    student = _checkpoint(work, weights)
-    calibration, scheme = _calibrate(work, student)
-    return quantize(student, scheme, calibration), calibration
 
 
 # --- judging ----------------------------------------------------------------------------------------------------------
@@ -472,11 +470,14 @@ def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
             (_row(name, work.config, taught.weights, work.share, work.qat), own),
         )
     ]
-    rounded, calibration = _quantize(work, taught.weights)
+    exact = _checkpoint(work, taught.weights)
+    calibration, scheme = _calibrate(work, exact)
+    rounded = quantize(exact, scheme, calibration)
     students[1] |= _int8_errors(work, taught.weights, rounded, held_out, planned)
     unrounded = None
     if taught.unrounded:
-        unrounded = _int8_errors(work, taught.unrounded, _quantize(work, taught.unrounded)[0], held_out, planned)
+        before = quantize(_checkpoint(work, taught.unrounded), *_ranges_before(taught.folder))
+        unrounded = _int8_errors(work, taught.unrounded, before, held_out, planned)
     chosen = _plans(work, work.config, taught.weights, choosing)
     driven = ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())

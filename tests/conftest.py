@@ -85,17 +85,6 @@ def tiny_policy():
     return lerobot_policy(**TINY)
 
 
-@pytest.fixture(scope="module")
-def full_policy():
-    """A policy of the user's size: 84 million parameters, which no process keeps longer than it needs them."""
-    from policies import FULL, lerobot_policy
-
-    from rover_lib.workshop.int8.quantize import forget_graphs
-
-    forget_graphs()  # of what tests before have left, up to LEFT_MB, for there is no room beside it
-    return lerobot_policy(**FULL)
-
-
 @pytest.fixture(scope="session")
 def tiny_file(made_once, request) -> Path:
     def make(folder: Path) -> None:
@@ -151,25 +140,33 @@ def artifacts(made_once, request) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
-def hailo_kit(tiny, tmp_path_factory) -> Path:
+def hailo_kit(made_once, request) -> Path:
     """A kit of the tiny policy for Hailo's compiler. A test that writes into it must copy it first."""
-    from hailo_kit import make_kit, normalised
 
-    return make_kit(normalised(tiny), tmp_path_factory.mktemp("hailo") / "kit")
+    def make(folder: Path) -> None:
+        from hailo_kit import make_kit, normalised
+
+        make_kit(normalised(request.getfixturevalue("tiny")), folder / "kit")
+
+    return made_once("hailo", make) / "kit"
 
 
 @pytest.fixture(scope="session")
-def onnx_static(tiny, calibration, tmp_path_factory) -> Path:
+def onnx_static(made_once, request) -> Path:
     """The same policy as `artifacts["static"]`, exported for ONNX Runtime."""
-    from policies import memory_samples
 
-    from rover_lib.workshop.int8.export import export
-    from rover_lib.workshop.int8.quantize import quantize
-    from rover_lib.workshop.int8.scheme import Scheme
+    def make(folder: Path) -> None:
+        from policies import memory_samples
 
-    path = tmp_path_factory.mktemp("onnx") / "policy_static.onnx.zip"
-    export(quantize(tiny, Scheme("static"), calibration), tiny, path, memory_samples(4, seed=1), calibration)
-    return path
+        from rover_lib.workshop.int8.export import export
+        from rover_lib.workshop.int8.quantize import quantize
+        from rover_lib.workshop.int8.scheme import Scheme
+
+        tiny, calibration = request.getfixturevalue("tiny"), request.getfixturevalue("calibration")
+        quantized = quantize(tiny, Scheme("static"), calibration)
+        export(quantized, tiny, folder / "policy_static.onnx.zip", memory_samples(4, seed=1), calibration)
+
+    return made_once("onnx", make) / "policy_static.onnx.zip"
 
 
 @pytest.fixture(scope="session")

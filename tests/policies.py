@@ -3,6 +3,7 @@
 # LeRobot takes ten seconds to import, and every process that collects tests would pay for it: import it in functions.
 
 import gc
+import re
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 
 if TYPE_CHECKING:
+    from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
 
     from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -30,6 +32,23 @@ def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarra
     return (cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1) * 255).astype(np.uint8)
 
 
+def lerobot_config(cameras: dict[str, tuple[int, int]], states: int = 2, actions: int = 2, **config) -> "ACTConfig":
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+
+    config.setdefault("n_action_steps", config.get("chunk_size", 100))
+    return ACTConfig(
+        input_features={
+            **{k: PolicyFeature(FeatureType.VISUAL, (3, *size)) for k, size in cameras.items()},
+            **({"observation.state": PolicyFeature(FeatureType.STATE, (states,))} if states else {}),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (actions,))},
+        pretrained_backbone_weights=None,
+        device="cpu",
+        **config,
+    )
+
+
 def lerobot_policy(
     cameras: dict[str, tuple[int, int]] | None = None, states: int = 2, actions: int = 2, seed: int = 0, **config
 ) -> "ACTPolicy":
@@ -38,8 +57,6 @@ def lerobot_policy(
     The statistics of its frozen batch norms are set from pictures, so that its features do not vanish.
     """
     first = "lerobot" not in sys.modules
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
     from torchvision.ops.misc import FrozenBatchNorm2d
 
@@ -47,20 +64,8 @@ def lerobot_policy(
         gc.collect()
         gc.freeze()  # each collection would take 0.3 s to find that all those modules are still used
     cameras = cameras or {"observation.images.cam_front": (72, 128)}
-    config.setdefault("n_action_steps", config.get("chunk_size", 100))
     torch.manual_seed(seed)
-    policy = ACTPolicy(
-        ACTConfig(
-            input_features={
-                **{k: PolicyFeature(FeatureType.VISUAL, (3, *size)) for k, size in cameras.items()},
-                **({"observation.state": PolicyFeature(FeatureType.STATE, (states,))} if states else {}),
-            },
-            output_features={"action": PolicyFeature(FeatureType.ACTION, (actions,))},
-            pretrained_backbone_weights=None,
-            device="cpu",
-            **config,
-        )
-    ).eval()
+    policy = ACTPolicy(lerobot_config(cameras, states, actions, **config)).eval()
     rng = np.random.default_rng(seed)
     h, w = next(iter(cameras.values()))
     x = np.stack([smooth_frame(rng, h, w) for _ in range(2)]).transpose(0, 3, 1, 2).astype(np.float32) / 64 - 2
@@ -170,6 +175,18 @@ def of_a_cars_size(path: Path) -> Path:
         policy.model.action_head.bias.copy_(torch.tensor([0.0, 0.05]))
     torch.save(trainer_content(policy), path)
     return path
+
+
+INNER = re.compile(r"(backbone\.layer\d\.\d)\.(?:conv1\.weight|bn1\.weight|bn1\.bias|conv2\.weight)")
+
+
+def with_few_channels(weights: dict[str, torch.Tensor], kept: int) -> dict[str, torch.Tensor]:
+    """The weights with all but each kept-th channel inside the backbone's blocks zero, as --backbone-channels does."""
+    thin = {name: value.clone() for name, value in weights.items()}
+    for name in filter(INNER.fullmatch, thin):
+        channels = thin[name].transpose(0, 1) if "conv2" in name else thin[name]  # it reads them
+        channels[torch.arange(len(channels)) % kept > 0] = 0
+    return thin
 
 
 def dazzled_by_white(checkpoint: "Checkpoint") -> "Checkpoint":

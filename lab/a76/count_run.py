@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from lab.a76.core import A76, Core, CountError, emulate_script, prepare
-from lab.a76.count import COUNTED, OURS, STEADY, Counted, count_artifact, guest_of, side_by_side
+from lab.a76.core import A76, Core, CountError, prepare
+from lab.a76.count import COUNTED, STEADY, Counted, Guest, count_artifact, guest_of, side_by_side
 from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
@@ -61,7 +61,7 @@ def count_run(
     compared with what the FP32 artifact of its image size predicts on this machine; so is what it predicts on this
     machine. FP32 takes up to minutes for a frame in the emulated Pi. So it predicts only a few frames there, which must
     equal this machine's within the parity vectors' tolerance. An artifact without an FP32 of its image size is only
-    counted. For policy_static the bits that its INT8 backbone gives are compared too (see `backbone_bits`).
+    counted. For policy_static the bits that its INT8 backbone gives are compared too (see `cut_backbone`).
     jobs: how many artifacts are counted at a time, each in one thread and below 1 GB; this machine's cores if None.
     Raises CountError, or what reading the run raises.
     """
@@ -76,20 +76,21 @@ def count_run(
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
-        raise CountError(
-            f"{run_dir}: its recordings have no held-out frames to judge with", remedy="record more episodes"
-        )
+        raise CountError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
     core = prepare(progress)
     plans = plans_of(manifests, len(samples))
-    counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
+    with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
+        guests = {stem: guest_of(path) for stem, path in artifacts.items()}
+        if STATIC in artifacts:
+            guests[STATIC] = cut_backbone(run_dir, again.checkpoint, pick_evenly(samples, BIT_FRAMES), Path(scratch))
+        counts = _count_all(core, artifacts, plans, guests, samples, jobs or os.cpu_count() or 1, progress)
+        bits = {"backbone_bits": compare_bits(Path(scratch))} if STATIC in artifacts else {}
     rows = {stem: artifact_metrics(counts[stem], manifests[stem]) for stem in artifacts}
     for stem, judged in _judge(artifacts, plans, counts, samples, again, progress).items():
         rows[stem] |= judged
-    metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
+    metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows, **bits}
     if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
         metrics["note"] = note
-    if STATIC in artifacts:
-        metrics["backbone_bits"] = backbone_bits(run_dir, core, again.checkpoint, pick_evenly(samples, BIT_FRAMES))
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
     given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
@@ -152,6 +153,7 @@ def _count_all(
     core: Core,
     artifacts: Mapping[str, Path],
     plans: Mapping[str, Plan],
+    guests: Mapping[str, Guest],
     samples: Sequence[Any],
     jobs: int,
     progress: Progress,
@@ -159,8 +161,7 @@ def _count_all(
     counts: dict[str, Callable[..., Counted]] = {}
     for stem, plan in plans.items():
         chosen = [samples[i] for i in plan.frames]
-        guest = guest_of(artifacts[stem])
-        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guest, counted=plan.counted)
+        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guests[stem], counted=plan.counted)
     inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
     return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
 
@@ -218,31 +219,31 @@ def errors_pct(
     return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}
 
 
-def backbone_bits(run_dir: Path, core: Core, checkpoint: Checkpoint, samples: Sequence[Any]) -> dict[str, int]:
-    """Check whether policy_static's INT8 backbone gives the same bits in the emulated Pi as on this machine.
+def cut_backbone(run_dir: Path, checkpoint: Checkpoint, samples: Sequence[Any], folder: Path) -> Guest:
+    """Cut policy_static's INT8 backbone out of the same graph (see pipeline.requantize), and run it on this machine.
 
-    The backbone (up to the image projection's INT8 output) is cut out of the same graph (see pipeline.requantize) and
-    run on prepared frames on both. Returns {frames, values, differing}: how many frames there were, how many values
-    were compared, and how many of them differ. Raises QuantizeError if policy_static.pt was not made from the run's
-    files.
+    It goes up to the image projection's INT8 output. folder: takes it, the samples' prepared frames, and its bits.
+    Returns a guest that leaves the emulated Pi's bits beside them after its predictions: to import torch again would
+    take longer than they do. Raises QuantizeError if policy_static.pt was not made from the run's files.
     """
     backbone = q.backbone_of(requantize(run_dir, checkpoint)).eval()
     inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
-    with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch, torch.inference_mode():
-        folder = Path(scratch)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
-            traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
-        traced.save(folder / "backbone.pt")
-        frames: dict[str, Any] = {}
-        for i, (_, *seen) in enumerate(inputs):
-            for camera, frame in zip(checkpoint.config.cameras, seen, strict=True):
-                frames[f"frame_{i:04d}.{camera}"] = frame.numpy()
-        np.savez(folder / "inputs.npz", state=torch.cat([x[0] for x in inputs]).numpy(), **frames)
-        with torch.jit.optimized_execution(False):
-            here = torch.cat([traced(*x) for x in inputs]).numpy()
-        emulate_script(core, OURS.script, ["--backbone", q.ENGINE, "backbone.pt", "inputs.npz"], folder)
-        there = np.load(folder / "backbone.npy")
+    with torch.inference_mode(), torch.jit.optimized_execution(False), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
+        traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
+        np.save(folder / "here.npy", torch.cat([traced(*x) for x in inputs]).numpy())
+    traced.save(folder / "backbone.pt")
+    frames: dict[str, Any] = {}
+    for i, (_, *seen) in enumerate(inputs):
+        for camera, frame in zip(checkpoint.config.cameras, seen, strict=True):
+            frames[f"frame_{i:04d}.{camera}"] = frame.numpy()
+    np.savez(folder / "inputs.npz", state=torch.cat([x[0] for x in inputs]).numpy(), **frames)
+    return Guest(arguments=(q.ENGINE, *(folder / name for name in ("backbone.pt", "inputs.npz", "there.npy"))))
+
+
+def compare_bits(folder: Path) -> dict[str, int]:
+    """Return how many frames there were, how many values were compared, and how many of them differ."""
+    here, there = (np.load(folder / f"{where}.npy") for where in ("here", "there"))
     if (here.dtype, here.shape) != (there.dtype, there.shape):
         expected, given = f"{here.dtype} {here.shape}", f"{there.dtype} {there.shape}"
         raise CountError(f"the backbone gives {expected} on this machine, and not on the core", found=given)

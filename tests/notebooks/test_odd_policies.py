@@ -97,16 +97,21 @@ def trained(robot, seen, folder):
     return plan
 
 
+def run_cells(name, run_dir, **given):
+    """A notebook's cells, one after the other, without a kernel, which imports torch once more."""
+    path, variables = NOTEBOOKS / f"{name}.ipynb", {}
+    known = parameters_of(path)
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            exec(cell.source, variables)
+        if "parameters" in cell.metadata.get("tags", []):
+            variables |= {k: v for k, v in {"run_dir": str(run_dir), **given}.items() if k in known}
+
+
 def run_here(run_dir, **given):
-    """The five notebooks' cells, one after the other, without a kernel each: they know each other only by files."""
+    """The five notebooks, which know each other only by files."""
     for name in NAMES:
-        path, variables = NOTEBOOKS / f"{name}.ipynb", {}
-        known = parameters_of(path)
-        for cell in nbformat.read(path, as_version=4).cells:
-            if cell.cell_type == "code":
-                exec(cell.source, variables)
-            if "parameters" in cell.metadata.get("tags", []):
-                variables |= {k: v for k, v in {"run_dir": str(run_dir), **QUICK, **given}.items() if k in known}
+        run_cells(name, run_dir, **(QUICK | given))
 
 
 # What a car's dataset may lack has tests of its own; make check-release sees it go the whole way.

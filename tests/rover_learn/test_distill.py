@@ -51,6 +51,16 @@ def recipe():
     return DistillRecipe(**{**params()["distill"], **steps, **few})
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_samples(tmp_path_factory):
+    """Eight samples calibrate a student, instead of all."""
+    path = tmp_path_factory.mktemp("params") / "few.yml"
+    path.write_text("calibration: {samples: 8}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_PARAMS", str(path))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     """Each test has a cache of its own. Of all students `taught` alone chooses its observer, by three quantizations."""

@@ -12,11 +12,10 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from interrupted import interrupt, save_each_step
-from policies import TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content
+from policies import INNER, TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content, with_few_channels
 
 from rover_learn import finetune as finetune_module
 from rover_learn import training
-from rover_learn.channels import without_channels
 from rover_learn.finetune import FinetuneRecipe, finetune, human_samples
 from rover_learn.student import gmac
 from rover_lib.cli import main
@@ -235,15 +234,15 @@ def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, 
 @pytest.mark.slow
 def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old, new, recipe, tmp_path):
     """Channels that `rover distill --backbone-channels` left out stay zero, so the artifact stays as small."""
-    parent, rng = load_checkpoint(checkpoint), np.random.default_rng(0)
-    pictures = [torch.from_numpy(np.stack([smooth_frame(rng, 72, 128) for _ in range(4)]))]
-    thin, notes = without_channels(parent.weights, parent.config, 0.25, pictures, rng)
+    parent = load_checkpoint(checkpoint)
+    thin = with_few_channels(parent.weights, 4)
     settings = {"learning_rate": 1e-3, "batch_size": 4, "data_dir": "", "output_dir": "", "device": "cpu", "seed": 0}
     write_trainer(tmp_path / "best_model.pth", parent.config, thin, 0.1, {}, **settings)
     folder = finetune(tmp_path / "best_model.pth", [old, new], "thin", runs_dir=tmp_path, recipe=recipe, device="cpu")
     learned = load_checkpoint(folder / "best_model.pth")
-    assert len(notes) == 8
-    for name in (note["block"] for note in notes):
+    blocks = {inner[1] for inner in map(INNER.fullmatch, thin) if inner}
+    assert len(blocks) == 8
+    for name in blocks:
         for part in ("conv1.weight", "bn1.weight", "bn1.bias", "conv2.weight"):
             before, after = (of[f"{name}.{part}"] for of in (thin, learned.weights))
             if part == "conv2.weight":  # its inputs are the channels

@@ -205,7 +205,8 @@ def test_a_student_is_taught_into_its_runs_folder(tmp_path, monkeypatch):
     of_a_cars_size(tmp_path / "teacher.pth")
     episodes = record_drives(tmp_path / "episodes")
     student = {"size": "96x54", "decoder_layers": 1, "feedforward": 64, "steps": 4, "samples": 12}
-    job = Job(str(tmp_path / "teacher.pth"), str(episodes), student, {"worlds": 0}, {"distill.judged_frames": 4})
+    few = {"distill.judged_frames": 4, "calibration.samples": 8, "quantization.observers": ["minmax"]}
+    job = Job(str(tmp_path / "teacher.pth"), str(episodes), student, {"worlds": 0}, few)
     sweeping.Notebooks().prepare(job, tmp_path)
     student_file = tmp_path / job.name / "best_model.pth"
     config = load_checkpoint(student_file).config

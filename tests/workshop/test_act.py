@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import FULL, TINY, check_is, lerobot_policy, saved, saved_processors, smooth_frame
+from policies import FULL, TINY, check_is, lerobot_config, lerobot_policy, saved, saved_processors, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
@@ -27,6 +27,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 SHAPES = {
     "the user's": FULL,
+    "the user's widths and picture": {**FULL, "n_encoder_layers": 1, "n_decoder_layers": 2, "n_vae_encoder_layers": 1},
     "tiny": TINY,
     "resnet34": {**TINY, "vision_backbone": "resnet34"},
     "dim 256, 4 heads, feed-forward 777": {**TINY, "dim_model": 256, "n_heads": 4, "dim_feedforward": 777},
@@ -66,23 +67,26 @@ def read(folder, for_int8: bool) -> ACT:
     return ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
 
 
-@pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
-def test_equals_lerobot(name, request, tmp_path):
-    policy = request.getfixturevalue("full_policy") if SHAPES[name] is FULL else lerobot_policy(**SHAPES[name])
+# All of the user's layers take 2 GB, and say no more than the other shapes' one to three do at smaller widths.
+MARKS = {"the user's": pytest.mark.release, "tiny": ()}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=MARKS.get(n, pytest.mark.slow)) for n in SHAPES])
+def test_equals_lerobot(name, tmp_path):
+    policy = lerobot_policy(**SHAPES[name])
     policy.save_pretrained(tmp_path)
     for for_int8, mean in ((False, IMAGENET_MEAN), (True, WHOLE_MEAN)):
         saved_processors(policy, tmp_path, image_stats(policy, mean))
         model = read(tmp_path, for_int8)
         assert all(isinstance(m, Columns if for_int8 else Pixels) for m in model.image_input)
-        for seed in range(2):
-            frames, state = observation(policy, seed)
-            batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
-            with torch.inference_mode():
-                expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
-                ours = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
-            assert ours.shape == expected.shape
-            assert expected.std() > 1e-3  # a constant answer would prove nothing
-            assert (ours - expected).abs().max() < 1e-5
+        frames, state = observation(policy, seed=int(for_int8))
+        batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
+        with torch.inference_mode():
+            expected = policy.predict_action_chunk(batch | {"observation.state": torch.from_numpy(state)[None]})
+            ours = model(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames.values()))
+        assert ours.shape == expected.shape
+        assert expected.std() > 1e-3  # a constant answer would prove nothing
+        assert (ours - expected).abs().max() < 1e-5
         del model  # a policy of the user's size has 270 MB of it
 
 
@@ -146,13 +150,17 @@ def test_cameras_that_are_normalised_differently_keep_the_float_stem():
 
 
 @pytest.mark.slow
-def test_counts_the_full_policys_arithmetic(full_policy):
+def test_counts_the_full_policys_arithmetic():
     """torch counts 15.02 G multiply-accumulates in LeRobot's own forward; ours may do fewer, never more."""
-    weights = {k.removeprefix("model."): v for k, v in full_policy.state_dict().items()}
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    with torch.device("meta"):  # LeRobot's needs no numbers
+        policy = ACTPolicy(lerobot_config(**FULL)).eval()
+        batch = {"observation.images.cam_front": torch.zeros(1, 3, 360, 640), "observation.state": torch.zeros(1, 2)}
+    with FlopCounterMode(display=False) as counter, torch.inference_mode(), torch.device("meta"):
+        policy.predict_action_chunk(batch)
+    weights = {k.removeprefix("model."): torch.ones(1).expand(v.shape) for k, v in policy.state_dict().items()}
     counts = multiply_accumulates(ACT(ActConfig(), weights))
-    batch = {"observation.images.cam_front": torch.zeros(1, 3, 360, 640), "observation.state": torch.zeros(1, 2)}
-    with FlopCounterMode(display=False) as counter, torch.inference_mode():
-        full_policy.predict_action_chunk(batch)
     theirs = counter.get_total_flops() / 2
     assert theirs / 1e9 == pytest.approx(15.02, abs=0.15)
     assert 0.97 * theirs < sum(counts.values()) <= theirs

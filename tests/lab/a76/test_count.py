@@ -1,6 +1,7 @@
 """Counting against what is known: a program whose instructions can be counted by hand, and itself."""
 
 import os
+import shutil
 import struct
 import subprocess
 from dataclasses import asdict, replace
@@ -10,16 +11,16 @@ from types import SimpleNamespace
 import needs
 import numpy as np
 import pytest
-import torch
 from policies import memory_samples
 
 from lab.a76 import core as a76
 from lab.a76 import count_run as counting
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, CountError, emulate, prepare
-from lab.a76.count import STEADY, Counted, count_artifact, write_observations
+from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, write_observations
 from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
+from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.care import pi5
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -35,6 +36,7 @@ pytestmark = [pytest.mark.emulated, needs.qemu]
 # Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
 BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2, "policy_static.onnx": 39.2}
 SVC = 0xD4000001
+SMALL = "policy_static_54x96"
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
 
@@ -183,18 +185,15 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
     """A run's folder with artifacts of the tests' small policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
     checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
-    scheme, options = q.Scheme("static"), {"samples": samples[:3]}
-    # Another image size, without an FP32 of its own.
-    small = checkpoint.at_size(54, 96)
-    calibration = calibrate(small, samples[:4])
-    static = q.quantize(small, scheme, calibration)
-    export(static, small, folder / "policy_static_54x96.pt", calibration=calibration, **options)
+    # Each parity vector of FP32 takes the emulated core four seconds.
+    scheme, options = q.Scheme("static"), {"samples": samples[:1]}
     calibration = calibrate(checkpoint, samples)
     calibration.save(folder / "calibration.pt")
     export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
     digest = export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
     export(static, checkpoint, folder / "policy_static.onnx.zip", calibration=calibration, **options)
+    shutil.copy(folder / "policy_static.pt", folder / f"{SMALL}.pt")  # its name is that of a size without an FP32
     modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
     inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
     write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
@@ -215,16 +214,23 @@ def counts() -> dict[str, Counted]:
     return {}
 
 
+def as_planned(counted: Counted, plan: counting.Plan) -> Counted:
+    """The same emulated inferences, as many as are asked for."""
+    return replace(counted, chunks=counted.chunks[: len(plan.frames)], inferences=counted.inferences[: plan.counted])
+
+
 @pytest.fixture(scope="module")
 def report(core, tiny_run, again, counts) -> dict:
-    """count_run on held-out frames from memory."""
+    """count_run on held-out frames from memory. FP32 is counted like a slow one: a frame takes four seconds."""
     count_all = counting._count_all
 
-    def keep(*args):
-        counts.update(count_all(*args))
+    def keep(core, artifacts, plans, *args):
+        counts.update(count_all(core, artifacts, {stem: plans[stem] for stem in plans if stem != SMALL}, *args))
+        counts[SMALL] = as_planned(counts["policy_static"], plans[SMALL])
         return counts
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(counting, "SLOW_GMAC", 0.0)
         patch.setattr(counting, "open_run", lambda run_dir: again)
         patch.setattr(counting, "_count_all", keep)
         return count_run(tiny_run, frames=12)
@@ -240,7 +246,7 @@ def test_a_run_is_counted(report, tiny_run):
     assert static["reference_max_difference"] < 1e-4
     assert fp32["workstation_steering_mae_pct"] == fp32["workstation_throttle_mae_pct"] == 0
     assert fp32["steering_mae_pct"] < 1e-3 and fp32["throttle_mae_pct"] < 1e-2  # another order of sums
-    assert fp32["frames_on_the_core"] == 10
+    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (STEADY, None)
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
     assert static["threads"] == 1 and static["frames_on_the_core"] == 12
@@ -282,9 +288,8 @@ def test_a_pi_4_has_no_dot_product(report, counts, tiny_run, again, monkeypatch)
 
 
 def test_an_image_size_without_fp32_is_only_counted(report):
-    static, small = (report["metrics"]["artifacts"][f"policy_static{size}"] for size in ("", "_54x96"))
-    assert (small["image_height"], small["image_width"]) == (54, 96)
-    assert 0 < small["sdot_g"] < static["sdot_g"] and small["instructions_g"] < static["instructions_g"]
+    small = report["metrics"]["artifacts"][SMALL]
+    assert small["instructions_g"] > small["sdot_g"] > 0
     assert small["tenth_g"] is None and not [key for key in small if "mae" in key or "reference" in key]
 
 
@@ -301,54 +306,31 @@ def test_the_int8_backbone_is_the_same_bit_for_bit(report):
     assert bits == {"frames": 4, "values": 4 * 64 * 3 * 4, "differing": 0}
 
 
-def test_bits_that_differ_are_found(core, tiny_run, again, monkeypatch):
-    def flipped(_: Core, script: Path, arguments: list[str], folder: Path) -> None:
-        torch.backends.quantized.engine = q.ENGINE
-        with np.load(folder / "inputs.npz") as seen, torch.inference_mode():
-            frame = torch.from_numpy(seen["frame_0000.cam_front"])
-            flipped_bits = torch.jit.load(folder / "backbone.pt")(torch.from_numpy(seen["state"]), frame).numpy()
-        flipped_bits[0, 0, 0, 0] += 1
-        np.save(folder / "backbone.npy", flipped_bits)
-
-    monkeypatch.setattr(counting, "emulate_script", flipped)
-    bits = counting.backbone_bits(tiny_run, core, again.checkpoint, memory_samples(1))
-    assert bits == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
+def test_bits_that_differ_are_found(tiny_run, again, tmp_path):
+    counting.cut_backbone(tiny_run, again.checkpoint, memory_samples(1), tmp_path)
+    bits = np.load(tmp_path / "here.npy")
+    bits[0, 0, 0, 0] += 1
+    np.save(tmp_path / "there.npy", bits)
+    assert counting.compare_bits(tmp_path) == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
+    np.save(tmp_path / "there.npy", bits[0])
+    with pytest.raises(CountError, match="and not on the core"):
+        counting.compare_bits(tmp_path)
 
 
-def test_another_calibration_has_no_bits_to_compare(core, tiny_run, again, tmp_path):
+def test_another_calibration_has_no_bits_to_compare(tiny_run, again, tmp_path):
     for name in ("policy_static.pt", "quantize.json"):
         (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
     calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
     with pytest.raises(QuantizeError, match=r"calibration\.pt are not those of quantize\.json"):
-        counting.backbone_bits(tmp_path, core, again.checkpoint, memory_samples(1))
+        counting.cut_backbone(tmp_path, again.checkpoint, memory_samples(1), tmp_path)
 
 
-def test_a_slow_fp32_is_held_against_this_machines(report, tiny_run, again, counts, tmp_path, monkeypatch):
-    for path in tiny_run.glob("policy_*"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-
-    def fewer(_, artifacts, plans, *args):
-        """The same emulated inferences, as many as are asked for."""
-        return {
-            stem: replace(c, chunks=c.chunks[: len(plan.frames)], inferences=c.inferences[: plan.counted])
-            for stem, c in counts.items()
-            for plan in [plans[stem]]
-        }
-
-    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
-    monkeypatch.setattr(counting, "_count_all", fewer)
-    monkeypatch.setattr(counting, "backbone_bits", lambda *args: report["metrics"]["backbone_bits"])
-    monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
-    artifacts = count_run(tmp_path, frames=12)["metrics"]["artifacts"]
-    fp32, static, before = (
-        artifacts["policy_fp32"],
-        artifacts["policy_static"],
-        report["metrics"]["artifacts"]["policy_static"],
-    )
-    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (STEADY, None)
-    assert 0 < static["reference_max_difference"] < 1e-4
-    same = ("instructions_g", "tenth_g", "frames_on_the_core", "steering_mae_pct", "throttle_mae_pct")
-    assert {key: static[key] for key in same} == {key: before[key] for key in same}
+def test_a_small_fp32_is_compared_on_as_many_frames_as_are_counted(tiny_run):
+    manifests = {path.stem: read_manifest(path) for path in tiny_run.glob("policy_*.pt")}
+    plans = counting.plans_of(manifests, 12)
+    assert (len(plans["policy_fp32"].frames), plans["policy_fp32"].counted) == (COUNTED, COUNTED)
+    assert plans["policy_static"] == counting.Plan("policy_fp32", tuple(range(12)), COUNTED)
+    assert next(iter(plans)) == "policy_fp32"  # takes longest
 
 
 def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
@@ -357,6 +339,7 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again,
     fake = SimpleNamespace(chunks=np.full((STEADY, 32, 2), 0.5, np.float32))
     monkeypatch.setattr(counting, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
     monkeypatch.setattr(counting, "artifact_metrics", lambda counted, manifest: {})
+    monkeypatch.setattr(counting, "compare_bits", lambda folder: {})
     with pytest.raises(CountError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count_run(tiny_run, frames=4)
 

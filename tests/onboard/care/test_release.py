@@ -41,6 +41,14 @@ def signed(artifacts, keys) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
+def third(signed, keys, tmp_path_factory) -> Path:
+    """Another artifact that is fit to deploy, as small as the two: each command hashes what a rover has."""
+    path = write_changed_artifact(signed["static"], tmp_path_factory.mktemp("third") / "policy.pt", answers=1e-6)
+    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
+    return path
+
+
+@pytest.fixture(scope="session")
 def two(signed) -> tuple[Path, Path]:
     """Two artifacts that differ and are fit to deploy, their parity vectors run."""
     found = signed["static"], signed["mixed"]
@@ -75,11 +83,17 @@ def releases(tmp_path, first_models) -> Releases:
     return quick(Path(shutil.copytree(first_models, tmp_path / "models", symlinks=True)))
 
 
+@pytest.fixture(scope="session")
+def full_models(first_models, third, keys, tmp_path_factory) -> Path:
+    """They, with a release that the next deployment will remove."""
+    models = shutil.copytree(first_models, tmp_path_factory.mktemp("full") / "models", symlinks=True)
+    Releases(models, signers=keys / "signers").stage(third)
+    return models
+
+
 @pytest.fixture
-def full(releases, signed) -> Releases:
-    """It, with a release that the next deployment will remove."""
-    releases.stage(signed["fp32"], allow=["mode"])
-    return releases
+def full(tmp_path, full_models) -> Releases:
+    return quick(Path(shutil.copytree(full_models, tmp_path / "full", symlinks=True)))
 
 
 def deploy(r: Releases, source: Path) -> str:
@@ -193,7 +207,6 @@ def test_power_cut_at_each_step_of_a_deployment(full, two, n):
     old = full.current
     lose(full.models, cut_after(lambda: deploy(full, two[1]), n))
     assert_drives(full, {old, content_hash(two[1])})
-    load_policy(full.policy)
     new = deploy(full, two[1])  # running it again heals it
     assert new == content_hash(two[1]) == full.current
     assert_drives(full, {new})
@@ -510,11 +523,10 @@ def test_what_is_no_release_is_not_switched_to(releases, name):
 
 
 @pytest.mark.slow
-def test_back_and_back_again(releases, two, signed):
+def test_back_and_back_again(releases, two, third):
     first = releases.current
     second = deploy(releases, two[1])
-    third = releases.stage(signed["fp32"], allow=["mode"]).name
-    releases.switch(third)
+    releases.switch(releases.stage(third).name)
     assert releases.status()["can_roll_back_to"] == second
     assert [releases.rollback(), releases.rollback()] == [second, first]
     with pytest.raises(ReleaseError, match=f"no release to roll back to; {first[:12]} stays in use"):
@@ -533,19 +545,19 @@ def test_rollback_with_nothing_to_roll_back_to(releases, tmp_path):
 
 
 @pytest.mark.slow
-def test_rollback_passes_over_what_is_damaged(releases, two, signed):
+def test_rollback_passes_over_what_is_damaged(releases, two, third):
     first = releases.current
     second = deploy(releases, two[1])
-    releases.switch(releases.stage(signed["fp32"], allow=["mode"]).name)
+    releases.switch(releases.stage(third).name)
     damage(releases.path_of(second))
     assert releases.status()["can_roll_back_to"] == first == releases.rollback()
 
 
 @pytest.mark.slow
-def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, signed):
+def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, third):
     first = releases.current
     second = deploy(releases, two[1])
-    never = releases.stage(signed["fp32"], allow=["mode"]).name
+    never = releases.stage(third).name
     assert releases.prune(3) == []
     assert releases.prune(2) == [never]
     releases.rollback()
@@ -627,13 +639,12 @@ def test_a_history_that_is_no_history(releases, two):
 
 
 @pytest.mark.parametrize(
-    "number, says",
+    "number, says, n",
     [
-        (errno.ENOSPC, "the disk is full; what was in use still is"),
-        (errno.EROFS, "the disk cannot be written (Read-only"),
+        *((errno.ENOSPC, "the disk is full; what was in use still is", n) for n in range(1, 7)),
+        (errno.EROFS, "the disk cannot be written (Read-only", 1),
     ],
 )
-@pytest.mark.parametrize("n", range(1, 7))
 @pytest.mark.slow
 def test_a_disk_that_is_full_or_dying_at_some_step(releases, two, n, number, says):
     old, count = releases.current, 0

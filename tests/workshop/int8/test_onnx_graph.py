@@ -8,10 +8,9 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
+from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame, with_few_channels
 from torch import nn
 
-from rover_learn.channels import without_channels
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, predictions
@@ -129,11 +128,8 @@ def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
 @pytest.mark.slow
 def test_int8_policy_of_half_the_channels_is_the_same(tiny):
     """What `rover distill --backbone-channels 0.5` leaves, computed as the graph says: kernels for AVX2 saturate."""
-    samples, rng = memory_samples(8), np.random.default_rng(0)
-    pictures = [torch.from_numpy(np.stack([sample.picture for sample in samples]))]
-    weights, _ = without_channels(tiny.weights, tiny.config, 0.5, pictures, rng)
-    student = replace(tiny, weights=tiny.weights | weights, sha256="student")
-    quantized = quantize(student, Scheme(), calibrate(student, samples))
+    student = replace(tiny, weights=with_few_channels(tiny.weights, 2), sha256="student")
+    quantized = quantize(student, Scheme(), calibrate(student, memory_samples(8)))
     inputs = [inputs_of(s, tiny.config) for s in memory_samples(4, seed=1)]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()

@@ -4,10 +4,7 @@ import functools
 import gc
 import itertools
 import math
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +19,7 @@ from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
-from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
@@ -497,44 +494,11 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     assert not (tmp_path / "a.pt").exists()
 
 
-def test_the_optimizer_is_not_in_the_artifact(tiny_policy, artifacts):
+def test_an_artifact_has_the_weights_that_act_and_no_optimizer(tiny_policy, artifacts):
+    """Static: a byte for each and at most 3 % more, so the user's 66.5 million take less than 70 MB."""
     assert "optimizer_state_dict" in trainer_content(tiny_policy)
-    acting = 4 * sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
-    assert artifacts["fp32"].stat().st_size / 1e6 < 1.05 * acting + 0.3
-    assert artifacts["static"].stat().st_size < 0.3 * artifacts["fp32"].stat().st_size
-
-
-def he_weights(config: ActConfig) -> dict[str, torch.Tensor]:
-    """Random weights under which activations keep their size, without those that only train."""
-    torch.manual_seed(0)
-    weights = {}
-    for name, shape in expected_shapes(replace(config, vae_layers=0)).items():
-        if len(shape) > 1:
-            weights[name] = torch.randn(shape) * (2 / math.prod(shape[1:])) ** 0.5
-        else:
-            weights[name] = torch.ones(shape) if name.endswith(("weight", "running_var")) else torch.zeros(shape)
-    return weights
-
-
-def full_static_mb(folder: Path) -> float:
-    """Return the size of the user's policy as a static artifact, with random weights.
-
-    Calibrated on small frames: their size adds 0.5 MB of positions at 640x360, and no weight.
-    """
-    config = ActConfig()
-    checkpoint = Checkpoint(Path("full"), "trainer", config, he_weights(config), "full", {}).at_size(72, 128)
-    samples = memory_samples(2)
-    calibration = calibrate(checkpoint, samples)
-    quantized = quantize(checkpoint, Scheme("static"), calibration)
-    export(quantized, checkpoint, folder / "static.pt", samples=samples, calibration=calibration)
-    return (folder / "static.pt").stat().st_size / 1e6
-
-
-@pytest.mark.slow
-def test_the_users_full_size_static_artifact_is_at_most_70_mb(tmp_path):
-    """The floor is 66.4 MB, a byte per weight that acts; the optimizer and the VAE encoder are not in it.
-
-    In a process of its own, as it takes 2 GB.
-    """
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        assert 66 < process.submit(full_static_mb, tmp_path).result() <= 69
+    acting = sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
+    assert artifacts["fp32"].stat().st_size / 1e6 < 1.05 * 4 * acting + 0.3
+    assert acting < artifacts["static"].stat().st_size / 1e6 < 1.03 * acting
+    shapes = expected_shapes(replace(ActConfig(), vae_layers=0)).values()
+    assert sum(map(math.prod, shapes)) / 1e6 == pytest.approx(66.5, abs=0.1)
