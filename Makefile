@@ -28,7 +28,7 @@ help:
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
-	@echo "make test-fast                              what a minute and a half can prove"
+	@echo "make test-fast                              what two minutes can prove"
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
 	@echo "make check-release                          what takes two hours and a quiet machine"
 	@echo "make count NAME=demo [PEERS=1]              count a run's instructions on an emulated Cortex-A76; NAME=full makes"
