@@ -28,6 +28,7 @@ from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import pick_evenly
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
 # A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an
@@ -36,6 +37,7 @@ FLOAT_PER_INT8 = 4.2
 # Min-max alone clips nothing that calibration saw. On a handful of frames others often seem a little better, and on
 # frames of other episodes they were up to twice as bad: docs/quantization.md has how often, and by how much.
 CLIPPING_PAYS = 0.8  # times the error of what clips less: what clips more must be better than that
+SENSITIVITY_FRAMES = 24  # of the choosing frames: they only order the blocks, which are then tried on all
 USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are odd frames
 # Odd frames far above the others in every tensor lose their plans by narrow ranges, and widening one tensor mends
 # nothing while the next one clips. So all but the odd frames are also tried with every range wider, by these shares:
@@ -182,12 +184,14 @@ class Chooser:
         """Each block quantized alone, everything else in float: {block: errors}."""
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
         config, plain = self.checkpoint.config, replace(scheme, float_blocks=())
-        before = _BeforeBlocks(graph, blocks(config), self.inputs)
+        some = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES))
+        before = _BeforeBlocks(graph, blocks(config), [self.inputs[i] for i in some])
         table = {}
         for block in progress(blocks(config), desc="blocks"):
             forget_graphs()
             actions = before.predictions(convert(graph, config, plain, only=[block]), block)
-            table[block] = mae_pct(self._from_reference(actions), self.weights, self.action_range)
+            errors = (actions - self.reference[some]).abs().mean(1)
+            table[block] = mae_pct(errors, self.weights[some], self.action_range)
         return table
 
     def mixed(

@@ -257,7 +257,7 @@ class Recordings:
         found = sorted(f"{name} = {formula}" for name, formula in each)
         return (
             f"the actions of {len(changed)} of {len(self.episodes)} episodes were recomputed from their pulses, "
-            f"as they follow an older formula: {', '.join(found)}"
+            f"as they follow another formula: {', '.join(found)}"
         )
 
     def faults_by_kind(self) -> dict[str, dict[str, int]]:

@@ -4,6 +4,7 @@ import ast
 import mmap
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -136,11 +137,11 @@ def test_an_artifact_that_was_written_is_not_kept_in_memory(tiny, tmp_path):
     from rover_lib.workshop.int8.quantize import forget_graphs
 
     held = []
-    for _ in range(3):
+    for _ in range(4):
         export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "policy.pt", memory_samples(1))
         forget_graphs()
         held.append(int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6)
-    assert held[2] - held[1] < 25
+    assert min(after - before for before, after in pairwise(held)) < 25  # other memory may be taken in between
 
 
 def test_nothing_is_given_back_where_nothing_is_packed(artifacts):

@@ -477,7 +477,7 @@ def test_actions_of_another_formula_are_recomputed_from_their_pulses(tmp_path, f
     edit(tmp_path / "episode_20260101_120000", rewritten(formulas, wrong, share))
     recordings = load(tmp_path)
     assert np.abs(np.array([s.chunk.tolist() for s in recordings.samples]) - whole).max() <= 1e-4
-    assert recordings.recomputed().endswith(f"an older formula: {said}")
+    assert recordings.recomputed().endswith(f"another formula: {said}")
     assert recordings.faults_by_kind().keys() == {"recomputed from the pulses"}
     assert recordings.summary()["recomputed"] == recordings.recomputed()
 
