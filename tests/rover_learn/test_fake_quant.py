@@ -62,7 +62,8 @@ def test_every_layer_gives_what_the_int8_layer_gives(tiny, calibration, rounded,
             y = y.relu() if place != name else y
             y = torch.fake_quantize_per_tensor_affine(y, layer.scale, layer.zero_point, -128, 127)
             steps = ((y - out.dequantize()) / layer.scale).round().abs()
-            assert steps.max() <= 1 and steps.sum() <= max(3, 5e-3 * steps.numel()), name
+            ties = 1e-3 * steps.numel()  # about; how many fall on a layer is chance
+            assert steps.max() <= 1 and steps.sum() <= max(3, ties + 4 * ties**0.5), name
 
 
 @pytest.mark.slow
