@@ -4,7 +4,7 @@ from typing import Any
 
 
 def shorten(value: Any, digits: int = 4) -> Any:
-    """The same with so many digits of each number: nobody reads more."""
+    """Round each number in it to this many digits: nobody reads more."""
     if isinstance(value, dict):
         return {key: shorten(each, digits) for key, each in value.items()}
     if isinstance(value, list):

@@ -36,14 +36,8 @@ def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> 
     from rover_exchange.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
     from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 
-    for name in (
-        "episodes_are",
-        "faults_while_reading",
-        CAR,
-        DRIVEN_BY,
-        OUTCOMES,
-    ):  # too long to print; the file has them
-        del report[name]
+    for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, OUTCOMES):
+        del report[name]  # too long to print; the file has them
     show({done: report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
         from rover_lib.onboard.care.release import Expected

@@ -39,6 +39,15 @@ def _one_thread():
     torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="module")
+def set_params(tmp_path_factory):
+    """A function that lets a params.yml of this text hold until the module's tests have ended."""
+    path = tmp_path_factory.mktemp("params") / "params.yml"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_PARAMS", str(path))
+        yield path.write_text
+
+
 def resident_mb() -> float:
     """Return the memory that this process holds at present."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,8 +1,10 @@
-"""The outputs of an executed notebook, as text."""
+"""Execute a notebook's cells in this process, and read the outputs of an executed one as text."""
 
 from pathlib import Path
 
 import nbformat
+
+from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
 
 
 def text_of(cell: nbformat.NotebookNode) -> str:
@@ -20,3 +22,14 @@ def printed(path: Path) -> str:
     """Return what all cells printed, without what they showed."""
     cells = nbformat.read(path, as_version=4).cells
     return "".join(o.text for c in cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream")
+
+
+def run_cells(name, run_dir, **given):
+    """A notebook's cells, one after the other, without a kernel, which imports torch once more."""
+    path, variables = NOTEBOOKS / f"{name}.ipynb", {}
+    known = parameters_of(path)
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            exec(cell.source, variables)
+        if "parameters" in cell.metadata.get("tags", []):
+            variables |= {k: v for k, v in {"run_dir": str(run_dir), **given}.items() if k in known}

@@ -72,7 +72,7 @@ class VirtualGamepad:
         self.send(ABS, THROTTLE, round(-throttle * FULL))
 
     def wiggle(self, side_s: float = 0.15) -> None:
-        """Make the gesture before arming, for so long at each side, and wait until it counts."""
+        """Make the gesture before arming, and wait until it counts. side_s: how long the stick stays at each side."""
         for steering in WIGGLE:
             self.move(steering, 0)
             time.sleep(side_s)

@@ -64,7 +64,7 @@ INSTEAD = {  # (what was given, what was wanted): what to do instead
 }
 PARTS = ("checkpoint part", "dataset part")
 NOTHING = {*PARTS, "document", "pointer", "stage"}  # what cannot be given for the folder that holds it
-MOST_INSIDE = 500  # paths that are looked at
+MOST_INSIDE = 500  # paths that are looked at, of a level
 REFUSED = {
     "document": "give a file or folder that it describes",
     "pointer": "git lfs pull, where it was cloned, or download the file itself",
@@ -133,7 +133,8 @@ def refuse_part(path: Path | str) -> None:
 def refuse_holder(folder: Path | str) -> None:
     """Raise KindError for a folder that is nothing itself, but holds what is: checkpoints, or a cache of the Hub."""
     for level in ("*", "*/*", "*/*/*"):
-        inside = [p for p in islice(sorted(Path(folder).glob(level)), MOST_INSIDE) if not set(kinds_of(p)) <= NOTHING]
+        found = sorted(islice(Path(folder).glob(level), MOST_INSIDE))
+        inside = [p for p in found if not set(kinds_of(p)) <= NOTHING]
         if inside:
             names = ", ".join(os.path.relpath(p, folder) for p in inside[:4]) + (" ..." if len(inside) > 4 else "")
             raise KindError(

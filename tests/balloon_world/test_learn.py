@@ -182,12 +182,8 @@ def test_what_is_shown_and_what_where_nothing_is(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def few_params(tmp_path_factory):
-    path = tmp_path_factory.mktemp("params") / "params.yml"
-    path.write_text("calibration: {samples: 8}\nfinetune: {batch: 4}\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROVER_PARAMS", str(path))
-        yield
+def few_params(set_params):
+    set_params("calibration: {samples: 8}\nfinetune: {batch: 4}\n")
 
 
 @pytest.fixture(scope="module")

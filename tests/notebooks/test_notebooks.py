@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import nbformat
 import pytest
-from test_odd_policies import run_cells
+from executed import run_cells
 
 from lab.repository import publish
 from lab.repository.publish import NOTEBOOK_LIMIT, RESULTS_OF

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 
-import nbformat
 import numpy as np
 import pytest
 import torch
+from executed import run_cells
 from policies import TINY, lerobot_policy, smooth_frame
 
 from rover_lib.onboard.drive.inference import PolicyProcess
@@ -14,7 +14,7 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Source
-from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, parameters_of
+from rover_lib.workshop.run.run import NAMES
 from rover_lib.workshop.run.session import load
 
 pytestmark = pytest.mark.slow
@@ -95,17 +95,6 @@ def trained(robot, seen, folder):
             return outer(policy.predict_action_chunk(inner(item))[0]).numpy()
 
     return plan
-
-
-def run_cells(name, run_dir, **given):
-    """A notebook's cells, one after the other, without a kernel, which imports torch once more."""
-    path, variables = NOTEBOOKS / f"{name}.ipynb", {}
-    known = parameters_of(path)
-    for cell in nbformat.read(path, as_version=4).cells:
-        if cell.cell_type == "code":
-            exec(cell.source, variables)
-        if "parameters" in cell.metadata.get("tags", []):
-            variables |= {k: v for k, v in {"run_dir": str(run_dir), **given}.items() if k in known}
 
 
 def run_here(run_dir, **given):

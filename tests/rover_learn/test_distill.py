@@ -52,13 +52,9 @@ def recipe():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_samples(tmp_path_factory):
+def few_samples(set_params):
     """Eight samples calibrate a student, instead of all."""
-    path = tmp_path_factory.mktemp("params") / "few.yml"
-    path.write_text("calibration: {samples: 8}")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROVER_PARAMS", str(path))
-        yield
+    set_params("calibration: {samples: 8}")
 
 
 @pytest.fixture(autouse=True)

@@ -12,6 +12,7 @@ not judged: its error is None, and `warnings` says so.
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
+from types import EllipsisType
 from typing import Any
 
 import torch
@@ -104,8 +105,8 @@ class Chooser:
         forget_graphs()
         return self._from_reference(predictions(module, self.inputs))
 
-    def _from_reference(self, actions: Tensor) -> Tensor:
-        return (actions - self.reference).abs().mean(1)
+    def _from_reference(self, actions: Tensor, of: Sequence[int] | EllipsisType = ...) -> Tensor:
+        return (actions - self.reference[of]).abs().mean(1)
 
     def error(self, module: nn.Module) -> Errors:
         """The errors of a quantized policy against FP32, on the samples, in % of the recorded range."""
@@ -190,8 +191,7 @@ class Chooser:
         for block in progress(blocks(config), desc="blocks"):
             forget_graphs()
             actions = before.predictions(convert(graph, config, plain, only=[block]), block)
-            errors = (actions - self.reference[some]).abs().mean(1)
-            table[block] = mae_pct(errors, self.weights[some], self.action_range)
+            table[block] = mae_pct(self._from_reference(actions, some), self.weights[some], self.action_range)
         return table
 
     def mixed(

@@ -394,8 +394,9 @@ def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) 
     system_s, arduino_s = (np.abs(np.diff([getattr(c, s) for c in controls])) for s in ("system_s", "arduino_s"))
     if len(controls) > LEAST_READINGS:
         # Most of a backlog's steps are too short, but not all of the recording's.
-        usual_s, live_s = np.nanmedian(arduino_s), np.quantile(system_s, 0.9)
-        if usual_s > 0 < live_s and not 0.1 < live_s / usual_s < 10:
+        known = arduino_s[np.isfinite(arduino_s)]
+        usual_s, live_s = np.median(known) if len(known) else 0.0, np.quantile(system_s, 0.9)
+        if usual_s > 0 and live_s > 0 and not 0.1 < live_s / usual_s < 10:
             note = f"its steps are {1000 * usual_s:.3g}, the system's clock's {1000 * live_s:.3g} ms; it is not used"
             faults.add(path, "arduino_clock_not_in_ms", note, len(controls))
             controls = [replace(c, arduino_s=math.nan) for c in controls]

@@ -36,8 +36,8 @@ from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
-# Odd frames need more: their errors are far apart, and on 16, ranges were chosen that were half as bad again
-# on others. They also tell what share is odd: of the frames that calibrate, which training knows, it is a quarter.
+# Odd frames need more: their errors are far apart, and on 16 frames ranges were chosen that were half as bad again on
+# others. The 64 also tell what share is odd: training knows the frames that calibrate, and only a quarter as many were.
 ODD_CHOOSING_FRAMES = 64
 
 
@@ -77,7 +77,10 @@ class Recipe:
 def prepare_chooser(
     checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
 ) -> Chooser:
-    """A chooser on this many frames that calibration has not seen, and on some of the odd ones that it met."""
+    """A chooser on this many frames that calibration has not seen.
+
+    If calibration met odd ones, on some of those and on ODD_CHOOSING_FRAMES instead.
+    """
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
     few = pick_evenly(parts.choosing or parts.calibration, ODD_CHOOSING_FRAMES if odd else frames)
