@@ -265,13 +265,15 @@ def kill_commands(ctx: click.Context, output: Path | None, each: int, only: tupl
     with tempfile.TemporaryDirectory() as folder:
         inputs = kills.make_inputs(Path(folder))
         for work in (work for work in kills.WORKS if not only or work.name in only):
-            metrics[f"{work.name}_killed"] = kills.kill_randomly(work, inputs, each)
+            tries = {"killed": (kills.kill_randomly, each)}
             if work.name != "record":  # two recordings have two names
-                metrics[f"{work.name}_twice"] = kills.do_twice(work, inputs, max(1, each // 10))
+                tries["twice"] = kills.do_twice, max(1, each // 10)
             if os.geteuid() == 0:
-                metrics[f"{work.name}_disk_full"] = kills.fill_randomly(work, inputs, max(1, each // 5))
-            if output:  # after each work, as all of them take an hour
-                write_stage(output, "kills", params={"each": each}, metrics=metrics)
+                tries["disk_full"] = kills.fill_randomly, max(1, each // 5)
+            for what, (try_it, times) in tries.items():
+                metrics[f"{work.name}_{what}"] = try_it(work, inputs, times)
+                if output:  # after each, as all of them take an hour
+                    write_stage(output, "kills", params={"each": each}, metrics=metrics)
     show(metrics, False)
     ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
 

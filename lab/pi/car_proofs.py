@@ -44,6 +44,7 @@ STOPPED_MS = 200.0  # from what ends a drive to throttle off
 AT_SPEED_S = 1.0
 ATTEMPTS = 3  # how often a drive is tried if it ends by itself, because this machine is too busy for it
 SIDE_S, GESTURE_S = 0.4, 60.0
+BEHIND_S = 0.1  # more than the emulated Arduino's clock, by which events are dated, may be behind this machine's
 POWER_ON_S = 3.0  # how long the pins are watched; the emulated Arduino has no boot loader then
 GAMEPAD_CAR = Path(__file__).parents[1] / "cars" / "gamepad.yml"
 NODE = "/dev/input/event9"  # as evdev names and numbers them; nobody has plugged this one in
@@ -128,6 +129,7 @@ def gamepad_rows(pi: Container) -> list[Row]:
         with _driving(pi, pins, pad) as armed_s:
             rows += [_stops(pi, pins, armed_s, "gamepad of FIFOs pulled out", "the gamepad .* is gone", pad.unplug)]
         at_s = time.monotonic()
+        time.sleep(BEHIND_S)
         board.power()
         time.sleep(POWER_ON_S)
         return [*rows, neutral_row(before, pins.since(at_s))]
