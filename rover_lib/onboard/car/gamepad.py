@@ -68,11 +68,11 @@ class Gamepad:
         self.gone = ""  # why it can be read no more
 
     def close(self) -> None:
-        """Close both devices."""
-        for fd in {self._pad, self._motion}:
-            with contextlib.suppress(OSError):
-                os.close(fd)
+        """Close both devices. Once is enough."""
         self.gone = self.gone or "it was closed"
+        while self._rest:
+            with contextlib.suppress(OSError):
+                os.close(self._rest.popitem()[0])
 
     def sticks(self, now_s: float | None = None) -> tuple[float, float] | None:
         """Return (steering, throttle) as they are now, each in [-1, 1], right and forward positive.
@@ -81,13 +81,13 @@ class Gamepad:
         again. Never waits, raises nothing.
         """
         now_s = time.monotonic() if now_s is None else now_s
-        for fd in (self._motion, self._pad):
+        for fd in () if self.gone else (self._motion, self._pad):  # others may have its numbers by now
             try:
                 self._read(fd, now_s)
             except OSError as error:
-                if not self.gone:
-                    _log.warning("the gamepad %s is gone (%s): the car is nobody's", self.name, error.strerror)
-                self.gone = self.gone or str(error.strerror)
+                _log.warning("the gamepad %s is gone (%s): the car is nobody's", self.name, error.strerror)
+                self.gone = str(error.strerror)
+                break
         if self.gone or now_s - self._heard_s > ALIVE_S:
             self._held = False
         return (self._values[STEERING], -self._values[THROTTLE]) if self._held else None

@@ -24,7 +24,7 @@ from typing import Any
 import serial
 
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
+from rover_lib.onboard.car.gamepad import Gamepad, GamepadError, open_gamepad
 from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.pwm import Channel, Pulses
 from rover_lib.onboard.errors import RoverError
@@ -429,8 +429,19 @@ class ServoLink:
         raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
 
     def remedy(self, missing: str) -> str:
-        """Return what this car's human does about what is missing, a key of MISSING."""
-        return "hold L1 of the gamepad" if missing == "s" and self.car.human == "gamepad" else MISSING[missing]
+        """Return what this car's human does about what is missing, a key of MISSING.
+
+        Here a gamepad that was gone is opened again, which may take a second; if it cannot be, that is what is missing.
+        """
+        if missing != "s" or self.car.human != "gamepad":
+            return MISSING[missing]
+        if self._gamepad and self._gamepad.gone:
+            self._gamepad.close()
+            try:
+                self._gamepad = open_gamepad()
+            except GamepadError as error:
+                return str(error)
+        return "hold L1 of the gamepad"
 
     def neutral(self) -> Telemetry:
         """Stop the car until arm() if the host drives it; a human who drives goes on. Return the confirming status.

@@ -41,6 +41,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import simplejpeg
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL, Channel, PwmCalibration
@@ -76,6 +77,7 @@ FOLLOWING = ("absent", "nothing_usable")
 DECISIVE = ("no_formula", "no_car", "no_overlap", "not_seconds", "coarse_times", "wrong_header", "broken_json")
 LAST_S = 1e11  # Unix time is a hundredth of it
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
+JPEG_HEAD = 1024  # in which most cameras say how large the picture is
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 Item = TypeVar("Item")
 
@@ -129,7 +131,7 @@ class _Frame:
     number: int
     time_s: float
     path: Path
-    usable: bool
+    size: tuple[int, int] | None  # None: it cannot be used
 
 
 def load_recordings(
@@ -550,7 +552,7 @@ def _inside(path: Path, folder: Path) -> bool:
 
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
-    """Return the listed frames that have a time, ordered by it. `usable` says whether the picture is whole."""
+    """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
     for i, row in enumerate(rows):
@@ -571,8 +573,14 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        usable = check_picture(folder, picture, name, path, faults)
-        frames.append(_Frame(int(number), time_s, picture, usable))
+        frames.append(_Frame(int(number), time_s, picture, check_picture(folder, picture, name, path, faults)))
+    sizes = Counter(f.size for f in frames if f.size and any(f.size))
+    usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
+    for i, frame in enumerate(frames):
+        if frame.size and frame.size not in (usual, (0, 0)):
+            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*frame.size, *usual)
+            faults.add(frame.path, "another_size", note)
+            frames[i] = replace(frame, size=None)
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = _in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
@@ -595,26 +603,31 @@ def _is_no_second(time_s: float, which: str, path: Path, faults: Faults) -> bool
     return time_s > LAST_S
 
 
-def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> bool:
-    """Whether a listed picture is there, inside the episode's folder, and whole. Only its two ends are read."""
+def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
+    """Return the height and width of a listed picture, (0, 0) where it says them late; None if it is not there, inside
+    the episode's folder, and whole. Only its two ends are read.
+    """
     try:
         if Path(name).is_absolute() or not _inside(picture, folder):
             faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
-            return False
+            return None
         if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
             faults.add(path, "frame_missing", f"{quote(name)} is no file")
-            return False
+            return None
         with picture.open("rb") as f:
-            head = f.read(12)
+            head = f.read(JPEG_HEAD)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
             problem = _jpeg_problem(head, f.read())
     except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
         faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
-        return False
+        return None
     if problem:
         faults.add(picture, "broken_jpeg", problem)
-        return False
-    return True
+        return None
+    try:
+        return simplejpeg.decode_jpeg_header(head)[:2]
+    except ValueError:
+        return 0, 0
 
 
 def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
@@ -623,7 +636,7 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
     cv2 would only warn of a file that was cut short, and return a picture.
     """
     if not head.startswith(b"\xff\xd8"):
-        return f"no JPEG: it begins with {quote(head)}"
+        return f"no JPEG: it begins with {quote(head[:12])}"
     if not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
         return "cut short: its end marker is missing"
     return None
@@ -688,7 +701,7 @@ def _make_samples(
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
         for k, i in enumerate(segment):
-            if not frames[i].usable:
+            if frames[i].size is None:
                 continue
             if k == 0 and i > 0:
                 unknown_state += 1

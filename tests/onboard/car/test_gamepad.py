@@ -2,11 +2,13 @@
 
 import os
 import time
+from functools import partial
 
 import pytest
 
 from lab.driving.virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
+from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError, Stick
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink
@@ -75,6 +77,23 @@ def test_one_that_is_unplugged_is_nobody(pad, opened, caplog):
     assert opened.sticks() is None
     assert opened.sticks() is None
     assert caplog.text.count("is gone") == 1
+
+
+def test_one_that_is_back_is_opened_again(pad, monkeypatch):
+    """Whoever waits to be armed asks what is missing ten times a second."""
+    link = ServoLink("none", car=Car(human="gamepad"))
+    link._gamepad = first = open_virtual(pad.folder)
+    pad.unplug()
+    assert first.sticks() is None and first.gone
+    monkeypatch.setattr(servo_link, "open_gamepad", partial(gamepads.open_gamepad, list))
+    assert "no gamepad that can be used is connected" in link.remedy("s")
+    pad.plug()
+    monkeypatch.setattr(servo_link, "open_gamepad", lambda: open_virtual(pad.folder))
+    assert link.remedy("s") == "hold L1 of the gamepad"
+    time.sleep(0.05)
+    pad.hold(True)
+    assert link._gamepad is not first and link._gamepad.sticks() and first.sticks() is None
+    link._gamepad.close()
 
 
 def test_a_half_event_waits_for_its_rest(pad, opened):

@@ -11,6 +11,7 @@ from itertools import pairwise
 import hostile
 import numpy as np
 import pytest
+import simplejpeg
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recorded import real_episode, real_recordings
@@ -204,18 +205,20 @@ def test_pictures(tmp_path):
 def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
     folder = record(tmp_path)
     whole = load(tmp_path).samples
+    (folder / "frames/frame_000005.jpg").write_bytes(simplejpeg.encode_jpeg(np.zeros((48, 64, 3), np.uint8)))
     (folder / "frames/frame_000010.jpg").unlink()
     cut = folder / "frames/frame_000020.jpg"
     cut.write_bytes(cut.read_bytes()[:-40])
     (folder / "frames/frame_000030.jpg").write_bytes(b"")
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"frame_missing": 1, "broken_jpeg": 2}
+    assert kinds(recordings) == {"frame_missing": 1, "broken_jpeg": 2, "another_size": 1}
     assert {f.file for f in recordings.faults} == {
+        "episode_20260101_120000/frames/frame_000005.jpg",
         "episode_20260101_120000/episode_data.json",
         "episode_20260101_120000/frames/frame_000020.jpg",
         "episode_20260101_120000/frames/frame_000030.jpg",
     }
-    left = [s for k, s in enumerate(whole) if k not in (9, 19, 29)]
+    left = [s for k, s in enumerate(whole) if k not in (4, 9, 19, 29)]
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in left]
     assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
 
