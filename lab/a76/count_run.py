@@ -127,7 +127,7 @@ def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent)
 
 def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
     """Return the FP32 artifact to judge an artifact by, policy_fp32_180x320 for policy_static_180x320, if it exists."""
-    size = re.search(r"_\d+x\d+$", stem)
+    size = re.search(r"_\d+x\d+(?=\.|$)", stem)
     own = REFERENCE + (size.group() if size else "")
     return own if own in artifacts else None
 

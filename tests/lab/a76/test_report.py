@@ -159,6 +159,7 @@ def test_an_image_size_is_judged_by_fp32_of_its_own():
     assert counting.reference_of("policy_static", there) == "policy_fp32"
     assert counting.reference_of("policy_static_180x320", there) == "policy_fp32_180x320"
     assert counting.reference_of("policy_static_240x432", there) is None
+    assert counting.reference_of("policy_static_180x320.onnx", there) == "policy_fp32_180x320"
 
 
 def test_the_command_counts_then_draws_then_says_what_it_found(tmp_path, monkeypatch):
