@@ -42,8 +42,8 @@ class Engine(Protocol):
         """How many threads compute."""
 
     def set_threads(self, threads: int) -> None:
-        """Compute with that many threads from now on. For torch this sets those of the whole process; of these, a pool of
-        XNNPACK's keeps the number at its first plan, so load a policy with the number that it shall have.
+        """Compute with that many threads from now on. For torch this sets those of the whole process; a pool of
+        XNNPACK's keeps the number of its first plan, so load a policy with the number that it shall have.
         """
 
 
