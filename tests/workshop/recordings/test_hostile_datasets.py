@@ -115,7 +115,9 @@ def test_23_hostile_datasets(tmp_path):
     """One unpacked 0.97 MB to 3.5 GB, one filled in a template for 42 s, one waited for a pipe for ever."""
     good = make(tmp_path / "good", "image")
     os.mkfifo(good / "beside.parquet")
-    wrong = [] if in_a_child(lambda: load_recordings(good, 8) and None)[0] == 0 else ["what lies beside is read"]
+    # Twice: a fork may stand still for a lock that a thread held. Who waits for the pipe does so both times.
+    passed = any(in_a_child(lambda: load_recordings(good, 8) and None)[0] == 0 for _ in range(2))
+    wrong = [] if passed else ["what lies beside is read"]
     (good / "beside.parquet").unlink()
     wrong += [] if len(HOSTILE) == 23 else [f"{len(HOSTILE)} datasets"]
 
