@@ -122,9 +122,9 @@ def refused(episodes, out, **options) -> str:
 def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     (tmp_path / "there").mkdir()
     assert "is there already" in refused(recorded, tmp_path / "there")
-    other = record(tmp_path / "mixed", "episode_20260101_120000", frames=20)
+    record(tmp_path / "mixed", "episode_20260101_120000", frames=20)
     slow = record(tmp_path / "mixed", "episode_20260101_120001", frames=20)
-    record(tmp_path / "mixed", "episode_20260101_120002", frames=20)
+    other = record(tmp_path / "mixed", "episode_20260101_120002", frames=20)
 
     def slower(content):
         for frame in content["frame_samples"]:
@@ -135,11 +135,11 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     shutil.rmtree(slow)
     for picture in (other / "frames").iterdir():
         shutil.copy(wide(tmp_path), picture)
-    assert "a picture of 32x18 among those of 64x18" in refused(tmp_path / "mixed", tmp_path / "out")
+    assert "a picture of 64x18 among those of 32x18" in refused(tmp_path / "mixed", tmp_path / "out")
     assert "16 to 8192 pixels a side, found 32x9" in refused(tmp_path / "mixed", tmp_path / "out", size=(9, 32))
     assert not (tmp_path / "out").exists()
     report = export_dataset(tmp_path / "mixed", tmp_path / "out", size=(36, 64))
-    assert report["pictures"].startswith("64x36, recorded ")
+    assert report["pictures"] == "64x36, recorded 32x18"
     expected = [prepare_frame(s.frame_bgr(), 36, 64)[..., ::-1] for s in load(tmp_path / "mixed").samples]
     found = [s.frame_bgr() for s in load(tmp_path / "out").samples]
     assert np.array_equal(found, expected)

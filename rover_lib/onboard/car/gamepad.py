@@ -68,7 +68,7 @@ class Gamepad:
         self.gone = ""  # why it can be read no more
 
     def close(self) -> None:
-        """Close both devices. Once is enough."""
+        """Close both devices; again, it does nothing."""
         self.gone = self.gone or "it was closed"
         while self._rest:
             with contextlib.suppress(OSError):
@@ -81,7 +81,9 @@ class Gamepad:
         again. Never waits, raises nothing.
         """
         now_s = time.monotonic() if now_s is None else now_s
-        for fd in () if self.gone else (self._motion, self._pad):  # others may have its numbers by now
+        if self.gone:  # others may have the numbers of its files by now
+            return None
+        for fd in (self._motion, self._pad):
             try:
                 self._read(fd, now_s)
             except OSError as error:
