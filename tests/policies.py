@@ -2,9 +2,7 @@
 
 # LeRobot takes ten seconds to import, and every process that collects tests would pay for it: import it in functions.
 
-import gc
 import re
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,13 +54,9 @@ def lerobot_policy(
 
     The statistics of its frozen batch norms are set from pictures, so that its features do not vanish.
     """
-    first = "lerobot" not in sys.modules
     from lerobot.policies.act.modeling_act import ACTPolicy
     from torchvision.ops.misc import FrozenBatchNorm2d
 
-    if first:
-        gc.collect()
-        gc.freeze()  # each collection would take 0.3 s to find that all those modules are still used
     cameras = cameras or {"observation.images.cam_front": (72, 128)}
     torch.manual_seed(seed)
     policy = ACTPolicy(lerobot_config(cameras, states, actions, **config)).eval()
@@ -87,6 +81,15 @@ def lerobot_policy(
     for hook in hooks:
         hook.remove()
     return policy
+
+
+def without_most_channels(checkpoint: "Checkpoint", left: int = 16) -> "Checkpoint":
+    """Return a policy whose blocks have `left` channels inside: the others are zeros, which ACT leaves out."""
+    weights = {name: weight.clone() for name, weight in checkpoint.weights.items()}
+    for name in weights:
+        if name.endswith((".conv1.weight", ".bn1.bias", ".bn1.running_mean")) and ".layer" in name:
+            weights[name][left:] = 0
+    return replace(checkpoint, weights=weights)
 
 
 def saved(policy: "ACTPolicy", folder: Path, stats: dict | None = None) -> tuple:

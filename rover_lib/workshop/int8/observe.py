@@ -122,14 +122,13 @@ class RangeObserver(UniformQuantizationObserverBase):
     def _least_squares(self, low: float, high: float) -> tuple[float, float]:
         """The range whose rounding plus clipping has the least squared error over the histogram."""
         shrink = torch.linspace(1.0, 0.1, 31)
-        lows, highs = torch.meshgrid(low * shrink, high * shrink, indexing="ij")
-        lows, highs = lows.flatten(), highs.flatten()
+        lows, highs = low * shrink, high * shrink
         used = self.histogram > 0
         weight, x = self.histogram[used] / self.histogram.sum(), self._centres()[used]
-        step = (highs.clamp(min=0) - lows.clamp(max=0)).clamp(min=1e-12) / 255
-        clipped = torch.relu(x - highs[:, None]) ** 2 + torch.relu(lows[:, None] - x) ** 2
-        best = int((step**2 / 12 + clipped @ weight).argmin())
-        return lows[best].item(), highs[best].item()
+        step = (highs.clamp(min=0) - lows[:, None].clamp(max=0)).clamp(min=1e-12) / 255
+        below, above = torch.relu(lows[:, None] - x) ** 2 @ weight, torch.relu(x - highs[:, None]) ** 2 @ weight
+        best = divmod(int((step**2 / 12 + below[:, None] + above).argmin()), len(shrink))
+        return lows[best[0]].item(), highs[best[1]].item()
 
     def calculate_qparams(self, **_: object) -> tuple[Tensor, Tensor]:
         low, high = self.range()

@@ -30,6 +30,7 @@ from rover_lib.onboard.stage import sha256_of
 @pytest.fixture(autouse=True)
 def _our_laptop(keys, monkeypatch):
     monkeypatch.setattr("rover_lib.onboard.care.release.SIGNERS", keys / "signers")
+    monkeypatch.setattr("rover_lib.onboard.care.release.COPIED_BYTES", 1 << 20)  # power is cut within a copy too
 
 
 @pytest.fixture(scope="session")

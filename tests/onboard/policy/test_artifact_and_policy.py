@@ -60,14 +60,14 @@ def test_drives(artifacts, mode):
     assert np.allclose(policy.predict_chunk(big, STATE), chunk, atol=1e-5)  # the camera may have any size
 
 
-def test_equals_the_policy_it_was_made_of(tiny, artifacts):
+def test_equals_the_policy_it_was_made_of(thin, artifacts):
     from rover_lib.workshop.act import ACT, inputs_of
 
-    sample = memory_samples(1, seed=9)[0]
+    sample, (origin, _) = memory_samples(1, seed=9)[0], thin
     policy = load_policy(artifacts["fp32"])
     with torch.inference_mode():
-        expected = ACT(tiny.config, tiny.weights)(*inputs_of(sample, tiny.config))[0].numpy()
-    found = policy.run(sample.state, [inputs_of(sample, tiny.config)[1].numpy()])
+        expected = ACT(origin.config, origin.weights)(*inputs_of(sample, origin.config))[0].numpy()
+    found = policy.run(sample.state, [inputs_of(sample, origin.config)[1].numpy()])
     assert np.abs(found - expected).max() < 1e-5
 
 
@@ -112,12 +112,17 @@ def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch)
         policy.predict_chunk(FRAME, STATE)
 
 
-def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(artifacts, monkeypatch):
+def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny, calibration, tmp_path, monkeypatch):
+    from rover_lib.workshop.int8.export import export
+    from rover_lib.workshop.int8.quantize import quantize
+    from rover_lib.workshop.int8.scheme import Scheme
+
+    export(quantize(tiny, Scheme(), calibration), tiny, tmp_path / "p.pt", memory_samples(1), calibration)
     asked, (state, frame) = [], (np.full(2, 0.1, np.float32), 255 - FRAME)
     monkeypatch.setattr(
         "rover_lib.onboard.policy.torch_engine.give_back_packed_weights", lambda module: asked.append(module) or 0
     )
-    policy = load_policy(artifacts["static"])
+    policy = load_policy(tmp_path / "p.pt")
     before = policy.predict_chunk(frame, state)
     (module,) = asked
     weights = list(memory._originals(module.graph))
