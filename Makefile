@@ -5,9 +5,10 @@ ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
 PACKAGES := rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world lab lerobot_robot_rover
 READY := $(VENV)/.ready
-# Each process runs whole test files or notebooks. More than four processes would cost more memory than they save time.
+# Each process runs whole test files or notebooks, and one waits while others compute. More than four processes would
+# cost more memory than they save time.
 # They go in the order of the folders: ansible and lab have the longest files, which would run alone if they came last.
-PROCESSES ?= auto
+PROCESSES ?= $(shell echo $$(($$(nproc) + 1)))
 PYTEST := $(VENV)/bin/pytest --numprocesses $(PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
 DEMO := runs/demo/.made

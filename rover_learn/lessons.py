@@ -45,8 +45,8 @@ class BatchedPolicy(nn.Module):
     def __init__(self, config: ActConfig, weights: dict[str, Tensor]):
         super().__init__()
         self.config = config
-        self.model = lerobot_act(replace(config, vae_layers=0)).model
-        self.model.load_state_dict({k: v.float() for k, v in weights.items() if not k.startswith("vae_")})
+        acting = {name: weight for name, weight in weights.items() if not name.startswith("vae_")}
+        self.model = lerobot_act(replace(config, vae_layers=0), acting).model
         self.backbone = self.model.backbone
         self.model.backbone = Given()
         self.eval()

@@ -4,6 +4,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,25 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if {"demo_run", "hailo_kit"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+
+
+USERS_CACHE = os.environ.get("ROVER_CACHE", "")  # empty is as unset
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory):
+    """A cache of this process's own, so that the tests neither find nor leave anything in the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def users_cache():
+    """The user's cache instead, as for make count: to fetch and unpack an emulated Pi takes a minute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", USERS_CACHE)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -129,15 +149,15 @@ def calibration(tiny):
 
 @pytest.fixture(scope="session")
 def thin(tiny):
-    """The tiny policy with 16 channels inside each block of its backbone, and its calibration.
+    """The tiny policy with a sixteenth of the channels inside its backbone's blocks, and its calibration.
 
-    Hundreds of tests write, hash and load its artifacts, which have a fifth of the tiny policy's megabytes.
+    Hundreds of tests write, hash and load its artifacts, which have a tenth of the tiny policy's megabytes.
     """
-    from policies import memory_samples, without_most_channels
+    from policies import memory_samples, with_few_channels
 
     from rover_lib.workshop.int8.observe import calibrate
 
-    policy = without_most_channels(tiny)
+    policy = replace(tiny, weights=with_few_channels(tiny.weights, 16))
     return policy, calibrate(policy, memory_samples(12))
 
 

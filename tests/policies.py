@@ -83,15 +83,6 @@ def lerobot_policy(
     return policy
 
 
-def without_most_channels(checkpoint: "Checkpoint", left: int = 16) -> "Checkpoint":
-    """Return a policy whose blocks have `left` channels inside: the others are zeros, which ACT leaves out."""
-    weights = {name: weight.clone() for name, weight in checkpoint.weights.items()}
-    for name in weights:
-        if name.endswith((".conv1.weight", ".bn1.bias", ".bn1.running_mean")) and ".layer" in name:
-            weights[name][left:] = 0
-    return replace(checkpoint, weights=weights)
-
-
 def saved(policy: "ACTPolicy", folder: Path, stats: dict | None = None) -> tuple:
     policy.save_pretrained(folder)
     return saved_processors(policy, folder, stats)

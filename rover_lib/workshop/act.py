@@ -95,8 +95,12 @@ class ActConfig:
         return -(-height // stride), -(-width // stride)
 
 
-def lerobot_act(c: ActConfig) -> "ACTPolicy":
-    """Make LeRobot's own ACTPolicy of this shape, with random weights and no normalisation. It downloads nothing."""
+def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
+    """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
+
+    weights: all of them, by LeRobot's names without the leading `model.`; copied, as float32. None: random ones, which
+    take most of the time.
+    """
     # Imported here, because it takes ten seconds, and code that only reads or quantizes a checkpoint does not need it.
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -125,7 +129,12 @@ def lerobot_act(c: ActConfig) -> "ACTPolicy":
         latent_dim=c.latent,
         n_vae_encoder_layers=max(c.vae_layers, 1),
     )
-    return ACTPolicy(config)
+    if weights is None:
+        return ACTPolicy(config)
+    with torch.device("meta"):
+        policy = ACTPolicy(config)
+    policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
+    return policy
 
 
 def positions_2d(dim: int, h: int, w: int) -> Tensor:

@@ -1,7 +1,9 @@
 """LeRobot's own commands, as processes, with the rover: on the emulated Arduino, and in the balloon world."""
 
 import contextlib
+import functools
 import importlib
+import inspect
 import os
 import pty
 import re
@@ -15,6 +17,7 @@ import time
 import typing
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import needs
 import numpy as np
@@ -175,6 +178,9 @@ def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
     """Those of this LeRobot: in 0.6 lerobot-record drives no policy, and in 0.4 there is no lerobot-rollout."""
     import draccus
 
+    # It reads a class's source once more for each of its fields.
+    once = SimpleNamespace(getsource=functools.cache(inspect.getsource))
+    monkeypatch.setattr("draccus.wrappers.docstring.inspect", once)
     text, parsed = (ROOT / "docs" / "lerobot.md").read_text().replace("\\\n", " "), []
     for line in re.findall(r"^    (lerobot-\w+ .*)$", text, re.M):
         program, *words = shlex.split(line.partition(" # ")[0])

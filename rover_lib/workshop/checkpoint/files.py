@@ -83,8 +83,7 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     from lerobot.configs.types import NormalizationMode
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
-    policy = lerobot_act(config)
-    policy.model.load_state_dict(weights)
+    policy = lerobot_act(config, weights)
     normed = {"VISUAL": True, "STATE": config.state_norm is not None, "ACTION": config.action_unnorm is not None}
     policy.config.normalization_mapping = {
         kind: NormalizationMode.MEAN_STD if acts else NormalizationMode.IDENTITY for kind, acts in normed.items()

@@ -183,9 +183,7 @@ class LerobotEager:
         c = checkpoint.config
         self.config, self.chunk = c, c.chunk
         self.action_names, self.state_names = c.action_names, c.state_names
-        self._policy = lerobot_act(c)
-        self._policy.model.load_state_dict(checkpoint.weights)
-        self._policy.eval()
+        self._policy = lerobot_act(c, checkpoint.weights).eval()
         self.car = car or this_car()
         self._low, self._high = action_limits(c.action_names, self.car)
 

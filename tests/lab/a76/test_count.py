@@ -31,7 +31,7 @@ from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
-pytestmark = [pytest.mark.emulated, needs.qemu]
+pytestmark = [pytest.mark.emulated, needs.qemu, pytest.mark.usefixtures("users_cache")]
 
 # Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
 BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2, "policy_static.onnx": 39.2}
@@ -71,7 +71,7 @@ def program(path: Path, code: list[int]) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plugin_only(tmp_path_factory) -> Core:
+def plugin_only(users_cache, tmp_path_factory) -> Core:
     """Enough for a static program: no userland."""
     return Core(tmp_path_factory.mktemp("root"), a76.build_plugin())
 
@@ -176,7 +176,7 @@ def test_kernels_are_summed_and_the_rest_is_other():
 
 
 @pytest.fixture(scope="module")
-def core() -> Core:
+def core(users_cache) -> Core:
     return prepare()
 
 

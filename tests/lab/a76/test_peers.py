@@ -230,7 +230,7 @@ def test_peers_join_what_was_counted(without_engines, tiny_run):
 
 
 @needs_engines
-def test_the_engines_run_the_policy_in_int8(tiny, tiny_run, monkeypatch):
+def test_the_engines_run_the_policy_in_int8(users_cache, tiny, tiny_run, monkeypatch):
     monkeypatch.setattr(peers, "open_run", lambda run_dir: tiny_run.opened)
     machine, samples = prepare(), tiny_run.opened.parts.held_out[:6]
     ours = count_artifact(machine, tiny_run.folder / "policy_static.pt", samples, counted=3)
