@@ -21,6 +21,7 @@ from rover_lib.workshop.act import (
     example_inputs,
     fits_columns,
     imagenet,
+    lerobot_act,
     multiply_accumulates,
 )
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -56,6 +57,20 @@ def observation(policy, seed=0):
 def image_stats(policy, mean=IMAGENET_MEAN, std=IMAGENET_STD):
     stats = {"mean": torch.tensor(mean)[:, None, None], "std": torch.tensor(std)[:, None, None]}
     return {k: stats for k in policy.config.image_features}
+
+
+@pytest.mark.slow
+def test_lerobots_policy_is_filled_as_if_it_had_been_made_first(tiny):
+    """Nothing of it is left without a value, and training finds the same to train."""
+    filled, made = lerobot_act(tiny.config, tiny.weights), lerobot_act(tiny.config)
+    made.model.load_state_dict(tiny.weights)
+    for part in ("named_parameters", "named_buffers"):
+        ours, theirs = (dict(getattr(policy, part)()) for policy in (filled, made))
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[n], x) and ours[n].requires_grad == x.requires_grad for n, x in theirs.items())
+    assert all(w.data_ptr() != tiny.weights[n].data_ptr() for n, w in filled.model.state_dict().items()), "copied"
+    with pytest.raises(RuntimeError, match="Missing key"):
+        lerobot_act(tiny.config, {k: v for k, v in tiny.weights.items() if k != "action_head.bias"})
 
 
 # LeRobot pads with normalised zeros. With this mean, zero is a whole pixel, so columns can be exact at the border too.

@@ -432,6 +432,22 @@ def test_an_observers_range_is_within_what_it_saw(batches, choice):
     assert scale >= SMALLEST_SCALE and -128 <= zero <= 127
 
 
+def test_the_least_squares_range_is_the_best_of_all_pairs():
+    """By the definition: of each pair of ends, the error of every value that is rounded or clipped."""
+    o = observer("histogram")
+    o(torch.from_numpy(np.random.default_rng(0).laplace(size=100_000).astype(np.float32)))
+    x, weight = o._centres().double(), (o.histogram / o.histogram.sum()).double()
+
+    def error(low, high):
+        clipped = torch.where(x > high, x - high, torch.where(x < low, low - x, torch.zeros_like(x)))
+        return ((high - low) / 255) ** 2 / 12 + float(clipped**2 @ weight)
+
+    shares = np.linspace(1, 0.1, 31)
+    pairs = [(o.min_val.item() * a, o.max_val.item() * b) for a in shares for b in shares]
+    assert o.range() == pytest.approx(min(pairs, key=lambda pair: error(*pair)), rel=1e-6)
+    assert o.range()[1] < 0.9 * o.max_val.item(), "it clips what is rare"
+
+
 def test_growing_the_histogram_keeps_it_exact():
     one, two = observer(), observer()
     small, large = torch.linspace(-1, 1, 1001), torch.linspace(-4, 4, 1001)
