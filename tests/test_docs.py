@@ -117,6 +117,7 @@ def options_of(group: click.Command) -> set[str]:
     return own.union(*map(options_of, group.commands.values())) if isinstance(group, click.Group) else own
 
 
+@pytest.mark.slow
 def test_every_command_that_we_print_is_one():
     """All that the pages, the program and its playbooks show, by the parser of the program that is named."""
     from lab.__main__ import main as lab

@@ -49,6 +49,7 @@ def drive(simulation, worlds=1, each=lambda head: None):
     return seen
 
 
+@pytest.mark.slow
 def test_a_slow_machine_slows_time_and_changes_nothing_else(simulation, monkeypatch):
     fast = drive(simulation)
     slow_one = Simulation(simulation._artifact)
@@ -59,6 +60,7 @@ def test_a_slow_machine_slows_time_and_changes_nothing_else(simulation, monkeypa
     assert simulation._results == slow_one._results and sum(r[1] for r in simulation._results.values()) == 1
 
 
+@pytest.mark.slow
 def test_each_picture_has_what_a_page_shows(simulation):
     seen = [head for head in drive(simulation, 2) if head["phase"] == "driving"]
     assert {head["world"]["seed"] for head in seen} == {10_000, 10_001}
@@ -67,6 +69,7 @@ def test_each_picture_has_what_a_page_shows(simulation):
     assert 0 <= seen[-1]["sent_s"] - seen[-1]["plan"]["captured_s"] < 0.3  # so that the ribbon begins at the car
 
 
+@pytest.mark.slow
 def test_what_a_page_asks_for(simulation):
     asked = iter([("driving", "stop"), ("ended", "drive FP32"), ("driving", "rm -rf"), ("driving", "next")])
     waiting = [next(asked)]

@@ -92,6 +92,7 @@ KEYS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     counted(made.teacher, 90)
     counted(made.student, 20)

@@ -37,6 +37,7 @@ def test_the_same_seed_gives_the_same_drive_and_frames(shoves):
     assert frame_hash(worlds[0]) == frame_hash(worlds[1])
 
 
+@pytest.mark.slow
 def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
     for seed in range(30):
         plain, with_decoys = World(seed, 2), World(seed, 2, decoys=2)

@@ -100,6 +100,7 @@ def policy_of(image_sizes, names, **config) -> ACT:
 
 
 @pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
+@pytest.mark.slow
 def test_both_splits_in_onnx_runtime_are_the_policy(name):
     model = policy_of(**SHAPES[name])
     rng = np.random.default_rng(0)
@@ -112,6 +113,7 @@ def test_both_splits_in_onnx_runtime_are_the_policy(name):
         assert np.abs(actions - expected).max() < 1e-5 * max(1, np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_networks_have_fixed_shapes_of_few_ranks_and_known_operators(checkpoint):
     front, whole, rest = networks(ACT(checkpoint.config, checkpoint.weights))
     for model in (front.model, whole.model, rest):

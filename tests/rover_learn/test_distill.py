@@ -141,6 +141,7 @@ def test_what_was_begun_with_other_settings_is_not_gone_on_with(teacher, episode
     assert students[0] != students[1] and students[2] == students[3]  # the settings matter only with QAT
 
 
+@pytest.mark.slow
 def test_int8s_training_begins_from_the_ranges_that_were_chosen(tiny, calibration, tmp_path, monkeypatch):
     """With others, all that it learned would be against a rounding that the export does not do."""
     chosen = Scheme(observer="frames", usual_pct=50.0, wider=(("image_project", 0.5),))
@@ -338,6 +339,7 @@ def test_a_name_is_one_process(teacher, episodes, tmp_path, monkeypatch):
     distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
 
 
+@pytest.mark.slow
 def test_a_policy_that_somebody_trained_is_not_replaced_by_a_student(teacher, episodes, tmp_path):
     """The teacher's folder, as in `rover distill runs/full/best_model.pth ... --name full`, or another policy's."""
     own = tmp_path / "full" / "best_model.pth"

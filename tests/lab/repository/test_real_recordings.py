@@ -44,6 +44,7 @@ class Seen(Sample):
         return picture
 
 
+@pytest.mark.slow
 def test_a_small_model_learns_from_the_picture_what_the_last_action_does_not_say():
     """And its error falls with the recordings to learn from: the real ones' stays above the last action's."""
     rng, episodes = np.random.default_rng(0), []

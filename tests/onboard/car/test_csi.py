@@ -62,6 +62,7 @@ def test_frames_have_the_sensors_time_stamps(csi):
         assert frame.repeats == 0
 
 
+@pytest.mark.slow
 def test_a_picture_that_was_cut_costs_two_frames_and_shifts_no_time_stamp(csi):
     with csi("cut 12") as camera:
         frame = camera.latest()
@@ -103,6 +104,7 @@ def test_without_the_program_it_says_what_to_install(monkeypatch, tmp_path):
         Camera("csi").open()
 
 
+@pytest.mark.slow
 def test_the_doctor_measures_it(csi):
     csi()
     (check,) = camera_rate("csi", rate_hz=30.0)

@@ -71,6 +71,7 @@ def test_equals_the_policy_it_was_made_of(thin, artifacts):
     assert np.abs(found - expected).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
     """If an operator has changed since it was new, as gelu has, torch names a record of its archive differently."""
     from rover_lib.workshop.act import ACT, inputs_of
@@ -112,6 +113,7 @@ def test_a_prediction_that_is_not_finite_never_comes_out(artifacts, monkeypatch)
         policy.predict_chunk(FRAME, STATE)
 
 
+@pytest.mark.slow
 def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny, calibration, tmp_path, monkeypatch):
     from rover_lib.workshop.int8.export import export
     from rover_lib.workshop.int8.quantize import quantize
@@ -135,6 +137,7 @@ def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny
     assert np.array_equal(policy.predict_chunk(frame, state), before)
 
 
+@pytest.mark.slow
 def test_an_artifact_that_was_written_is_not_kept_in_memory(tiny, tmp_path):
     """torch never frees a frozen module's type, whose graph held the 47 MB of weights. Tracing leaves 7 MB."""
     from rover_lib.workshop.act import ACT

@@ -414,6 +414,7 @@ def test_a_human_is_recorded(tmp_path):
 
 
 @pytest.mark.parametrize(("how", "says"), [("dies_s", "unplugged|plugged in"), ("silent_s", "no status for 0.3 s")])
+@pytest.mark.slow
 def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, monkeypatch, how, says):
     monkeypatch.setattr(module, "SILENT_S", 0.3)
     link = FakeLink()

@@ -117,6 +117,7 @@ def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_pat
             load_checkpoint(tmp_path)
 
 
+@pytest.mark.slow
 def test_other_statistics_beside_the_same_weights_are_another_policy(config, weights, tmp_path):
     made = {}
     for name, throttle in (("as it was", 0.02), ("again", 0.02), ("corrected", 0.03)):

@@ -94,6 +94,7 @@ def jumped(dazzled, jumping):
     return calibrate(dazzled, jumping)
 
 
+@pytest.mark.slow
 def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_path):
     jumped.save(tmp_path / "calibration.pt")
     again = Calibration.load(tmp_path / "calibration.pt")
@@ -132,6 +133,7 @@ def test_odd_frames_take_no_steps_from_the_others(dazzled, jumping, jumped):
     assert worst(table[list(table)[-1]]) < 0.8 * worst(table["minmax"])
 
 
+@pytest.mark.slow
 def test_odd_frames_weigh_what_they_are_among_unseen_ones(dazzled, jumping, jumped):
     """Training knows the frames that calibrate: of others, a policy found four times as many odd."""
     odd = frames.odd_samples(jumped.frames, jumped.seen, jumping)  # an eighth of those

@@ -221,6 +221,7 @@ def test_pixels_enter_the_first_convolution_as_they_are(tiny, made):
     assert mixed(*inputs(tiny, 1)[0]).isfinite().all()
 
 
+@pytest.mark.slow
 def test_a_calibration_serves_one_image_size(tiny, calibration):
     other = replace(tiny, config=replace(tiny.config, image_sizes=((96, 160),)))
     with pytest.raises(QuantizeError, match=r"made with images of .*calibrate again"):
@@ -366,6 +367,7 @@ def test_an_observer_that_clips_must_win_clearly(errors, chosen):
 
 
 @pytest.mark.parametrize("kind", ["symmetric", "affine"])
+@pytest.mark.slow
 def test_one_conversion_takes_the_ranges_of_every_scheme(tiny, calibration, made, kind):
     """To the last bit as if each were converted: choosing converts once, as conversions took most of its time."""
     schemes = [Scheme(kind=kind), Scheme(kind=kind, observer="minmax"), Scheme(kind=kind)]
@@ -487,6 +489,7 @@ def test_same_inputs_same_content(tiny, calibration, made, tmp_path):
     assert other not in hashes
 
 
+@pytest.mark.slow
 def test_a_policy_that_loses_much_by_int8_is_an_artifact_all_the_same(tiny, calibration, tmp_path):
     """What it loses is for the gates to judge; what may differ on a car stays within what a reader takes."""
     bias = tiny.weights["action_head.bias"] + torch.tensor([0.0, 0.5])
@@ -510,6 +513,7 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     assert not (tmp_path / "a.pt").exists()
 
 
+@pytest.mark.slow
 def test_an_artifact_has_the_weights_that_act_and_no_optimizer(tiny_policy, tiny, calibration, made, tmp_path):
     """Static: a byte for each and at most 3 % more, so the user's 66.5 million take less than 70 MB."""
     assert "optimizer_state_dict" in trainer_content(tiny_policy)

@@ -44,6 +44,7 @@ def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
     assert modes["static"]["scheme"]["mode"] == "static" and modes["static"]["int8_modules"] > 0
 
 
+@pytest.mark.slow
 def test_fp32_needs_no_calibration(loaded, tmp_path):
     recipe = replace(Recipe.of(params()), samples=2)
     digest, warnings = make_artifact(loaded, tmp_path / "fp32.pt", recipe, fp32=True)

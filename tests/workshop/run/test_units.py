@@ -79,6 +79,7 @@ def test_a_policy_of_older_actions_on_newer_recordings(tiny, tmp_path):
     assert in_todays_units(older, another, another.samples) is older
 
 
+@pytest.mark.slow
 def test_what_notebook_01_found_is_not_planned_again(tiny, old_recordings, tmp_path, monkeypatch):
     """Sixteen plans of a full-size policy take seconds, and five notebooks open a run."""
     made = tmp_path / "run"
