@@ -19,6 +19,7 @@ os.environ.setdefault("ROVER_AS_ROOT", "1")
 # No deadline for hypothesis's examples: one that waits for another program's turn has not failed.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
+USERS_CACHE = os.environ.get("ROVER_CACHE", "")  # empty is as unset
 LEFT_MB = 150
 _give_back_from = [0.0]  # megabytes held, above which a test's end frees what is left
 LIBRARY = 200  # modules that were imported since, of which the collector need not see again what they made
@@ -33,9 +34,6 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if {"demo_run", "hailo_kit"} & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-
-
-USERS_CACHE = os.environ.get("ROVER_CACHE", "")  # empty is as unset
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -215,9 +215,7 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
 def drives(tmp_path_factory):
     """Four drives of the expert, through the command line."""
     folder = tmp_path_factory.mktemp("drives")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROVER_CACHE", str(folder / "cache"))
-        result = rover("world", "record", folder / "episodes", "--count", 4, "--seed", 5)
+    result = rover("world", "record", folder / "episodes", "--count", 4, "--seed", 5)
     assert result.exit_code == 0, result.output
     return folder / "episodes"
 

@@ -99,8 +99,8 @@ def policy_of(image_sizes, names, **config) -> ACT:
     return ACT(act, {name.removeprefix("model."): tensor for name, tensor in lerobot.state_dict().items()})
 
 
-@pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
 @pytest.mark.slow
+@pytest.mark.parametrize("name", SHAPES)
 def test_both_splits_in_onnx_runtime_are_the_policy(name):
     model = policy_of(**SHAPES[name])
     rng = np.random.default_rng(0)

@@ -86,7 +86,7 @@ class Chooser:
                 f"{' and '.join(action_range)} never change in these recordings: no error can be judged",
                 remedy="record episodes in which the car is steered",
             )
-        forget_graphs()
+        forget_graphs()  # for the first time, as nothing is converted yet
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
         self.inputs = [inputs_of(s, checkpoint.config) for s in (*samples, *odd)]

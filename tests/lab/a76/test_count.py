@@ -31,7 +31,7 @@ from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
-pytestmark = [pytest.mark.emulated, needs.qemu, pytest.mark.usefixtures("users_cache")]
+pytestmark = [pytest.mark.emulated, needs.qemu]
 
 # Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
 BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2, "policy_static.onnx": 39.2}

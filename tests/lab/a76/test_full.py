@@ -22,15 +22,7 @@ SIZE = {"size": "small", "drives": 5, "samples": 6, "sizes": ((54, 96),), "curve
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """A cache of this module's own: what it makes is made here, and is not left in the user's."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROVER_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
-@pytest.fixture(scope="module")
-def run_dir(cache, tmp_path_factory):
+def run_dir(tmp_path_factory):
     return full_run(tmp_path_factory.mktemp("runs") / "full", steps=5, **SIZE)
 
 
@@ -72,7 +64,7 @@ def test_what_was_made_before_is_taken_from_the_cache(run_dir, checkpoint_alone,
     assert sha256_of(again / "best_model.pth") == sha256_of(run_dir / "best_model.pth")
 
 
-def test_the_whole_recipe_is_that_of_the_balloon_world(cache, checkpoint_alone, tmp_path, monkeypatch):
+def test_the_whole_recipe_is_that_of_the_balloon_world(checkpoint_alone, tmp_path, monkeypatch):
     """So that a checkpoint that `rover train` left in the cache is used."""
     short = train_module.RECIPES["small", "cpu"].of_steps(4)
     monkeypatch.setitem(train_module.RECIPES, ("small", "cpu"), short)

@@ -596,9 +596,9 @@ def test_wild_json(tmp_path_factory, content):
     check_sane(folder)
 
 
+@pytest.mark.slow
 @QUICK
 @given(rows=st.lists(ROW, max_size=25), tail=st.binary(max_size=40), cut=st.integers(0, 60))
-@pytest.mark.slow
 def test_wild_csv(tmp_path_factory, rows, tail, cut):
     folder = tmp_path_factory.mktemp("csv")
     with (folder / "control_data.csv").open("w", newline="") as f:

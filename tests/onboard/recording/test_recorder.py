@@ -413,8 +413,8 @@ def test_a_human_is_recorded(tmp_path):
     assert again.throttle_us.tolist() == [c["throttle_raw_us"] for c in controls if c["throttle_measured"]]
 
 
-@pytest.mark.parametrize(("how", "says"), [("dies_s", "unplugged|plugged in"), ("silent_s", "no status for 0.3 s")])
 @pytest.mark.slow
+@pytest.mark.parametrize(("how", "says"), [("dies_s", "unplugged|plugged in"), ("silent_s", "no status for 0.3 s")])
 def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, monkeypatch, how, says):
     monkeypatch.setattr(module, "SILENT_S", 0.3)
     link = FakeLink()

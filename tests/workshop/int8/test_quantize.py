@@ -366,8 +366,8 @@ def test_an_observer_that_clips_must_win_clearly(errors, chosen):
     assert best_of({name: Scheme(observer=name) for name in errors}, table) == chosen
 
 
-@pytest.mark.parametrize("kind", ["symmetric", "affine"])
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["symmetric", "affine"])
 def test_one_conversion_takes_the_ranges_of_every_scheme(tiny, calibration, made, kind):
     """To the last bit as if each were converted: choosing converts once, as conversions took most of its time."""
     schemes = [Scheme(kind=kind), Scheme(kind=kind, observer="minmax"), Scheme(kind=kind)]
