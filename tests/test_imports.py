@@ -14,7 +14,7 @@ FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.cli", *BESIDE, "
 PLUGIN = "lerobot_robot_rover"  # for LeRobot's commands
 TOPS = ("rover_lib", *BESIDE, PLUGIN, "lab")
 ROOMS = {
-    "lab": ("debian", "arduino", "driving", "a76", "int8", "pi", "repository", "__main__"),
+    "lab": ("debian", "arduino", "driving", "a76", "pi", "repository", "__main__"),
     "rover_lib.onboard": ("car", "artifact", "policy", "recording", "drive", "view", "care", "cli"),
     "rover_lib.workshop": ("recordings", "checkpoint", "judge", "int8", "plots", "run"),
 }
