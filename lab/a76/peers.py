@@ -28,7 +28,7 @@ from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.stage import atomic_path, find_stage, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -40,7 +40,6 @@ from rover_lib.workshop.run.session import open_run
 from rover_lib.workshop.run_program import run
 
 FOLDER = GUEST / "peers"
-COMMON = (FOLDER / "float_policy.py", FOLDER / "planes.py")
 SHIM = FOLDER / "executorch.cpp"
 COMPILER = "aarch64-linux-gnu-g++"
 NEEDS = {COMPILER: "g++-aarch64-linux-gnu"}  # the Debian package of a command
@@ -150,19 +149,13 @@ class Made:
 
 
 def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
-    """Quantize the policy with an engine's own tools into `folder`, unless it is there and its inputs are unchanged.
+    """Quantize the policy with an engine's own tools into `folder`.
 
     samples: for calibration. Raises CountError if the tools fail, or if they leave a layer in float that is INT8 in our
     artifact.
     """
-    artifact, report = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
-    frames = [sha256_of(s.frame_path) for s in samples]
-    states = [s.state.tolist() for s in samples]
-    goes_in = {"checkpoint": checkpoint.sha256, "frames": frames, "states": states, "packages": engine.packages}
-    key = key_of(goes_in, engine.maker, *COMMON, act)
-    made_of = {artifact.name: sha256_of(artifact)} if artifact.exists() else {}
-    if made_of and (before := find_stage(report, "peer", params={"key": key}, inputs=made_of)):
-        return Made(artifact, before["metrics"])
+    folder.mkdir(exist_ok=True)
+    artifact = folder / f"{engine.name}{engine.suffix}"
     height, width = checkpoint.config.image_sizes[0]
     with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch, atomic_path(artifact) as temporary:
         calibration = Path(scratch) / "calibration.npz"
@@ -174,7 +167,6 @@ def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Samp
         printed = run(*command, error=CountError, remedy=remedy, env=environment)
         made = json.loads(printed.splitlines()[-1])
         check_int8(engine.name, made, int8_layers(checkpoint))
-    write_stage(report, "peer", params={"key": key}, metrics=made, inputs={artifact.name: sha256_of(artifact)})
     return Made(artifact, made)
 
 

@@ -93,44 +93,31 @@ def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
     """Hold static artifacts to their gates; return `compare.gate` rows.
 
-    metrics: of arm.json. limits: arm.gates of lab/params.yml.
-    A gate is left out if this run has no artifact for it: those of instructions are for the user's policy, which is
-    known by its multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too, and the
-    worst action is judged.
+    metrics: of arm.json. limits: arm.gates of lab/params.yml. A gate is left out if this run has no artifact for it:
+    those of instructions are for the user's policy, which is known by its multiply-accumulates. Errors are divided by
+    this machine's, ONNX Runtime's by torch's too, and the worst action is judged.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():
         own = dict(limits["policies"].get(stem, {}))
-        if not own or abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
+        if own and abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
             own = {}
         rows += [gate(f"{stem} {key}", artifact[key], "<=", limit) for key, limit in own.items()]
         if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?(\.onnx)?", stem) or artifact.get("reference") is None:
             continue
         here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
-        rows += [
-            gate(
-                f"{stem} error on the emulated core, times the workstation's",
-                _times(artifact, here),
-                "<=",
-                limits["x_workstation_error"],
-            ),
-            gate(f"{stem} frames judged on the emulated core", artifact["frames_on_the_core"], ">=", limits["frames"]),
-            gate(f"{stem} cost of the tenth plan against the third, %", off_pct, "<=", limits["tenth_pct"]),
+        held = [
+            ("error on the emulated core, times the workstation's", _times(artifact, here), "x_workstation_error"),
+            ("cost of the tenth plan against the third, %", off_pct, "tenth_pct"),
         ]
-        for key in ("peak_memory_mb", "peak_memory_loading_mb"):
-            if key not in own:
-                rows.append(gate(f"{stem} {key}", artifact[key], "<=", limits[key]))
+        held += [(key, artifact[key], key) for key in ("peak_memory_mb", "peak_memory_loading_mb") if key not in own]
         if stem == STATIC_ONNX and (torchs := metrics["artifacts"].get(STATIC)):
-            errors = {key: torchs[key] for key in here}
-            rows.append(
-                gate(
-                    f"{stem} error on the emulated core, times torch's there",
-                    _times(artifact, errors),
-                    "<=",
-                    limits["x_torch_error"],
-                )
-            )
+            there = {key: torchs[key] for key in here}
+            held.append(("error on the emulated core, times torch's there", _times(artifact, there), "x_torch_error"))
+        rows += [gate(f"{stem} {what}", found, "<=", limits[limit]) for what, found, limit in held]
+        frames = artifact["frames_on_the_core"]
+        rows.append(gate(f"{stem} frames judged on the emulated core", frames, ">=", limits["frames"]))
     return rows
 
 
