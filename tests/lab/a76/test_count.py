@@ -23,10 +23,8 @@ from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.care import pi5
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
@@ -165,13 +163,12 @@ def core(users_cache) -> Core:
 
 
 @pytest.fixture(scope="module")
-def tiny_run(tiny_file, tmp_path_factory) -> Path:
-    """A run's folder with artifacts of the tests' small policy, always the same."""
+def tiny_run(thin, tmp_path_factory) -> Path:
+    """A run's folder with artifacts of the tests' thin policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
-    checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
+    (checkpoint, calibration), samples = thin, memory_samples(16)
     # Each parity vector of FP32 takes the emulated core four seconds.
     scheme, options = q.Scheme("static"), {"samples": samples[:1]}
-    calibration = calibrate(checkpoint, samples)
     calibration.save(folder / "calibration.pt")
     export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
@@ -185,11 +182,11 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def again(tiny_file) -> SimpleNamespace:
+def again(thin) -> SimpleNamespace:
     """What `opened` would give: held-out frames from memory."""
     recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
     parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
-    return SimpleNamespace(checkpoint=load_checkpoint(tiny_file), parts=parts, recordings=recordings)
+    return SimpleNamespace(checkpoint=thin[0], parts=parts, recordings=recordings)
 
 
 @pytest.fixture(scope="module")
