@@ -23,70 +23,52 @@ STATES = {
     State.STOPPED.value: ("nobody, stopped", RED),
     "": ("not known", "#F2F2F2"),
 }
+HEIGHTS = {"who": 0.35, "steering": 1.6, "throttle": 1.6, "plan": 1.6, "late": 1.3, "temperature": 0.9}  # in inches
 EVENTS_LISTED = 14
-LABEL_SHARE = 0.05  # events that are closer than this share of the width have one label together
 TEXT_LENGTH = 105
-DIGIT_SPACE = "\u2007"  # as wide as a digit
 
 
 def flight_figure(flight: Flight) -> Figure:
-    """Draw one drive, with all panels over the same seconds."""
+    """Draw one drive: panels over the same seconds, a dotted line for each event, and below them the last events."""
     ticks, summary = flight.ticks, flight.summary()
-    listed = list(enumerate(flight.events, 1))[-EVENTS_LISTED:]  # the last ones say why it ended
-    rows = ("who", "steering", "throttle", "plan", "late", "temperature")
-    heights = [0.35, 1.6, 1.6, 1.6, 1.3, 0.9]
-    fig, axes = new_figure(
-        len(rows), height_in=sum(heights) + 3.4 + 0.19 * len(listed), height_ratios=heights, sharex=True
-    )
-    panel = dict(zip(rows, axes[:, 0], strict=True))
+    listed = flight.events[-EVENTS_LISTED:]  # the last ones say why it ended
+    height_in = sum(HEIGHTS.values()) + 3.4 + 0.19 * len(listed)
+    fig, axes = new_figure(len(HEIGHTS), height_in=height_in, height_ratios=[*HEIGHTS.values()], sharex=True)
+    panel = dict(zip(HEIGHTS, axes[:, 0], strict=True))
     t_s, calibration = ticks["t_s"], flight.car.pwm
-    times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
-    end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
-    start_s = float(t_s[0]) if len(t_s) else 0.0  # events before the first tick are listed, not drawn
-    start_s = max(0.0, start_s - 0.02 * (end_s - start_s))
-
-    _who(panel["who"], ticks, (flight.period_ms or 0) / 1000)
-    _pulses(panel["steering"], calibration.steering, ticks, COLOURS["steering"])
-    _pulses(panel["throttle"], calibration.throttle, ticks, COLOURS["throttle"])
+    _draw_who(panel["who"], ticks, (flight.period_ms or 0) / 1000)
+    _draw_pulses(panel["steering"], calibration.steering, ticks, COLOURS["steering"])
+    _draw_pulses(panel["throttle"], calibration.throttle, ticks, COLOURS["throttle"])
     if (ticks["fade"] < 1).any():
         ax = panel["throttle"]
         # The area hangs from the top: its share of the height is the share of the throttle that is taken away.
         options = {"step": "post", "transform": ax.get_xaxis_transform(), "color": RED, "alpha": 0.18, "lw": 0}
         ax.fill_between(t_s, ticks["fade"], 1, label="faded for the plan's age", **options)
-    _plan(panel["plan"], ticks, flight.header.get("drive", {}))
-    _late(panel["late"], ticks, summary)
-    _temperature(panel["temperature"], flight.machine, summary)
-    for ax in axes[:, 0]:
+    _draw_plan(panel["plan"], ticks, flight.header.get("drive", {}))
+    _draw_late(panel["late"], ticks, summary)
+    _draw_temperature(panel["temperature"], flight.machine, summary)
+    for name, ax in panel.items():
         for event in flight.events:
             ax.axvline(event.t_s, color=BLACK, lw=0.8, ls=":", zorder=0.5)
-        if ax is not panel["who"]:
+        if name != "who":
             ax.grid(axis="y", color="#EEEEEE", lw=0.8)
             ax.set_axisbelow(True)
-            _legend_above(ax)
-    _event_numbers(panel["who"], [(n, e) for n, e in listed if e.t_s >= start_s], end_s - start_s)
-    axes[-1, 0].set_xlim(start_s, end_s)
+            if ax.get_legend_handles_labels()[0]:  # above the axes, where no line can run through it
+                ax.legend(loc="lower left", bbox_to_anchor=(0, 0.98), ncols=4, frameon=False, fontsize=9)
+    times_s = [t_s, flight.machine["t_s"], np.array([e.t_s for e in flight.events])]
+    end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
+    start_s = float(t_s[0]) if len(t_s) else 0.0  # events before the first tick are listed, not drawn
+    axes[-1, 0].set_xlim(max(0.0, start_s - 0.02 * (end_s - start_s)), end_s)
     axes[-1, 0].set_xlabel("time since the start (s)", fontsize=10)
     fig.align_ylabels(axes[:, 0])
-    fig.suptitle(_title(flight, summary), fontsize=11)
+    fig.suptitle(f"{flight.path.name}: {summary['start']}, {summary['seconds']:.1f} s", fontsize=11)
     if listed:
-        fig.supxlabel(_event_list(listed), fontsize=9, x=0.01, ha="left", linespacing=1.4)
+        earlier = len(flight.events) - len(listed)
+        fig.supxlabel(_list_events(listed, earlier), fontsize=9, x=0.01, ha="left", linespacing=1.4)
     return fig
 
 
-def _title(flight: Flight, summary: Mapping[str, Any]) -> str:
-    start = str(flight.header.get("start", "start not known")).partition(".")[0].replace("T", " ")
-    which = f", drive {flight.drive} of {flight.drives}" if flight.drives > 1 else ""
-    return f"{flight.path.name}{which}: {start}, {summary['seconds']:.1f} s, {summary['ticks']} ticks"
-
-
-def _legend_above(ax: Axes) -> None:
-    """Put the legend above the axes, where no line can run through it."""
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="lower left", bbox_to_anchor=(0, 0.98), ncols=4, frameon=False, fontsize=9, borderaxespad=0,
-                  columnspacing=1.5, handlelength=1.6)  # fmt: skip
-
-
-def _who(ax: Axes, ticks: Mapping[str, np.ndarray], period_s: float) -> None:
+def _draw_who(ax: Axes, ticks: Mapping[str, np.ndarray], period_s: float) -> None:
     """Draw who drove, as coloured bands."""
     state, t_s = ticks["state"], ticks["t_s"]
     starts = np.flatnonzero(np.r_[True, state[1:] != state[:-1]]) if len(state) else np.array([], int)
@@ -97,11 +79,10 @@ def _who(ax: Axes, ticks: Mapping[str, np.ndarray], period_s: float) -> None:
     ax.spines["left"].set_visible(False)
     ax.set_ylabel("driven by", fontsize=10, rotation=0, ha="right", va="center")
     seen = [Patch(color=colour, label=label) for s, (label, colour) in STATES.items() if (state == s).any()]
-    ax.legend(handles=seen, loc="lower left", bbox_to_anchor=(0, 1.45), ncols=4, frameon=False, fontsize=9,
-              borderaxespad=0)  # fmt: skip
+    ax.legend(handles=seen, loc="lower left", bbox_to_anchor=(0, 0.9), ncols=4, frameon=False, fontsize=9)
 
 
-def _pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour: str) -> None:
+def _draw_pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour: str) -> None:
     """Draw one channel's pulses, commanded and on the pin. The axis on the right shows the same lines as actions."""
     t_s, commanded, pins = ticks["t_s"], ticks[f"{channel.name}_us"], ticks[f"pins_{channel.name}_us"]
     ax.plot(t_s, commanded, color=colour, lw=2.2, alpha=0.7, label="commanded", drawstyle="steps-post")
@@ -116,10 +97,9 @@ def _pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour:
     scale = (lambda us: (us - neutral_us) / channel.us_per_unit, lambda a: neutral_us + a * channel.us_per_unit)
     right = ax.secondary_yaxis("right", functions=scale)
     right.set_ylabel("action", fontsize=10)
-    right.tick_params(labelsize=9)
 
 
-def _plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -> None:
+def _draw_plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -> None:
     t_s, plans = ticks["t_s"], ticks["plan"]
     ax.plot(t_s, ticks["plan_age_ms"], color=SLATE, lw=1.1, label="age of the plan")
     _, first = np.unique(plans, return_index=True)
@@ -133,7 +113,7 @@ def _plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -
     ax.set_ylabel("plan (ms)", fontsize=10)
 
 
-def _late(ax: Axes, ticks: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> None:
+def _draw_late(ax: Axes, ticks: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> None:
     label = "lateness of a command"
     if summary["jitter_p50_ms"] is not None:
         p50, p99, most = (summary[f"jitter_{p}_ms"] for p in ("p50", "p99", "max"))
@@ -145,15 +125,13 @@ def _late(ax: Axes, ticks: Mapping[str, np.ndarray], summary: Mapping[str, Any])
     ax.set_ylabel("late (ms)", fontsize=10)
 
 
-def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+def _draw_temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
+    """Draw the processor's temperature; it stays empty on a machine without a sensor."""
     t_s, celsius = machine["t_s"], machine["temperature_c"]
     if np.isfinite(celsius).any():
-        label = f"processor, {summary['temperature_max_c']:.1f} °C at most"
-        ax.plot(t_s, celsius, color=RED, lw=1.4, label=label)
+        ax.plot(t_s, celsius, color=RED, lw=1.4, label=f"processor, {summary['temperature_max_c']:.1f} °C at most")
         ax.set_ylim(np.nanmin(celsius) - 2, np.nanmax(celsius) + 2)
     else:
-        ax.text(0.5, 0.5, "this machine has no temperature sensor", transform=ax.transAxes, ha="center", va="center",
-                fontsize=9)  # fmt: skip
         ax.set_yticks([])
     bits = np.array([int(v or "0", 16) & NOW_BITS for v in machine["throttled"]], int)
     if bits.any():
@@ -163,28 +141,10 @@ def _temperature(ax: Axes, machine: Mapping[str, Any], summary: Mapping[str, Any
     ax.set_ylabel("processor\n(°C)", fontsize=10)
 
 
-def _event_numbers(ax: Axes, events: Sequence[tuple[int, Event]], seconds: float) -> None:
-    """Write the events' numbers above their lines. Events that are close together share one label."""
-    groups: list[list[tuple[int, Event]]] = []
-    for number, event in events:
-        if groups and event.t_s - groups[-1][0][1].t_s < LABEL_SHARE * seconds:
-            groups[-1].append((number, event))
-        else:
-            groups.append([(number, event)])
-    for group in groups:
-        (first, event), (last, _) = group[0], group[-1]
-        text = f"{first}" if first == last else f"{first}-{last}"
-        ax.annotate(text, (event.t_s, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points",
-                    ha="center", va="bottom", fontsize=9)  # fmt: skip
-
-
-def _event_list(events: Sequence[tuple[int, Event]]) -> str:
-    lines = []
-    if (before := events[0][0] - 1) > 0:
-        lines.append(f"{before} earlier events: rover log --json lists them")
-    for number, event in events:
-        at = f"{event.t_s:.2f}".rjust(7, DIGIT_SPACE)
+def _list_events(events: Sequence[Event], earlier: int) -> str:
+    lines = [f"{earlier} earlier events: rover log --json lists them"] if earlier else []
+    for event in events:
         text = str(event)
         text = text if len(text) <= TEXT_LENGTH else f"{text[:TEXT_LENGTH]} ..."
-        lines.append(f"{str(number).rjust(2, DIGIT_SPACE)}  {at} s   {text}".replace("$", r"\$"))  # no formula
+        lines.append(f"{event.t_s:7.2f} s   {text}".replace("$", r"\$"))  # no formula
     return "\n".join(lines)
