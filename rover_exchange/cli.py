@@ -11,7 +11,7 @@ import click
 from rover_lib.cli.prepare import EPISODES, size_option
 from rover_lib.onboard.cli import AS_JSON, FILE, LOG_DRIVE, open_view, show, sum_up, view_options
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import Number, Output, PathTo, check_kind
+from rover_lib.onboard.kinds import Output, PathTo, check_kind
 from rover_lib.workshop.progress import terminal_bar
 
 SIZE = click.option(
@@ -61,17 +61,13 @@ def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, throttle: str
 
 def _print_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
     from rover_exchange.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
-    from rover_lib.onboard.care.release import Expected
     from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 
     for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, OUTCOMES):
         del report[name]  # too long to print; the file has them
     show({done: report | {"report": str(out / REPORT)}}, as_json)
-    if as_json:
-        return
-    if (frames := report["frames_in_a_usual_episode"]) < Expected.chunk:
-        click.echo(f"half of its episodes have at most {frames} frames, a plan {Expected.chunk}: its drives have holes")
-    click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+    if not as_json:
+        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
 
 
 @click.command(short_help="Show a drive in the browser, with a stop button.")
@@ -107,10 +103,6 @@ def open_browser(url: str) -> None:
 @click.option(
     "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
 )
-@click.option("--video-hz", type=Number(1, 60), default=30, show_default=True, help="Pictures a second of the film.")
-@click.option(
-    "--video-width", type=click.IntRange(160, 1920), default=640, show_default=True, help="Width of the film in pixels."
-)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
 def log(
     file: Path,
@@ -119,8 +111,6 @@ def log(
     video: Path | None,
     mcap: Path | None,
     pictures: Path | None,
-    video_hz: float,
-    video_width: int,
     as_json: bool,
 ) -> None:
     """Summarize the flight log FILE of `rover drive`, and draw it.
@@ -136,7 +126,7 @@ def log(
     if video:
         from rover_exchange.film import write_film
 
-        count = write_film(video, flight, pictures, rate_hz=video_hz, width=video_width, progress=terminal_bar())
+        count = write_film(video, flight, pictures, terminal_bar())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
     if mcap:
         from rover_exchange.mcap_log import write_mcap

@@ -6,41 +6,40 @@
 It runs where Hailo's Dataflow Compiler is installed: on x86-64 Linux, version 3.x for Hailo-8 and 8L, 5.x for
 Hailo-10H. It is a kit's compile.py, and needs nothing else of the project.
 
-Nobody who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo. The archive of each
-step (.har) stays beside the kit's files, for Hailo's own tools: `hailo analyze-noise`, `hailo visualizer`.
+Nobody who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo. The quantized
+network stays in a .har for Hailo's own tools, such as `hailo analyze-noise`.
 """
 
 import argparse
-import importlib.metadata
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-COMPILERS = {"hailo8": "3", "hailo8l": "3", "hailo10h": "5"}  # major versions of the Dataflow Compiler
+CHIPS = ("hailo8", "hailo8l", "hailo10h")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Compile a network of this kit for a chip, and pack it.")
-    parser.add_argument("chip", choices=COMPILERS)
+    parser.add_argument("chip", choices=CHIPS)
     parser.add_argument("network", choices=["backbone", "whole"])
     parser.add_argument("--hef", type=Path, help="do not compile: pack this one")
     given = parser.parse_args()
     kit = Path(__file__).resolve().parent
     hef = given.hef or compile_network(kit, given.chip, given.network)
-    if not hef.is_file():
-        raise SystemExit(f"{hef}: no such file")
     print(f"{pack(kit, given.chip, given.network, hef)}: take it to the rover, and run `rover doctor` there")
 
 
 def compile_network(kit: Path, chip: str, name: str) -> Path:
-    """Compile a network and return the path of its HEF. Ends the program with a sentence for another compiler."""
-    network = json.loads((kit / "kit.json").read_text())["networks"][name]
-    _check_compiler(COMPILERS[chip])
+    """Compile a network and return the path of its HEF.
+
+    Ends the program if the compiler does not number the inputs as the model script takes them to be numbered: it would
+    normalise another one.
+    """
     from hailo_sdk_client import ClientRunner
 
+    network = json.loads((kit / "kit.json").read_text())["networks"][name]
     runner = ClientRunner(hw_arch=chip)
     runner.translate_onnx_model(
         str(kit / f"{name}.onnx"),
@@ -49,12 +48,15 @@ def compile_network(kit: Path, chip: str, name: str) -> Path:
         end_node_names=network["end_nodes"],
         net_input_shapes=network["inputs"],
     )
-    runner.save_har(str(kit / f"{name}_{chip}_parsed.har"))
-    layers = _input_layers(runner.get_hn_dict()["layers"], name, list(network["inputs"]))
+    layers, data = runner.get_hn_dict()["layers"], {}
+    for number, key in enumerate(network["inputs"], 1):
+        layer = f"{name}/input_layer{number}"
+        if key not in layers.get(layer, {}).get("original_names", []):
+            raise SystemExit(f"{name}.alls takes {layer} for '{key}', and the layers are {', '.join(layers)}")
+        data[layer] = np.load(kit / f"calibration_{key}.npy", mmap_mode="r")
     runner.load_model_script(str(kit / f"{name}.alls"))
-    data = {layer: np.load(kit / f"calibration_{key}.npy", mmap_mode="r") for key, layer in layers.items()}
     runner.optimize(data if len(data) > 1 else next(iter(data.values())))
-    runner.save_har(str(kit / f"{name}_{chip}_quantized.har"))
+    runner.save_har(str(kit / f"{name}_{chip}.har"))
     hef = kit / f"{name}_{chip}.hef"
     hef.write_bytes(runner.compile())
     return hef
@@ -74,29 +76,6 @@ def pack(kit: Path, chip: str, name: str, hef: Path) -> Path:
         if name == "backbone":
             z.write(kit / "transformer.onnx", "archive/model.onnx")
     return new.replace(path)
-
-
-def _check_compiler(major: str) -> None:
-    try:
-        found = importlib.metadata.version("hailo_dataflow_compiler")
-    except importlib.metadata.PackageNotFoundError:
-        raise SystemExit("Hailo's Dataflow Compiler is not installed in this Python; see docs/hailo.md") from None
-    if found.split(".")[0] != major:
-        raise SystemExit(f"this chip wants the Dataflow Compiler {major}.x, here is {found}; use another environment")
-
-
-def _input_layers(layers: dict[str, Any], name: str, inputs: list[str]) -> dict[str, str]:
-    """Return the compiler's names of the network's inputs.
-
-    Ends the program if they are not numbered as the model script takes them to be: it would normalise another input.
-    """
-    found = {}
-    for number, key in enumerate(inputs, 1):
-        expected = f"{name}/input_layer{number}"
-        if key not in layers.get(expected, {}).get("original_names", []):
-            raise SystemExit(f"{name}.alls takes {expected} for '{key}', and the layers are {', '.join(layers)}")
-        found[key] = expected
-    return found
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
 """Make the networks of a kit from a policy, in ONNX."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import onnx
 import torch
-from onnx import helper, numpy_helper
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import QuantizeError
@@ -112,40 +110,12 @@ def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
 
 
 def _network(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> Network:
-    model = _tidy(onnx_model(graph_of(module), inputs, outputs))
-    made = {output: node.name for node in model.graph.node for output in node.output}
-    return Network(
-        model, {name: list(x.shape) for name, x in inputs.items()}, {output: made[output] for output in outputs}
-    )
-
-
-def _tidy(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Merge two transposes in a row, multiply constants, and remove Identity; the model computes the same as before.
-
-    Hailo's parser most often refuses shapes: shuffles that it does not know.
-    """
-    graph = model.graph
-    constants = {i.name: i for i in graph.initializer}
-    made = {node.output[0]: node for node in graph.node}
-    readers = Counter(name for node in graph.node for name in node.input)
-    for node in list(graph.node):
-        before = made.get(node.input[0])
-        if node.op_type == "Identity":
-            assert before is not None and readers[node.input[0]] == 1
-            before.output[0] = node.output[0]
-            graph.node.remove(node)
-        elif node.op_type == "Transpose" and before is not None and before.op_type == "Transpose":
-            assert readers[node.input[0]] == 1
-            first, second = (list(helper.get_node_attr_value(n, "perm")) for n in (before, node))
-            node.input[0] = before.input[0]
-            node.attribute[0].CopyFrom(helper.make_attribute("perm", [first[i] for i in second]))
-            graph.node.remove(before)
-        elif node.op_type == "Mul" and set(node.input) <= constants.keys():
-            x, y = (numpy_helper.to_array(constants[name]) for name in node.input)
-            graph.initializer.append(numpy_helper.from_array(x * y, node.output[0]))
-            graph.node.remove(node)
-    read = {name for node in graph.node for name in node.input}
-    for name in constants.keys() - read:
-        graph.initializer.remove(constants[name])
-    onnx.checker.check_model(model, full_check=True)
-    return model
+    model = onnx_model(graph_of(module), inputs, outputs)
+    made = {node.output[0]: node for node in model.graph.node}
+    ends = {}
+    for name in outputs:  # each is an Identity, which nothing else reads; the compiler's end is the node before it
+        end = made[made[name].input[0]]
+        model.graph.node.remove(made[name])
+        end.output[0] = name
+        ends[name] = end.name
+    return Network(model, {name: list(x.shape) for name, x in inputs.items()}, ends)

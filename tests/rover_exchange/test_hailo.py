@@ -3,7 +3,6 @@
 tests/onboard/policy/test_hailo_engine.py drives by such artifacts.
 """
 
-import importlib.metadata
 import json
 import re
 import shutil
@@ -101,9 +100,9 @@ def test_networks_have_fixed_shapes_of_few_ranks(tiny):
             sizes = [d.dim_value for d in value.type.tensor_type.shape.dim]
             assert all(sizes) and len(sizes) <= 4, value.name
         assert all(len(shape) == 4 and shape[0] == 1 for shape in network.inputs.values())
-        transposed = {n.output[0] for n in network.model.graph.node if n.op_type == "Transpose"}
-        for node in network.model.graph.node:
-            assert node.op_type != "Identity" and not (node.op_type == "Transpose" and node.input[0] in transposed)
+        onnx.checker.check_model(network.model, full_check=True)
+        ends = [node.op_type for node in network.model.graph.node if node.name in network.outputs.values()]
+        assert ends == ["Conv" if network is front else "Add"]
 
 
 @pytest.mark.parametrize("network", ["backbone", "whole"])
@@ -137,19 +136,10 @@ def test_model_scripts_normalise_and_the_kit_lists_its_files(kit):
     assert all(path.name in listed for path in kit.iterdir() if path.name != "KIT.md")
 
 
-def test_another_compiler_or_other_names_of_layers_are_refused(kit, monkeypatch):
-    with pytest.raises(SystemExit, match=r"5\.x, here is 3\.33"):
-        hailo_compile.compile_network(kit, "hailo10h", "backbone")
-    with monkeypatch.context() as patch, pytest.raises(SystemExit, match="input_layer1 for 'state'"):
-        patch.setattr(hailo_standin.ClientRunner, "first", 0)
+def test_other_names_of_inputs_are_refused(kit, monkeypatch):
+    monkeypatch.setattr(hailo_standin.ClientRunner, "first", 0)
+    with pytest.raises(SystemExit, match="input_layer1 for 'state'"):
         hailo_compile.compile_network(kit, "hailo8", "whole")
-
-    def missing(name):
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr("importlib.metadata.version", missing)
-    with pytest.raises(SystemExit, match="not installed"):
-        hailo_compile.compile_network(kit, "hailo8", "backbone")
     assert not list(kit.glob("*.hef"))
 
 
