@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
-PACKAGES := rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world lab lerobot_robot_rover
+PACKAGES := rover_lib rover_exchange rover_learn balloon_world lab lerobot_robot_rover
 READY := $(VENV)/.ready
 # Each process runs whole test files or notebooks, and one waits while others compute. More than four processes would
 # cost more memory than they save time.

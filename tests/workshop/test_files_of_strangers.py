@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from rover_exchange.moments import pictures_of
 from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
@@ -21,7 +22,6 @@ from rover_lib.onboard.view.server import read_token
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_look.replay import pictures_of
 
 MOST_S, MOST_BYTES = 10, 500_000_000
 

@@ -10,7 +10,7 @@ import pytest
 from hailo_kit import normalised
 from policies import memory_samples
 
-from rover_hailo import compile as hailo_compile
+from rover_exchange.hailo import compile as hailo_compile
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import ReleaseError, inspect_artifact
