@@ -245,24 +245,5 @@ def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> Non
     _end_pi(ctx, outcome.wrong, output)
 
 
-@pi.command("whole")
-@click.argument("output", type=FILE, default="runs/pi.json")
-@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="To deploy.")
-@click.option("--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows.")
-@click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
-@click.pass_context
-def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
-    """Provision, deploy and drive a whole emulated Pi, and check each servo pulse against its command.
-
-    The machine is QEMU's Cortex-A76 with kernel, camera and USB, and the real firmware on an emulated Arduino. Cables
-    are pulled while it drives. Writes OUTPUT as JSON. The exit code is 1 if anything is not as expected; the machine's
-    console is beside OUTPUT then.
-    """
-    from lab.pi.machine_run import run_machine
-
-    outcome = run_machine(output, **options, say=click.echo)
-    _end_pi(ctx, outcome.wrong, output)
-
-
 if __name__ == "__main__":
     main()
