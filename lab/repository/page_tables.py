@@ -247,7 +247,7 @@ def _faults(root: Path) -> list[Row]:
 
 
 def _view(root: Path) -> list[Row]:
-    """What a view does to a drive; `python -m lab view`."""
+    """What a view does to a drive; its program left after commit 545214c."""
     report = _metrics(root / "results" / "lab", "view")
     stop, late = report["stop"], report["late_ms"]
     cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without"
