@@ -136,25 +136,6 @@ def faults(
     _end(ctx, outcome.wrong)
 
 
-@main.command()
-@click.argument("output", type=FILE, default="runs/view.json")
-@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="That drives.")
-@click.option("--pairs", type=click.IntRange(min=1), default=10, show_default=True, help="Turns with and without.")
-@click.option("--stops", type=click.IntRange(min=1), help="Presses of the button [default: lab/params.yml].")
-@click.pass_context
-def view(ctx: click.Context, output: Path, artifact: Path, pairs: int, stops: int | None) -> None:
-    """Measure what a view costs a drive, how old its picture is, and how soon its button stops the car.
-
-    It takes about 10 minutes and writes OUTPUT as JSON. The exit code is 1 if a gate of lab/params.yml does not hold.
-    Needs Debian's packages for the Arduino's firmware and simavr, see docs/first_hour.md.
-    """
-    from lab.driving.view_bench import measure
-
-    metrics, wrong = measure(output, artifact, pairs, stops, click.echo)
-    show(metrics, False)
-    _end(ctx, wrong)
-
-
 @main.command("mutants")
 @click.argument("output", type=FILE, required=False)
 @click.option("--only", multiple=True, metavar="NAME", help="Only this mutant; several times for more.")
