@@ -207,28 +207,19 @@ def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as
     and ignores its camera.
     """
     from rover_lib.onboard.artifact.manifest import distinct_names
-    from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy.load import load_policy
-    from rover_lib.workshop.judge import compare as c
-    from rover_lib.workshop.judge.camera_use import look
-    from rover_lib.workshop.recordings.episodes import load_recordings, split
+    from rover_lib.onboard.policy.confined import run_confined
+    from rover_lib.workshop.judge.compare import comparison_rows
+    from rover_lib.workshop.judge.compare_files import compare_files
 
-    p = params()["calibration"]
-    fp32 = load_policy(reference)
-    if not episodes.cameras and len(fp32.cameras) > 1:
-        episodes = replace(episodes, cameras=fp32.cameras)
-    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal_bar())
-    held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
-    others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
-    report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal_bar())
-    for warning in report.warnings() + look(fp32, report, progress=terminal_bar()).warnings():
+    others = distinct_names(artifacts, drop="policy_")
+    report = run_confined(compare_files, reference=reference, others=others, source=vars(episodes))
+    for warning in report["warnings"]:
         click.echo(f"rover: warning: {warning}", err=True)
-    found = {name: report.summary(name) for name in others}
     if as_json:
-        return show(found, as_json)
-    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in others.items()}
-    click.echo("\n".join(align(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
-    click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
+        return show(report["summaries"], as_json)
+    sizes_mb = {name: path.stat().st_size / 1e6 for name, path in others.items()}
+    click.echo("\n".join(align(comparison_rows(report["summaries"], sizes_mb, reference.stat().st_size / 1e6))))
+    click.echo(f"errors on {report['frames']} held-out frames, of the recorded range, and microseconds of pulse")
 
 
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")

@@ -467,31 +467,18 @@ def benchmark(
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
     what runs on the Pi.
     """
-    from rover_lib.onboard.artifact.manifest import Artifact, distinct_names
+    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
     from rover_lib.onboard.car.host import usable_cores
-    from rover_lib.onboard.care.benchmark import BenchmarkOptions
-    from rover_lib.onboard.care.benchmark import benchmark as measure
+    from rover_lib.onboard.care.benchmark import benchmark_artifacts
     from rover_lib.onboard.care.limits import check_gates
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy.load import load_policy
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
-    policies, contents, vectors = {}, {}, None
-    for name, path in files.items():
-        with Artifact(path) as artifact:
-            # In torch, XNNPACK's pool keeps the number that it begins with.
-            policies[name] = load_policy(artifact, threads=threads or usable_cores())
-            contents[f"{name}{path.suffix}"] = artifact.content_hash
-            vectors = artifact.parity if vectors is None else vectors
-    assert vectors is not None, "click asks for an artifact at least"
-    first = next(iter(policies.values()))
-    frames = [
-        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
-    ]  # stored as RGB; a camera gives BGR
+    contents = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
     options: dict[str, Any] = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
-    metrics = measure(policies, frames, vectors["state"][0], BenchmarkOptions(**options, memory_alone=True))
+    metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if busy > BUSY:
         click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
     if output:

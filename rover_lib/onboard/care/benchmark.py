@@ -7,13 +7,13 @@ machine that heats up or is shared slows all of them alike. A value that the hos
 vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
+import contextlib
 import itertools
 import math
-import os
-import subprocess
-import sys
+import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +23,12 @@ import numpy as np
 
 from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
 from rover_lib.onboard.care.lower_bound import floor_ms
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.policy.confined import load_confined, run_confined
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
+THROTTLED_S = 1.0  # between two readings of the firmware's throttling
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
 
@@ -37,33 +39,81 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
     nothing about one of them. Returns None if the machine does not report it. Raises PolicyError if the artifact does
     not load or predict there.
     """
-    code = (
-        "import sys, numpy as np\n"
-        "from rover_lib.onboard import load_policy\n"
-        "from rover_lib.onboard.car.host import Host\n"
-        "policy = load_policy(sys.argv[1], threads=int(sys.argv[2]) or None)\n"
-        "cameras = policy.manifest['cameras']\n"
-        "frame = {c['name']: np.zeros((c['height'], c['width'], 3), np.uint8) for c in cameras}\n"
-        "for _ in range(3):\n"
-        "    policy.predict_chunk(frame, np.zeros(len(policy.state_names), np.float32))\n"
-        "print('peak', Host().process_peak_memory_mb())\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return run_confined(_predict_alone, timeout_s=timeout_s, path=str(path), threads=threads or usable_cores())
+
+
+def _predict_alone(path: str, threads: int) -> float | None:
+    policies, _ = load_confined({"policy": path}, threads=threads)
+    policy = policies["policy"]
+    frame = {c["name"]: np.zeros((c["height"], c["width"], 3), np.uint8) for c in policy.manifest["cameras"]}
+    for _ in range(3):
+        policy.predict_chunk(frame, np.zeros(len(policy.state_names), np.float32))
+    return Host().process_peak_memory_mb()
+
+
+def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Time artifacts from anywhere, on the frames of the first one's parity vectors, as benchmark() does.
+
+    Nothing of them runs in this process. paths: by name. threads: of the engines. options: of BenchmarkOptions. Each
+    artifact's memory is measured too. Raises PolicyError for an artifact that does not load.
+    """
+    host = Host()
+    with tempfile.TemporaryDirectory() as folder, _keep_throttled(Path(folder) / "throttled", host) as told:
+        metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options, throttled=told)
+    metrics["throttled_means"] = throttled_means(metrics["throttled"])
+    _add_memory(metrics, paths, threads)
+    return metrics
+
+
+@contextlib.contextmanager
+def _keep_throttled(path: Path, host: Host) -> Iterator[Path]:
+    """Keep what the firmware throttles in a file, for a confined process, which can start no program to ask."""
+    ended = threading.Event()
+
+    def keep() -> None:
+        while True:
+            path.write_text(host.throttled() or "")
+            if ended.wait(THROTTLED_S):
+                return
+
+    thread = threading.Thread(target=keep)
+    path.touch()
+    thread.start()
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, str(path), str(threads or 0)],
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            env=environment,
-        )
-    except subprocess.TimeoutExpired:
-        raise PolicyError(f"{path}: no prediction within {timeout_s:g} s in a process of its own") from None
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise PolicyError(f"{path}: does not run in a process of its own ({last})", remedy="load it here to see why")
-    word = done.stdout.split()[-1]
-    return None if word == "None" else float(word)
+        yield path
+    finally:
+        ended.set()
+        thread.join()
+
+
+@dataclass(frozen=True)
+class _ToldHost(Host):
+    """A host whose throttling another process keeps in the file `told`."""
+
+    told: Path = Path()
+
+    def throttled(self) -> str | None:
+        return self.told.read_text() or None
+
+
+def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any], throttled: str) -> dict[str, Any]:
+    policies, artifacts = load_confined(paths, threads=threads)
+    first, vectors = next(iter(policies.values())), next(iter(artifacts.values())).parity
+    frames = [
+        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
+    ]  # stored as RGB; a camera gives BGR
+    host = _ToldHost(told=Path(throttled))
+    return benchmark(policies, frames, vectors["state"][0], BenchmarkOptions(**options), host=host)
+
+
+def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
+    """Measure the memory of each artifact alone, and add it to the metrics."""
+    with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
+        peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
+        for name, peak_mb in zip(paths, peaks, strict=True):
+            metrics["artifacts"][name]["peak_memory_mb"] = peak_mb
+    if (peak_mb := metrics["artifacts"][metrics["main"]]["peak_memory_mb"]) is not None:
+        metrics["peak_memory_mb"] = peak_mb
 
 
 def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
@@ -184,18 +234,11 @@ def benchmark(
     if reference is not None:
         for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
-    if options.memory_alone:
-        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
-        with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
-            peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
-            for name, peak_mb in zip(paths, peaks, strict=True):
-                artifacts[name]["peak_memory_mb"] = peak_mb
     top = {k: v for k, v in artifacts[main].items() if not k.startswith("speedup")}
     process_mb = host.process_peak_memory_mb()
-    if top["peak_memory_mb"] is None:
-        top["peak_memory_mb"] = process_mb
-    return {
+    metrics = {
         **top,
+        "peak_memory_mb": process_mb,
         "process_peak_memory_mb": process_mb,
         "cpu_pct": _share_pct(run.process_s, run.wall_s, cores),
         **run.host_metrics(),
@@ -211,6 +254,10 @@ def benchmark(
         "artifacts": artifacts,
         "series": run.series if options.duration_s is not None else None,
     }
+    if options.memory_alone:
+        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
+        _add_memory(metrics, paths, threads)
+    return metrics
 
 
 def _set_threads(policies: Mapping[str, Any], threads: Mapping[str, int]) -> None:

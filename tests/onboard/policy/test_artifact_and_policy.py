@@ -1,6 +1,5 @@
 """The artifact alone: what it holds, what loading it refuses, and that it drives without the workshop."""
 
-import ast
 import mmap
 import shutil
 from dataclasses import replace
@@ -218,26 +217,3 @@ def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         artifact.save_artifact(path, module, manifest, parity)
     assert [p.name for p in tmp_path.iterdir()] == ["x.pt"] and path.read_text() == "old"
-
-
-def test_a_parser_that_fails_by_itself_is_asked_again(artifacts, monkeypatch):
-    """Python 3.11's sometimes does when several threads parse; seen when policies were loaded at the same time."""
-    parse, failures = ast.parse, iter(["depth mismatch", "depth mismatch"])
-
-    def failing(*args):
-        for text in failures:
-            raise SystemError(text)
-        return parse(*args)
-
-    with monkeypatch.context() as patched:  # only here, because pytest parses too
-        patched.setattr(ast, "parse", failing)
-        artifact.Artifact(artifacts["static"]).prove()
-
-
-def test_a_parser_that_always_fails_is_no_traceback(artifacts, monkeypatch):
-    def failing(*args):
-        raise SystemError("depth mismatch")
-
-    with monkeypatch.context() as patched, pytest.raises(ArtifactError, match=r"cannot be read \(SystemError\)"):
-        patched.setattr(ast, "parse", failing)
-        artifact.Artifact(artifacts["static"]).prove()
