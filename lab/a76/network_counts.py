@@ -26,10 +26,9 @@ from rover_learn.channels import kept_of
 from rover_learn.train import SIZES
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.workshop import act
-from rover_lib.workshop.act import ACT, ActConfig
+from rover_lib.workshop.act import ACT, ActConfig, expected_shapes
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.int8 import export, observe, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.run_program import run
