@@ -19,10 +19,9 @@ struct transmitted {
     uint16_t misread_in; /* one in this many pulses is read as one at rest; 0: none */
 };
 
-static const uint32_t PERIOD_US[2] = {STEERING_PERIOD_US, THROTTLE_PERIOD_US};
-static const uint16_t REST_US[2] = {STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US};
 static const double BYTES_PER_MS = 11.7647; /* 117647 baud */
 
+static struct car kept; /* in its EEPROM; the transmitter is that car's, too */
 static uint32_t now;
 static uint16_t boot;
 static char cause;
@@ -38,7 +37,7 @@ static uint16_t pins[2];
 static struct event events[65536];
 static uint32_t event_count;
 
-const struct car *car_kept() { return &DEFAULT_CAR; }
+const struct car *car_kept() { return &kept; }
 void car_keep(const struct car *car) { (void)car; }
 void pulses_begin(const struct car *car) {
     pulses_set(car, car->servos[STEERING].neutral_us, car->servos[THROTTLE].neutral_us);
@@ -55,7 +54,7 @@ bool receiver_take(enum channel channel, uint16_t *pulse_us, uint16_t *period_us
     bool came = fresh[channel];
     fresh[channel] = false;
     *pulse_us = measured_us[channel];
-    *period_us = (uint16_t)PERIOD_US[channel];
+    *period_us = kept.servos[channel].period_us;
     return came;
 }
 
@@ -96,7 +95,8 @@ static void note(void) {
     if (event_count < sizeof events / sizeof *events) events[event_count++] = event;
 }
 
-void board_start(uint32_t clock, uint16_t boot_now, char cause_now) {
+void board_start(uint32_t clock, uint16_t boot_now, char cause_now, const uint16_t *car) {
+    memcpy(&kept, car, sizeof kept);
     now = clock;
     boot = boot_now;
     cause = cause_now;
@@ -126,10 +126,10 @@ int board_run(int ms) {
         for (int channel = STEERING; channel <= THROTTLE; channel++) {
             struct transmitted *from = sent + channel;
             if (since_us < due_us[channel]) continue;
-            due_us[channel] += PERIOD_US[channel];
+            due_us[channel] += kept.servos[channel].period_us;
             if (!from->pulse_us || ++number[channel] % from->one_in) continue;
             bool misread = from->misread_in && number[channel] / from->one_in % from->misread_in == 0;
-            measured_us[channel] = misread ? REST_US[channel] : from->pulse_us;
+            measured_us[channel] = misread ? kept.servos[channel].neutral_us : from->pulse_us;
             fresh[channel] = true;
         }
         loop();

@@ -85,7 +85,7 @@ def test_a_planted_fault_of_the_firmware_is_found(tmp_path, monkeypatch, invaria
     source.write_text(text.replace(good, bad))
     monkeypatch.setattr(loop, "LATE_S", 99.0)  # the host's own limit, which would hide that the firmware has none
     virtual.compile_sketch(tmp_path / "firmware", tmp_path)
-    monkeypatch.setattr(virtual, "library", lambda: tmp_path / virtual.LIBRARY)
+    monkeypatch.setattr(virtual, "library", lambda human: tmp_path / virtual.LIBRARY)
     found = list(broken(drive_story(KEPT[story][0] if isinstance(story, str) else story)))
     assert any(sentence.startswith(f"{invariant}: ") for sentence in found), found
 
