@@ -47,40 +47,13 @@ def test_random_and_mutated_lines(count):
 @pytest.mark.parametrize(
     ("name", "file", "good", "bad"),
     [
-        ("range", "vehicle.c", "!within(command->steering_us, steering->min_us, steering->max_us)", "false"),
         ("late", "vehicle.c", "now_ms - command->heard_ms > LATE_MS", "false"),
-        ("cap", "vehicle.c", "command->throttle_us, vehicle->cap_us)", "command->throttle_us, 2000)"),
         ("car's cap", "vehicle.c", "within(car->cap_us, 1, CAP_MAX_US)", "within(car->cap_us, 1, 200)"),
-        ("car's neutral", "vehicle.c", "throttle->min_us == throttle->neutral_us &&", ""),
-        ("car's end", "vehicle.c", "throttle->neutral_us, THROTTLE_MAX_US)", "throttle->neutral_us, 980)"),
-        ("car's period", "vehicle.c", "within(servo->period_us, PERIOD_MIN_US, PERIOD_MAX_US) &&", ""),
-        ("armed", "vehicle.c", "AUTONOMOUS) return IGNORED;\n    uint32_t id", "0) return IGNORED;\n    uint32_t id"),
         ("told", "vehicle.c", "!vehicle->car_told ||", ""),
-        ("other car", "vehicle.c", "|| command->car != vehicle->car_id) return OTHER_CAR", ") return OTHER_CAR"),
-        ("raised cap", "vehicle.c", "car.cap_us < vehicle->lowered_us ?", "true ?"),
-        ("old signal", "vehicle.c", "received->period_us)) continue;", "received->period_us) || true) continue;"),
-        ("old rest", "vehicle.c", "throttle_free = false;\n        vehicle->throttle_off_rest = 0xFF;", "car = car;"),
         ("slew", "vehicle.c", "ms * STEERING_SLEW_US_PER_MS", "ms * 5"),
-        ("credit", "vehicle.c", "        vehicle->slewed_ms = now_ms;", "        vehicle->slewed_ms = now_ms - 1;"),
-        ("rest", "vehicle.c", "vehicle->throttle_free ?", "true ?"),
-        ("takeover", "vehicle.c", "    vehicle->throttle_free = false;\n}\n\nvoid", "}\n\nvoid"),
-        ("majority", "vehicle.c", "FAST_MOVED_PULSES : 1)", "FAST_MOVED_PULSES + 1 : 1)"),
-        ("wiggle", "vehicle.c", "vehicle->wiggle[2].seen && let_go", "let_go"),
-        ("let go", "vehicle.c", ".seen && let_go", ".seen"),
         ("by hand", "vehicle.c", "if (vehicle->throttle_off_rest) forget", "if (false) forget"),
-        ("request", "vehicle.c", "now_ms - command->asked_ms > REQUEST_MS", "false"),
-        ("used up", "vehicle.c", "forget_wiggle(vehicle);\n    vehicle->comm", "vehicle->comm"),
-        ("sparse", "vehicle.c", "[received->oldest] <= SIGNAL_TIMEOUT_MS) cont", "[received->oldest] < 1u << 31) cont"),
         ("replay", "vehicle.c", "!within(ahead, 1, SEQUENCE_WINDOW)", "ahead == 0"),
-        ("boot", "vehicle.c", "command->boot != vehicle->boot ||", ""),
-        ("fresh", "vehicle.c", "<= FRESH_MS", "<= LATE_MS"),
-        ("timeout", "vehicle.c", ">= COMMAND_TIMEOUT_MS", ">= 400"),
-        ("latch", "vehicle.c", "return IGNORED;\n    vehicle->w", "vehicle->state = AUTONOMOUS;\n    vehicle->w"),
-        ("signal", "vehicle.c", "if (!received->present ||", "if (true ||"),
-        ("stuck", "vehicle.c", "vehicle->sequence = command->sequence;", "vehicle->sequence |= command->sequence;"),
         ("crc", "protocol.c", "if (end[i] != hex(crc & 15))", "if (i == 1 && end[i] != hex(crc & 15))"),
-        ("human", "vehicle.c", "if (moved && vehicle", "if (moved && channel != STEERING && vehicle"),
-        ("stale", "protocol.c", "now_ms - reader->started_ms > LINE_LIFETIME_MS", "false"),
         ("overflow", "protocol.c", "reader->length == HOST_LINE_MAX", "reader->length == HOST_LINE_MAX + 40"),
     ],
 )  # fmt: skip
@@ -149,11 +122,6 @@ def test_a_car_is_nine_numbers_of_16_bits(boot, sequence, numbers):
     for command in commands:
         assert (command.kind, command.boot, command.sequence) == (b"C", boot, sequence)
         assert list(command.numbers) == numbers
-
-
-@given(st.binary(max_size=300))
-def test_random_bytes_are_no_command(data):
-    assert read(data + b"\n") == []
 
 
 @given(LINES, st.data())

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import needs
 import pytest
-from uno import EEPROM_BYTES, LINE_IN, RESET, Uno, pulses, widths
+from uno import EEPROM_BYTES, RESET, Uno, pulses, widths
 
 from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -41,7 +41,7 @@ def sticks(board, steering_us, throttle_us):
         steering_us,
         throttle_us,
         steering_period_us=board.car.numbers[0] + 30,  # receiver and Arduino have each a clock of their own
-        throttle_period_us=board.car.numbers[4] + (30 if board.car.reverses else 0),
+        throttle_period_us=board.car.numbers[4] + 30 * board.car.reverses,
     )
 
 
@@ -53,10 +53,10 @@ def arm(board):
     assert (board.status.state, board.status.result) == ("A", "k"), board.lines[-3:]
 
 
-@pytest.fixture(params=[CRAWLER, INVERTED], ids=["crawler", "inverted"])
-def armed(request):
+@pytest.fixture
+def armed():
     board = Uno()
-    board.car = car = request.param
+    board.car = car = CRAWLER
     board.neutral = SimpleNamespace(steering=car.numbers[2], throttle=car.numbers[6])
     board.run_ms(60)
     told(board, car)
@@ -94,25 +94,6 @@ def test_the_pins_are_car_ymls_over_the_whole_range(armed):
         for pin, period_us in (("steering", car.numbers[0]), ("throttle", car.numbers[4])):
             assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
     assert armed.status.state == "A"
-    assert car.pwm.pulses(1, 0).steering_us == (2000 if car is CRAWLER else 900)  # left
-
-
-def test_the_human_drives_over_the_whole_range(armed):
-    armed.command("N")
-    for _ in range(2):  # the first takes the car over, and his throttle passes once it was at rest
-        sticks(armed, armed.neutral.steering + 100, armed.neutral.throttle)
-        armed.run_ms(400)
-    least_us, most_us = (800, 2200) if armed.car.reverses else (40, 948)
-    for share in range(8):
-        steering_us, throttle_us = 820 + 190 * share, least_us + (most_us - least_us) / 7 * share
-        sticks(armed, steering_us, throttle_us)
-        armed.run_ms(120)
-        on_pins(armed.run_ms(90), steering_us, throttle_us, within_us=STEP_US + 1)
-        assert abs(armed.status.receiver_steering_us - steering_us) <= STEP_US
-        assert abs(armed.status.receiver_throttle_us - throttle_us) <= 2  # captured by hardware
-        periods = armed.status.receiver_steering_period_us - 30, armed.status.receiver_throttle_period_us
-        assert abs(periods[0] - armed.car.numbers[0]) <= 2 * ARDUINO_STEP_US
-        assert abs(periods[1] - armed.car.numbers[4]) <= 30 + 2 * ARDUINO_STEP_US
 
 
 def test_a_pulse_is_whole_whenever_it_changes(armed):
@@ -134,48 +115,7 @@ def test_a_pulse_is_whole_whenever_it_changes(armed):
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin))
 
 
-def test_silence_stops_it_at_its_neutral(armed):
-    rng = random.Random(2)
-    for _ in range(4):
-        armed.drive(*fastest(armed), 300 + rng.uniform(0, 25), every_ms=20)
-        armed.command("D", *fastest(armed))
-        events = armed.run_ms(400)
-        command_us = max(e.at_us for e in events if e.kind == LINE_IN)
-        is_neutral(armed, events, after_us=command_us + (TIMEOUT_MS + 24) * 1000)
-        moving = [e for e in pulses(events, "throttle") if armed.car.pwm.throttle.moves(e.pulse_us)]
-        last_us = max(e.at_us + e.pulse_us for e in moving) - command_us
-        assert (TIMEOUT_MS - 25) * 1000 <= last_us <= (TIMEOUT_MS + 25) * 1000
-        assert (armed.status.state, armed.status.reason) == ("S", "t")
-        arm(armed)
-
-
-@pytest.mark.parametrize(("steering_us", "throttle_us"), [(110, 0), (-110, 0), (0, 80), (0, -70)])
-def test_the_human_takes_over_within_50_ms(armed, steering_us, throttle_us):
-    rng = random.Random(3)
-    latest = 0
-    for _ in range(5):
-        armed.drive(*fastest(armed), 300 + rng.uniform(0, 25), every_ms=20)
-        start_us = armed.now_us
-        human = armed.neutral.steering + 4 + steering_us, armed.neutral.throttle + 4 + throttle_us
-        sticks(armed, *human)
-        events = armed.drive(*fastest(armed), 100, every_ms=20)
-        human = human[0], human[1] if not throttle_us else armed.neutral.throttle
-        if not throttle_us:  # his throttle passes at once where it is at rest, which a slow one's takes 160 ms to be
-            events = [e for e in events if e.channel == 0 or abs(e.pulse_us - armed.neutral.throttle) > STEP_US] + [
-                e for e in events if e.channel == 1 and e.kind == 1
-            ]
-        on_pins(events, *human, after_us=start_us + TAKEOVER_MS * 1000, within_us=STEP_US + 1)
-        moving = [e for e in pulses(events, "throttle", start_us) if abs(e.pulse_us - fastest(armed)[1]) <= STEP_US]
-        latest = max([latest, *(e.at_us + e.pulse_us - start_us for e in moving)])
-        assert (armed.status.state, armed.status.reason) == ("M", "h")
-        sticks(armed, armed.neutral.steering + 4, armed.neutral.throttle + 4)
-        armed.run_ms(60)
-        arm(armed)
-    print(f"the host's last throttle at most {latest / 1000:.1f} ms after")
-    assert latest <= TAKEOVER_MS * 1000
-
-
-@pytest.mark.parametrize("how", ["hang", "reset", "power"])
+@pytest.mark.parametrize("how", ["hang", "power"])
 def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
     """A watchdog's reset in a drive gave the default's neutral, 120 us at 984 Hz, to a speed controller of 50 Hz."""
     armed.drive(*fastest(armed), 297)
@@ -192,9 +132,6 @@ def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
     armed.wiggle()
     armed.command("A")
     armed.run_ms(ANSWER_MS)
-    if armed.car is INVERTED:  # its pins are the default's: which way is left, only the host knows
-        assert (armed.status.state, armed.status.result) == ("A", "k")
-        return
     assert (armed.status.state, armed.status.result) == ("M", "c")
     told(armed, armed.car)
     arm(armed)
@@ -297,18 +234,6 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
     assert found.count(zlib.crc32(bytes(18))) > len(images)
 
 
-def test_what_it_keeps_already_is_not_written_again():
-    board = Uno(eeprom=eeprom_of(CRAWLER))
-    board.run_ms(60)
-    for _ in range(5):
-        told(board, CRAWLER)
-    board._c.uno_eeprom(board._uno, b"\0" * EEPROM_BYTES, EEPROM_BYTES, True)  # what was written would show
-    for _ in range(5):
-        told(board, CRAWLER)
-    assert not any(board.eeprom)
-    board.close()
-
-
 def test_told_of_another_car_no_pulse_is_cut():
     """There and back while a human steers, the throttle at rest: each pulse on the way is one neutral or the other."""
     rng = random.Random(4)
@@ -335,39 +260,3 @@ def test_told_of_another_car_no_pulse_is_cut():
         periods = [e.period_us for e in pulses(board.events, "steering")[-2:]]
         assert all(abs(us - car.numbers[0]) <= EDGE_US for us in periods)
     board.close()
-
-
-def test_the_clock_is_true_through_changes_of_the_period():
-    board = Uno()
-    board.run_ms(50)
-    for car in (CRAWLER, Car(), CRAWLER, INVERTED, CRAWLER):
-        told(board, car)
-        board.run_ms(333)
-        assert board.now_us / 1000 - 35 <= board.status.uptime_ms <= board.now_us / 1000
-    board.close()
-
-
-def test_a_turn_of_the_loop_takes_less_than_two_milliseconds(armed):
-    """Telling a car is the longest line that there is."""
-    armed.watch_loop()
-    for n in range(30):
-        armed.command("C", *armed.car.numbers)
-        armed.command("D", armed.neutral.steering + n, armed.neutral.throttle + n)
-        armed.run_ms(25)
-    assert (armed.status.state, armed.status.lost) == ("A", 0)
-    print(f"the loop's longest turn takes {armed.longest_ms:.2f} ms")
-    assert 0.1 < armed.longest_ms < 2
-
-
-def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(armed):
-    armed.command("N")
-    rng = random.Random(5)
-    errors = []
-    for _ in range(200):
-        steering_us = rng.uniform(1010, 1940)
-        sticks(armed, steering_us, rng.uniform(*((1010, 1990) if armed.car.reverses else (120, 700))))
-        for _ in range(6):
-            armed.command("N")
-            armed.run_ms(rng.uniform(9, 12))
-        errors.append(armed.status.receiver_steering_us - steering_us)
-    assert max(map(abs, errors)) <= STEP_US + 0.5
