@@ -16,6 +16,7 @@ from rover_lib.onboard.params import params
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
 NEUTRAL_US = {"steering": 1456, "throttle": 120}  # of the default car
+PERIOD_US = {"steering": 21316, "throttle": 1016}
 STOPPED_THROTTLE_US = NEUTRAL_US["throttle"] + ARDUINO_STEP_US
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # the error of a pulse that the Arduino measured and sends on

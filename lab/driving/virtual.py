@@ -9,7 +9,6 @@ import functools
 import heapq
 import math
 import random
-from _ctypes import dlclose
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -66,36 +65,38 @@ def compile_sketch(firmware: Path, folder: Path, human: str = "receiver") -> Non
 
 
 class Board:
-    """The sketch from one start to the next, with a car in its EEPROM. Raises ArduinoError if there is no gcc."""
+    """The sketch from one start to the next, one at a time. Raises ArduinoError if there is no gcc.
 
-    def __init__(self, clock_ms: int, boot: int, cause: str, car: Car):
-        self._c = ctypes.CDLL(str(library(car.human)))
+    numbers: of the car in its EEPROM. human: as for library().
+    """
+
+    def __init__(self, clock_ms: int, boot: int, cause: str, numbers: Sequence[int], human: str):
+        self.c = ctypes.CDLL(str(library(human)))
         self._text = ctypes.create_string_buffer(1024)
         self._events = (Event * 65536)()
         self._zero_ms = clock_ms
-        numbers = (ctypes.c_uint16 * 9)(*car.numbers)
-        self._c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()), numbers)
+        car = (ctypes.c_uint16 * 9)(*numbers)
+        self.c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()), car)
 
-    def transmit(self, channel: int, pulse_us: int, one_in: int = 1, misread_in: int = 0) -> None:
+    def transmit(
+        self, channel: int, pulse_us: int, one_in: int = 1, misread_in: int = 0, misread_us: int = 0, period_us: int = 0
+    ) -> None:
         """Set the receiver's pulses from now on, where 0 stands for none. board.c explains the other arguments."""
-        self._c.board_transmit(channel, pulse_us, one_in, misread_in)
+        self.c.board_transmit(channel, pulse_us, one_in, misread_in, misread_us, period_us)
 
     def give(self, data: bytes) -> None:
-        self._c.board_give(data, len(data))
+        self.c.board_give(data, len(data))
 
     def run(self, ms: int) -> tuple[int, bytes]:
         """Let up to `ms` milliseconds pass. Returns how many did, and what the sketch sent in the last of them."""
-        passed = self._c.board_run(ms)
-        length = self._c.board_said(self._text)
+        passed = self.c.board_run(ms)
+        length = self.c.board_said(self._text)
         return passed, self._text.raw[:length]
 
     def events(self) -> list[tuple[int, Event]]:
         """Return the events since the last call, each with its time in milliseconds since this start."""
-        count = self._c.board_events(self._events)
+        count = self.c.board_events(self._events)
         return [((e.at_ms - self._zero_ms) % 2**32, Event.from_buffer_copy(e)) for e in self._events[:count]]
-
-    def close(self) -> None:
-        dlclose(self._c._handle)
 
 
 class Wire:
@@ -364,7 +365,7 @@ class World:
     def _power(self, clock_ms: int, cause: str) -> None:
         self._boot += 1
         self._started_ms, self._hung_ms = self.now_ms, 0
-        self.board = Board(clock_ms, self._boot, cause, self.car)
+        self.board = Board(clock_ms, self._boot, cause, self.car.numbers, self.car.human)
         self.seen.starts.append(self.now_ms)
         self.handle()
 
@@ -374,7 +375,6 @@ class World:
             self._hung_ms = 0
         if self.board:
             self.seen.pins += [(self._started_ms + ms, event) for ms, event in self.board.events()]
-            self.board.close()
             self.board = None
 
     def handle(self) -> None:
@@ -388,7 +388,7 @@ class World:
         if self.board:
             steering_us, throttle_us = hand.pulses()
             self.board.transmit(STEERING, steering_us)
-            self.board.transmit(THROTTLE, throttle_us, hand.one_in, hand.misread_in)
+            self.board.transmit(THROTTLE, throttle_us, hand.one_in, hand.misread_in, self.rest_us[1])
 
     def close(self) -> None:
         """End the world, and complete `seen`."""
