@@ -3,15 +3,18 @@
     seen = drive_story(random_story(seed=7))
 
 To add a new kind of fault, write a function here that changes something in the world (virtual.py). From then on every
-random drive may have it. KEPT has the stories that once broke an invariant; rows.py has the faults of docs/safety.md.
+random drive may have it. stories.yml has the faults of docs/safety.md (rows.py), and what once broke an invariant.
 """
 
 import contextlib
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from lab.driving.virtual import HELD, LIVE, LOST, PRESET, Killed, Seen, World
 from lab.driving.virtual_host import PLAN, Process
@@ -320,54 +323,23 @@ def _start_and_suspend(stage: Stage, h: Happening) -> None:
     stage.world.at(stage.world.now_ms + 5, lambda: stage.world.suspend(h.for_ms))
 
 
-H = Happening
-KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, and how a drive ends in them
-    "frozen since before the start": (Story((H(0, "the camera freezes", for_ms=4800),)), "frozen"),
-    "pictures of 1.5 s ago": (Story((H(0, "frames come late", 1500, 4800),)), "before it began"),
-    "pictures of 2.5 s ago, from now on": (Story((H(2300, "frames come late", 2500, 2000),)), "too old"),
-    "presets after a loss": (Story((H(2800, "the receiver sends presets", 400, 1500),)), "signal was lost"),
-    "presets from the first moment": (
-        Story((H(0, "the receiver sends presets", 400, 4800),), wiggled=False),
-        "throttle stick is not at rest",
-    ),
-    "held since before the start": (
-        Story((H(0, "the receiver holds its last values", for_ms=4800),), wiggled=False),
-        "wiggled",
-    ),
-    "a host that asks for full throttle": (Story((H(2800, "the host goes mad", 711, 500),)), "told to stop"),
-    "every third pulse misread": (
-        Story((H(2300, "throttle pulses are misread", 3, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
-        "the human took over",
-    ),
-    "a throttle pulse every 99 ms": (
-        Story((H(2300, "few throttle pulses come", 99, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
-        "signal was lost",
-    ),
-    "a link further and further behind": (
-        Story((H(1900, "to the Arduino: further and further behind", 80, 4000),)),
-        "no valid command|has not answered",  # a millisecond decides who stops it first
-    ),
-    "armed by a line that waited": (
-        Story((H(1400, "to the Arduino: further and further behind", 50, 4000),)),
-        "no answer to arming",
-    ),
-    "started again without a gesture": (
-        Story((H(2300, "the operator says stop"), H(3000, "the operator starts it"))),
-        "wiggled",
-    ),
-    "an exception while neutral is on its way": (
-        Story((H(3200, "from the Arduino: latency_ms", 617, 20), H(3800, "an exception in the loop"))),
-        "has not answered",
-    ),
-    "asked for, and then the process is stopped": (
-        Story((H(2110, "the process is stopped", for_ms=2300),), service=True),
-        "before a human armed|said nothing",
-    ),
-    "asked for, and then the machine is suspended": (
-        Story((H(2110, "the machine is suspended", for_ms=2300),), service=True),
-        "before a human armed",
-    ),
-}
+def read_stories(section: str) -> list[dict[str, Any]]:
+    """Return a section of stories.yml: "rows" or "kept"."""
+    return yaml.safe_load(Path(__file__).with_suffix(".yml").read_text())[section]
+
+
+def told(happens: Sequence[Sequence[Any]]) -> tuple[Happening, ...]:
+    """Return the happenings that stories.yml lists: at_ms, what, and the amount and for_ms if they are not 0."""
+    return tuple(Happening(*each) for each in happens)
+
+
+def _kept() -> Iterator[tuple[str, tuple[Story, str]]]:
+    for row in read_stories("kept"):
+        name, end, happenings = row.pop("name"), row.pop("end"), told(row.pop("happens"))
+        yield name, (Story(happenings, **row), end)
+
+
+KEPT = dict(_kept())  # stories that once broke an invariant, and how a drive ends in them: a regular expression
 
 
 def random_story(seed: int) -> Story:

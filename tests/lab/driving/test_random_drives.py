@@ -125,4 +125,4 @@ def test_every_happening_is_in_some_story():
 def test_the_command(tmp_path):
     done = CliRunner().invoke(main, ["random", str(tmp_path / "random.json"), "--drives", "3", "--jobs", "1"])
     assert done.exit_code == 0, done.output
-    assert "firmware_transitions" in (tmp_path / "random.json").read_text()
+    assert "firmware_states" in (tmp_path / "random.json").read_text()

@@ -13,7 +13,7 @@ from lab.arduino.emulator import REPOSITORY
 from lab.driving import faults
 from lab.driving.on_pins import PIN_ROWS, FaultError
 from lab.driving.pins import CONTINUES, REFUSED, STOPPED
-from lab.driving.rows import ROWS, rows_of, run_row
+from lab.driving.rows import all_rows, rows_of, run_row
 from lab.driving.stories import KEPT
 from lab.driving.virtual import LOST, STUCK, World
 from lab.driving.virtual_host import VirtualLink
@@ -54,7 +54,7 @@ def test_they_end_so_on_other_cars(name):
     ("name", "expected"), [("frames late", STOPPED), ("receiver lost", CONTINUES), ("camera frozen", REFUSED)]
 )
 def test_a_fault_that_ends_otherwise_is_wrong(name, expected):
-    assert run_row(replace(ROWS[name], expected=expected))["wrong"]
+    assert run_row(replace(all_rows()[name], expected=expected))["wrong"]
 
 
 def test_every_row_is_judged_and_there_are_enough():
@@ -75,7 +75,7 @@ def test_what_proves_safety_exists():
     for cell in (row[-2] for row in rows):
         names = re.findall(r"`([^`]+)`", cell)
         assert names, f"a hazard that nothing proves: {cell}"
-        assert set(names) <= ROWS.keys() | {row.name for row in PIN_ROWS} | KEPT.keys() | tests
+        assert set(names) <= all_rows().keys() | {row.name for row in PIN_ROWS} | KEPT.keys() | tests
 
 
 # ---- a gamepad's human, without a drive

@@ -158,34 +158,6 @@ def test_every_frame_of_a_mixed_drive_says_who_drove():
 
 
 @needs.gcc
-def test_what_is_written_of_the_human_is_what_the_receiver_measured():
-    world, process = mixed(*MIXED)
-    truly = drivers_by_pins(world)
-    start_ms = world.seen.starts[-1]
-    humans = [row for row in process.written.rows if row[2] != POLICY]
-    assert len(humans) > 150
-    for _, uptime_ms, driver, pulses_us in humans:
-        ms = start_ms + uptime_ms
-        assert driver == truly(ms)
-        assert all(us is None or us in sent for us, sent in zip(pulses_us, hands_at(world, ms), strict=True))
-
-
-@needs.gcc
-def test_the_pins_are_the_humans_as_soon_whether_it_is_recorded_or_not():
-    def pins_of(world):
-        return [(ms, event.steering_us, event.throttle_us) for ms, event in world.seen.pins]
-
-    happenings = (*MIXED[:1], (3300, sticks(0, 0)))
-    recorded, process = mixed(*happenings)
-    alone, _ = mixed(*happenings, make=lambda world: Process(world, service=False))
-    assert process.takeover is not None
-    assert recorded.seen.commands == alone.seen.commands and len(alone.seen.commands) > 30
-    assert recorded.written == alone.written  # every line, to the byte
-    assert pins_of(recorded)[: len(pins_of(alone))] == pins_of(alone)
-    assert (1656, 120) in {pins[1:] for pins in pins_of(alone)}
-
-
-@needs.gcc
 def test_a_transmitter_that_is_switched_off_ends_the_recording():
     _, process = mixed((2600, sticks(200, 0)), (3200, lost))
     assert "no signal" in process.takeover.ended and process.written.rows[-1][2] == NOBODY
