@@ -117,7 +117,6 @@ class Uno:
         self.sequence = 0
         self.boot = None
         self.car_id = car.this_car().id  # the car that the host names when it arms
-        self.heard_ms = None  # the status time that the host says it heard last; None: the newest status's
 
     def close(self) -> None:
         if self._uno:
@@ -154,26 +153,19 @@ class Uno:
                     self.boot, self.sequence = int(body.split()[3]), int(body.split()[4])
         return new
 
-    def send(self, data: bytes, *, framing_errors: bool = False) -> None:
-        flag = 0x8000 if framing_errors else 0
-        self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*(b | flag for b in data)), len(data))
+    def send(self, data: bytes) -> None:
+        self._c.uno_send(self._uno, (ctypes.c_uint16 * len(data))(*data), len(data))
 
-    def command(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
+    def command(self, kind: str, *values: int) -> bytes:
         """Send the next command: "A", "N", "L" with a throttle, "D" with two pulses, "C". Returns its line."""
-        text = self.next_line(kind, *values, boot=boot, sequence=sequence)
-        if sequence is None:
-            self.sequence += 1
+        if kind == "A":
+            values = (self.status.uptime_ms, self.car_id)
+        if kind in "AD":
+            values = (self.status.uptime_ms, *values)
+        self.sequence += 1
+        text = line(" ".join(map(str, (f">{kind}", self.boot, self.sequence, *values))))
         self.send(text)
         return text
-
-    def next_line(self, kind: str, *values: int, boot: int | None = None, sequence: int | None = None) -> bytes:
-        """Return the line that command() would send now."""
-        if kind == "A":
-            values = (self.status.uptime_ms, self.car_id, *values)
-        if kind in "AD":
-            values = (self.status.uptime_ms if self.heard_ms is None else self.heard_ms, *values)
-        numbers = (self.boot if boot is None else boot, self.sequence + 1 if sequence is None else sequence, *values)
-        return line(" ".join(map(str, (f">{kind}", *numbers))))
 
     def transmitter(
         self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float

@@ -1,7 +1,6 @@
 /* The rover's sketch for this machine: firmware/rover/rover.ino itself, with a board of virtual time around it.
  *
- * A start of the board is this library loaded anew, so that every variable is as after power-on. A millisecond is one
- * turn of the sketch's loop. The chip itself is not emulated here: test that with simavr. */
+ * A millisecond is one turn of the sketch's loop. The chip itself is not emulated here: test that with simavr. */
 #include <string.h>
 
 #include "rover.ino"
@@ -16,19 +15,19 @@ struct event {
 struct transmitted {
     uint16_t pulse_us;   /* 0: none */
     uint16_t one_in;     /* only one in this many pulses comes */
-    uint16_t misread_in; /* one in this many pulses is read as one at rest; 0: none */
+    uint16_t misread_in; /* one in this many pulses is read as misread_us, where 0 is no pulse; 0: none is */
+    uint16_t misread_us, period_us;
 };
 
-static const uint32_t PERIOD_US[2] = {STEERING_PERIOD_US, THROTTLE_PERIOD_US};
-static const uint16_t REST_US[2] = {STEERING_NEUTRAL_US, THROTTLE_NEUTRAL_US};
 static const double BYTES_PER_MS = 11.7647; /* 117647 baud */
 
+static struct car kept; /* in its EEPROM; the transmitter is that car's, too */
 static uint32_t now;
 static uint16_t boot;
 static char cause;
 static struct transmitted sent[2];
 static uint32_t due_us[2], number[2], since_us;
-static uint16_t measured_us[2];
+static uint16_t measured_us[2], periods_us[2];
 static bool fresh[2];
 static char in[128], out[1024];
 static uint16_t in_length, out_length;
@@ -38,7 +37,7 @@ static uint16_t pins[2];
 static struct event events[65536];
 static uint32_t event_count;
 
-const struct car *car_kept() { return &DEFAULT_CAR; }
+const struct car *car_kept() { return &kept; }
 void car_keep(const struct car *car) { (void)car; }
 void pulses_begin(const struct car *car) {
     pulses_set(car, car->servos[STEERING].neutral_us, car->servos[THROTTLE].neutral_us);
@@ -55,7 +54,7 @@ bool receiver_take(enum channel channel, uint16_t *pulse_us, uint16_t *period_us
     bool came = fresh[channel];
     fresh[channel] = false;
     *pulse_us = measured_us[channel];
-    *period_us = (uint16_t)PERIOD_US[channel];
+    *period_us = periods_us[channel];
     return came;
 }
 
@@ -96,7 +95,19 @@ static void note(void) {
     if (event_count < sizeof events / sizeof *events) events[event_count++] = event;
 }
 
-void board_start(uint32_t clock, uint16_t boot_now, char cause_now) {
+/* Every variable is as after power-on. car: in the EEPROM. */
+void board_start(uint32_t clock, uint16_t boot_now, char cause_now, const uint16_t *car) {
+    memcpy(&kept, car, sizeof kept);
+    memset(&vehicle, 0, sizeof vehicle);
+    memset(&reader, 0, sizeof reader);
+    memset(sent, 0, sizeof sent);
+    memset(due_us, 0, sizeof due_us);
+    memset(number, 0, sizeof number);
+    memset(fresh, 0, sizeof fresh);
+    since_us = event_count = 0;
+    in_length = out_length = status_ms = lost = 0;
+    waiting = 0;
+    status_due = false;
     now = clock;
     boot = boot_now;
     cause = cause_now;
@@ -104,8 +115,9 @@ void board_start(uint32_t clock, uint16_t boot_now, char cause_now) {
     note();
 }
 
-void board_transmit(int channel, uint16_t pulse_us, uint16_t one_in, uint16_t misread_in) {
-    sent[channel] = (struct transmitted){pulse_us, one_in, misread_in};
+void board_transmit(int channel, uint16_t pulse_us, uint16_t one_in, uint16_t misread_in, uint16_t misread_us,
+                    uint16_t period_us) {
+    sent[channel] = (struct transmitted){pulse_us, one_in, misread_in, misread_us, period_us};
 }
 
 void board_give(const char *bytes, int length) {
@@ -126,11 +138,12 @@ int board_run(int ms) {
         for (int channel = STEERING; channel <= THROTTLE; channel++) {
             struct transmitted *from = sent + channel;
             if (since_us < due_us[channel]) continue;
-            due_us[channel] += PERIOD_US[channel];
+            periods_us[channel] = from->period_us ? from->period_us : kept.servos[channel].period_us;
+            due_us[channel] += periods_us[channel];
             if (!from->pulse_us || ++number[channel] % from->one_in) continue;
             bool misread = from->misread_in && number[channel] / from->one_in % from->misread_in == 0;
-            measured_us[channel] = misread ? REST_US[channel] : from->pulse_us;
-            fresh[channel] = true;
+            measured_us[channel] = misread ? from->misread_us : from->pulse_us;
+            fresh[channel] = measured_us[channel] != 0;
         }
         loop();
         note();
@@ -152,3 +165,36 @@ int board_events(struct event *to) {
     event_count = 0;
     return count;
 }
+
+/* For a test that is host and human itself: time passes only here, and a line is read at once. */
+void board_trace(int ms, uint16_t *to) {
+    while (ms--) {
+        board_run(1);
+        out_length = 0;
+        *to++ = pins[STEERING];
+        *to++ = pins[THROTTLE];
+    }
+}
+
+/* Returns what became of the last command. */
+char board_tell(const char *bytes, int length) {
+    struct command command;
+    for (; length--; bytes++) {
+        if (reader_take(&reader, (uint8_t)*bytes, now, &command) != READ_COMMAND || command.kind == COMMAND_HELLO)
+            continue;
+        vehicle_command(&vehicle, &command, now);
+        vehicle_tick(&vehicle, now);
+    }
+    return vehicle.result;
+}
+
+/* The hello if asked for, otherwise the status. */
+int board_line(bool hello, char *text) {
+    struct line made;
+    uint8_t length = hello ? vehicle_hello(&vehicle, cause, &made) : vehicle_status(&vehicle, now, &made);
+    memcpy(text, made.text, length);
+    return length;
+}
+
+void board_sequence(uint32_t sequence) { vehicle.sequence = sequence; }
+bool board_may_keep() { return vehicle_may_keep(&vehicle); }

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, Asked, Hand, Seen
+from lab.driving.virtual import HELD, LIVE, Asked, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -117,7 +117,8 @@ def _asked_for(run: Run) -> str | None:
     for c in run.seen.commands:
         span = slice(c.at_ms, c.at_ms + VALID_MS)
         host[span] = np.maximum(host[span], c.throttle_us)
-    for (start_ms, hand), (until, _) in pairwise([*run.seen.hands, (run.seen.end_ms + 1, Hand())]):
+    ends = [ms for ms, _ in run.seen.hands[1:]] + [run.seen.end_ms + 1]
+    for (start_ms, hand), until in zip(run.seen.hands, ends, strict=True):
         if hand.receiver == LIVE:
             span, us = slice(start_ms, until + SIGNAL_MS + 25), hand.sticks[1]
         elif hand.receiver == HELD:  # nobody can tell this from a human, until the firmware starts anew: docs/safety.md
@@ -349,6 +350,7 @@ NAMED = re.compile(
     "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
     "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
     "|pictures in a row|no frame|ended after|too old"
+    "|picture changed|no frames|squeezed|no such camera|has ended|not found|damaged|copy the file|firmware flash"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )
 UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # sentence_of()'s form for unforeseen errors

@@ -10,17 +10,14 @@ from typing import Any, NamedTuple
 
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.params import lab_params
-from rover_lib.onboard.car.car import this_car
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.params import params
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
-CAR = this_car()  # python -m lab faults --car names another
-NEUTRAL_US = {"steering": CAR.numbers[2], "throttle": CAR.numbers[6]}
-PERIOD_US = {"steering": CAR.numbers[0], "throttle": CAR.numbers[4]}
+NEUTRAL_US = {"steering": 1456, "throttle": 120}  # of the default car
+PERIOD_US = {"steering": 21316, "throttle": 1016}
 STOPPED_THROTTLE_US = NEUTRAL_US["throttle"] + ARDUINO_STEP_US
-TICK_US = {"steering": 0.5, "throttle": 4.0}  # the resolution of the pin's timer
-SLEW_US_PER_MS = {"steering": 4.0, "throttle": 2.0}  # how fast the firmware lets the host move a pin
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # the error of a pulse that the Arduino measured and sends on
 COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # the error of a commanded pulse: half a tick of its timer, and an edge
@@ -38,17 +35,13 @@ class Gates:
     takeover_ms: float
     rows: int
     stopped_rows: int
-    bytes_us: float
     throttle_max_us: float = STOPPED_THROTTLE_US
 
     @classmethod
-    def of_params(cls) -> "Gates":
-        """Read the gates from lab/params.yml."""
-        return cls(**lab_params()["faults"])
-
-    @property
-    def stopped_s(self) -> float:
-        return self.stopped_ms / 1e3
+    def of_params(cls, car: Car | None = None) -> "Gates":
+        """Read the gates from lab/params.yml. car: the default one if None."""
+        neutral_us = (car or Car()).numbers[6]
+        return cls(**lab_params()["faults"], throttle_max_us=neutral_us + ARDUINO_STEP_US)
 
 
 class Command(NamedTuple):
@@ -108,15 +101,18 @@ def judge(
     *,
     human_us: tuple[float, float] = REST_US,
     until_limit: bool = False,
+    car: Car | None = None,
 ) -> Verdict:
     """Compare what the pins did from the fault on with what was expected.
 
-    human_us: the human's pulses. until_limit: whether a car that `continues` is stopped by a limit in the end.
+    human_us: the human's pulses. until_limit: whether a car that `continues` is stopped by a limit in the end. car: the
+    default one if None.
     """
+    car = car or Car()
     throttle, steering = seen.pulses("throttle"), seen.pulses("steering")
-    backwards = [e for e in throttle if CAR.reverses and e.pulse_us < NEUTRAL_US["throttle"] - ARDUINO_STEP_US]
-    moving = [e.end_s for e in throttle if e.pulse_us > gates.throttle_max_us or e in backwards]
-    late = [e.pulse_us for e in throttle if e.end_s > seen.at_s + gates.stopped_s]
+    least_us = car.numbers[6] - ARDUINO_STEP_US if car.reverses else 0
+    moving = [e.end_s for e in throttle if not least_us <= e.pulse_us <= gates.throttle_max_us]
+    late = [e.pulse_us for e in throttle if e.end_s > seen.at_s + gates.stopped_ms / 1e3]
     figures: dict[str, Any] = {
         "stopped_after_ms": round((max(moving) - seen.at_s) * 1e3, 1) if moving else 0.0,
         "max_throttle_us_after": round(max(late), 1) if late else None,
@@ -125,12 +121,12 @@ def judge(
     wrong = []
     if expected != REFUSED and not seen.was_driving(gates.throttle_max_us):
         wrong.append(f"the car was not driving in the {BEFORE_S * 1e3:g} ms before the fault")
-    for pin, period_us in PERIOD_US.items():
+    for pin, period_us in periods_of(car).items():
         count, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
         if count < wanted - 2:
             wrong.append(f"{count} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
     if expected == STOPPED:
-        wrong += _not_stopped(seen, gates, figures, human_us)
+        wrong += _not_stopped(seen, gates, figures, (car.numbers[2], human_us[0]))
     elif expected == REFUSED:
         figures["stopped_after_ms"] = None
         if moving:
@@ -138,29 +134,44 @@ def judge(
     elif expected == HUMAN:
         wrong += _not_human(seen, gates, figures, human_us)
     else:
-        wrong += _not_continued(seen, gates, figures, until_limit)
+        wrong += _not_continued(seen, gates, figures, until_limit, car)
     return Verdict(figures, wrong)
 
 
+def periods_of(car: Car) -> dict[str, int]:
+    """Return the periods of the pins' pulses, in microseconds."""
+    return {"steering": car.numbers[0], "throttle": car.numbers[4]}
+
+
+def row_of(
+    fault: Any, verdict: Verdict, code: int | None, line: str | None, recovered: bool | None, method: str, **more: Any
+) -> dict[str, Any]:
+    """Return a row of metrics.faults. line: tells of the fault. method: how it was done."""
+    row = {"fault": fault.name, "kind": fault.kind, "expected": fault.expected, **verdict.figures}
+    row |= {"recovered": recovered, "log_line": line, "exit_code": code, "injected": method}
+    row |= {"attempts": 1, "stalled_ms": 0.0, "wrong": verdict.wrong} | more
+    return row | {"found": fault.expected if not verdict.wrong else "not as expected"}
+
+
 def _not_stopped(
-    seen: Observation, gates: Gates, figures: dict[str, Any], rest_us: tuple[float, float]
+    seen: Observation, gates: Gates, figures: dict[str, Any], resting_us: tuple[float, float]
 ) -> Iterator[str]:
     if figures["stopped_after_ms"] > gates.stopped_ms:
         yield f"throttle off {figures['stopped_after_ms']:g} ms after the fault, {gates.stopped_ms:g} are allowed"
     if (figures["max_throttle_us_after"] or 0) > gates.throttle_max_us:
         yield f"throttle at {figures['max_throttle_us_after']:g} us after it had to be off"
     # A reset leaves the Arduino in manual. Then the steering is that of the resting stick, as measured.
-    since_s = seen.at_s + gates.stopped_s + PERIOD_US["steering"] * 1e-6
+    since_s = seen.at_s + gates.stopped_ms / 1e3 + 0.022
     widths = [e.pulse_us for e in seen.pulses("steering", since_s)]
-    if off := [us for us in widths if min(abs(us - NEUTRAL_US["steering"]), abs(us - rest_us[0])) > STEP_US]:
-        yield f"steering at {off[-1]:g} us, neutral is {NEUTRAL_US['steering']}"
+    if off := [us for us in widths if min(abs(us - rest_us) for rest_us in resting_us) > STEP_US]:
+        yield f"steering at {off[-1]:g} us, neutral is {resting_us[0]:g}"
 
 
 def _not_human(
     seen: Observation, gates: Gates, figures: dict[str, Any], human_us: tuple[float, float]
 ) -> Iterator[str]:
     took_ms = 0.0
-    for pin, wanted_us in zip(PERIOD_US, human_us, strict=True):
+    for pin, wanted_us in zip(("steering", "throttle"), human_us, strict=True):
         pulses = seen.pulses(pin)
         ours = [i for i, e in enumerate(pulses) if abs(e.pulse_us - wanted_us) > STEP_US]
         first = ours[-1] + 1 if ours else 0
@@ -174,20 +185,22 @@ def _not_human(
         yield f"the human's pulses after {took_ms:.1f} ms, {gates.takeover_ms:g} are allowed"
 
 
-def _not_continued(seen: Observation, gates: Gates, figures: dict[str, Any], until_limit: bool) -> Iterator[str]:
+def _not_continued(
+    seen: Observation, gates: Gates, figures: dict[str, Any], until_limit: bool, car: Car
+) -> Iterator[str]:
     if until_limit:
         yield from _not_limited(seen, gates, figures)
     stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
     if not until_limit:
         figures["stopped_after_ms"] = None
-    for pin, period_us in PERIOD_US.items():
-        index = 1 if pin == "steering" else 2
+    neutral_us = {"steering": car.numbers[2], "throttle": car.numbers[6]}
+    for index, (pin, period_us) in enumerate(periods_of(car).items(), 1):
         for e in seen.pulses(pin):
             recent = [c[index] for c in seen.commands if e.monotonic_s - STILL_VALID_S < c.at_s <= e.monotonic_s]
             if e.kind == "cut" or abs(e.period_us - period_us) > EDGE_US:
                 yield f"a {pin} pulse out of time: {e.period_us:g} us after the one before, {period_us} is its period"
                 return
-            neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - NEUTRAL_US[pin]) <= COMMAND_US[pin]
+            neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - neutral_us[pin]) <= COMMAND_US[pin]
             # The firmware moves a pin slowly, so a pulse may lie between those of two recent commands.
             within = recent and min(recent) - COMMAND_US[pin] <= e.pulse_us <= max(recent) + COMMAND_US[pin]
             if not neutral and not within:

@@ -1,9 +1,6 @@
-"""A policy that does what the picture's corner tells it to, so that a test can choose what happens in an inference."""
+"""A policy with a constant plan, and pictures for its camera."""
 
-import sys
-import time
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +10,8 @@ from rover_lib.onboard.artifact.manifest import SCHEMA, save_artifact, save_onnx
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0
-PLAN, OTHER_PLAN = (0.2, 0.15), (-0.3, 0.08)  # steering, throttle
-
-# The instructions. Red, green and blue in the picture's corner, on or off, are the bits 4, 2 and 1 of one.
-PLAIN, RAISE, HANG, NAN, OUT_OF_RANGE, SLOW, OTHER = range(7)
-SLOW_S = 0.3
+PLAN = 0.2, 0.15  # steering, throttle
+PLAIN = 0  # the pictures' usual seed
 
 
 def make_artifact(
@@ -78,59 +72,16 @@ def make_artifact(
         save_artifact(path, torch.jit.freeze(torch.jit.trace(module, tuple(inputs.values()))), manifest, parity)
 
 
-def obey_pictures() -> None:
-    """Let this process's policy process do from now on what the picture's corner tells it to: PLAIN to OTHER.
+def pictures(seed: int = PLAIN, size: tuple[int, int] = SIZE, count: int = 40) -> list[bytes]:
+    """Make JPEGs with a sensor's noise, no two the same, of that (height, width).
 
-    An artifact cannot do that, as its operators are a closed list. Otherwise the policy process is the real one.
+    If they are shown over and over again, they pass for a live camera only if there are more of them than Camera
+    remembers.
     """
-    from rover_lib.onboard.drive.inference import PolicyProcess
-
-    PolicyProcess.program = __name__
-
-
-def obey(policy: Any) -> None:
-    """Change a loaded policy with the plan PLAN, so that it does what the picture's corner tells it to."""
-    plain = policy.run
-
-    def run(state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
-        red, green, blue = frames_rgb[0][4:12, 4:12].mean((0, 1)) > 127
-        instruction = 4 * red + 2 * green + blue
-        if instruction == RAISE:
-            raise RuntimeError("told to fail by the picture")
-        if instruction in (HANG, SLOW):
-            end_s = time.monotonic() + (SLOW_S if instruction == SLOW else float("inf"))
-            while time.monotonic() < end_s:
-                pass
-        plan = plain(state, frames_rgb)
-        if instruction == NAN:
-            return plan * np.nan
-        if instruction == OUT_OF_RANGE:
-            return plan * 0 + 5
-        return plan * 0 + np.array(OTHER_PLAN, np.float32) if instruction == OTHER else plan
-
-    policy.run = run
-
-
-def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, count: int = 40) -> list[bytes]:
-    """Make JPEGs with a sensor's noise, no two the same, whose corner shows an instruction.
-
-    level: their grey; with 0 they are black and show no instruction. count: how many. If they are shown over and over
-    again, they pass for a live camera only if there are more of them than Camera remembers.
-    """
-    rng = np.random.default_rng(instruction)
-    height, width = size
+    rng = np.random.default_rng(seed)
     made = []
     for _ in range(count):
-        picture = rng.integers(level, level + 12, (height, width, 3), np.uint8)
-        on = [bool(instruction & bit) for bit in (1, 2, 4)]  # blue, green, red
-        if level:
-            picture[: height // 3, : width // 3] = np.where(on, 225, 25)
-            picture[: height // 3, : width // 3] += rng.integers(0, 12, (height // 3, width // 3, 3), np.uint8)
+        picture = rng.integers(100, 112, (*size, 3), np.uint8)
+        picture[: size[0] // 3, : size[1] // 3] -= 75  # so that there is something to see
         made.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
     return made
-
-
-if __name__ == "__main__":
-    from rover_lib.onboard.drive.inference import main
-
-    main(sys.argv[1:], loaded=obey)

@@ -8,9 +8,8 @@ import logging
 import re
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from rover_lib.onboard.stage import write_stage
 class Tally:
     """What a number of drives visited. driven: in how many of them the host moved the car.
 
-    firmware: the firmware's states, each with its reason, the result of the last command, what is missing and which
+    firmware: the firmware's states, each with its reason, what is missing, the result of the last command and which
     signals are there. loop: the phases of the loop, each with the firmware's state and its reason. ends: the sentences
     with which drives ended, without their numbers.
     """
@@ -33,47 +32,33 @@ class Tally:
     drives: int = 0
     driven: int = 0
     firmware: set[tuple] = field(default_factory=set)
-    firmware_transitions: set[tuple] = field(default_factory=set)
     loop: set[tuple] = field(default_factory=set)
-    loop_transitions: set[tuple] = field(default_factory=set)
     ends: set[str] = field(default_factory=set)
 
     def add(self, seen: Seen) -> None:
-        self.drives += 1
         run = Run(seen)
+        self.drives += 1
         self.driven += bool((run.autonomous & (run.throttle > RESTING_US)).any())
-        states = [_firmware_state(e) for _, e in seen.pins]
+        self.ends |= {re.sub(r"[\d.]+", "N", text) for _, _, text in seen.drives if text}
+        self.firmware |= {_firmware_state(event) for _, event in seen.pins}
         changes = [(ms, 0, name) for ms, name in seen.phases]
-        changes += [(ms, 1, "".join(map(str, _firmware_state(e)[:2]))) for ms, e in seen.pins]
-        now, both = ["off", ""], []
+        changes += [(ms, 1, "".join(map(str, _firmware_state(event)[:2]))) for ms, event in seen.pins]
+        now = ["off", ""]
         for _, which, value in sorted(changes, key=lambda change: change[:2]):
             now[which] = value
-            both.append(tuple(now))
-        for path, visited, transitions in (
-            (states, self.firmware, self.firmware_transitions),
-            (both, self.loop, self.loop_transitions),
-        ):
-            visited |= set(path)
-            transitions |= {(a, b) for a, b in pairwise(path) if a != b}
-        self.ends |= {re.sub(r"[\d.]+", "N", text) for _, _, text in seen.drives if text}
+            self.loop.add(tuple(now))
 
     def merge(self, other: "Tally") -> None:
-        for f in fields(self):
-            mine, theirs = getattr(self, f.name), getattr(other, f.name)
-            setattr(self, f.name, mine + theirs if isinstance(mine, int) else mine | theirs)
+        self.drives += other.drives
+        self.driven += other.driven
+        for name in ("firmware", "loop", "ends"):
+            getattr(self, name).update(getattr(other, name))
 
     @property
     def summary(self) -> dict[str, int]:
-        """The counts for JSON: drives, driven, and different states, transitions and ends."""
-        return {
-            "drives": self.drives,
-            "driven": self.driven,
-            "firmware_states": len(self.firmware),
-            "firmware_transitions": len(self.firmware_transitions),
-            "loop_states": len(self.loop),
-            "loop_transitions": len(self.loop_transitions),
-            "ends": len(self.ends),
-        }
+        """The counts for JSON: drives, driven, and different states and ends."""
+        states = {"firmware_states": len(self.firmware), "loop_states": len(self.loop), "ends": len(self.ends)}
+        return {"drives": self.drives, "driven": self.driven, **states}
 
 
 def _firmware_state(event: Event | None) -> tuple:

@@ -3,17 +3,22 @@
     seen = drive_story(random_story(seed=7))
 
 To add a new kind of fault, write a function here that changes something in the world (virtual.py). From then on every
-random drive may have it. KEPT has the stories that once broke an invariant.
+random drive may have it. stories.yml has the faults of docs/safety.md (rows.py), and what once broke an invariant.
 """
 
+import contextlib
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from lab.driving.virtual import HELD, LIVE, LOST, PRESET, STICKS_US, Killed, Seen, Wire, World
-from lab.driving.virtual_host import Process
+import yaml
+
+from lab.driving.virtual import HELD, LIVE, LOST, PRESET, Killed, Seen, World
+from lab.driving.virtual_host import PLAN, Process
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import frame
 
 WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 1500, 2100, 4800, 5400
@@ -37,6 +42,7 @@ class Story:
     wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
     asks it to arm the car. limited, heartbeat: see Process. terminal: whether the drive waits for the gesture.
     longer_ms: how much later it is stopped, and if `late`, begun. clock_ms: the Arduino's clock when it is switched on.
+    steady: whether the policy always goes, instead of going and braking in turn.
     """
 
     happenings: tuple[Happening, ...] = ()
@@ -48,6 +54,7 @@ class Story:
     heartbeat: bool = False
     longer_ms: int = 0
     late: bool = False
+    steady: bool = False
 
 
 # ---- what may happen
@@ -56,10 +63,12 @@ class Story:
 class Stage:
     """A world, and the process that drives in it while there is one."""
 
-    def __init__(self, clock_ms: int):
-        self.world = World(clock_ms)
+    def __init__(self, clock_ms: int, car: Car | None = None):
+        self.world = World(clock_ms, car)
         self.process: Process | None = None
         self.start_due = False
+        self.view: Any = None
+        self.stack = contextlib.ExitStack()  # of what is closed at the end
         self._usual: dict[tuple[object, str], Any] = {}
 
     def during(self, happening: Happening, thing: object, **values: Any) -> None:
@@ -87,25 +96,28 @@ class Stage:
 
         def move(steering_us: int) -> None:
             heard.append(hand.receiver in (LIVE, HELD))
-            hand.sticks = [steering_us, hand.sticks[1]]
+            hand.sticks = [world.rest_us[0] + steering_us, hand.sticks[1]]
             heard.append(heard[-1])
             world.handle()
 
         def let_go() -> None:
-            move(STICKS_US[0])
+            move(0)
             if any(heard[1:3]) and any(heard[3:5]):  # for each side: when it was reached, and when it was left
                 world.seen.wiggled.append(world.now_ms)
 
-        move(1750)
-        world.at(world.now_ms + 70, lambda: move(1150))
+        move(294)
+        world.at(world.now_ms + 70, lambda: move(-306))
         world.at(world.now_ms + 140, let_go)
 
 
 Happen = Callable[[Stage, Happening], None]
 HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
+TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone (rows.py): no random drive has them
+A_WHILE, LONG, ONCE = (20, 2500), (20, 4000), (0, 0)
+AMOUNT = object()  # of a value: the happening's amount
 
 
-def _may(what: str, amount: tuple[int, int] = (0, 0), for_ms: tuple[int, int] = (0, 0)) -> Callable[[Happen], Happen]:
+def _may(what: str, amount: tuple[int, int] = ONCE, for_ms: tuple[int, int] = ONCE) -> Callable[[Happen], Happen]:
     def add(happen: Happen) -> Happen:
         HAPPENINGS[what] = happen, amount, for_ms
         return happen
@@ -113,25 +125,26 @@ def _may(what: str, amount: tuple[int, int] = (0, 0), for_ms: tuple[int, int] = 
     return add
 
 
-A_WHILE = (20, 2500)
+def during(thing: str, **values: Any) -> Happen:
+    """Return what sets attributes of the world's `thing` while it lasts; "" is the world itself."""
+
+    def happen(stage: Stage, h: Happening) -> None:
+        now = {name: h.amount if value is AMOUNT else value for name, value in values.items()}
+        stage.during(h, getattr(stage.world, thing) if thing else stage.world, **now)
+
+    return happen
 
 
-def _by_camera(what: str, **values: Any) -> None:
-    _may(what, for_ms=(20, 4000))(lambda stage, h: stage.during(h, stage.world.lens, **values))
+_may("the camera is black", for_ms=LONG)(during("lens", black=True))
+_may("the camera gives no more frames", for_ms=LONG)(during("lens", silent=True))
 
 
-_by_camera("the camera is black", black=True)
-_by_camera("the camera gives no more frames", silent=True)
-
-
-@_may("the camera freezes", for_ms=(20, 4000))
+@_may("the camera freezes", for_ms=LONG)
 def _freeze(stage: Stage, h: Happening) -> None:
     stage.during(h, stage.world.lens, frozen_ms=stage.world.now_ms)
 
 
-@_may("frames come late", (20, 3000), A_WHILE)
-def _late(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.lens, late_ms=h.amount)
+_may("frames come late", (20, 3000), A_WHILE)(during("lens", late_ms=AMOUNT))
 
 
 @_may("the camera is unplugged")
@@ -140,56 +153,29 @@ def _unplug_camera(stage: Stage, h: Happening) -> None:
         stage.process.eyes.unplug()
 
 
-def _by_policy(does: str) -> None:
-    _may(f"the policy's answer: {does}", for_ms=(20, 300))(
-        lambda stage, h: stage.during(h, stage.world.mind, does=does)
-    )
+for _does in ("raise", "nan", "wild"):
+    _may(f"the policy's answer: {_does}", for_ms=(20, 300))(during("mind", does=_does))
+_may("the policy is slow", (90, 2000), A_WHILE)(during("mind", latency_ms=AMOUNT))
+_may("the policy wants full throttle", for_ms=A_WHILE)(during("mind", throttle=1.0))
+_may("the host goes mad", (120, 711), A_WHILE)(during("", mad_us=AMOUNT))
+
+WIRES = {"to the Arduino": "down", "from the Arduino": "up"}
 
 
-_by_policy("raise")
-_by_policy("nan")
-_by_policy("wild")
-
-
-@_may("the policy is slow", (90, 2000), A_WHILE)
-def _slow(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.mind, latency_ms=h.amount)
-
-
-@_may("the policy wants full throttle", for_ms=A_WHILE)
-def _full_throttle(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.mind, throttle=1.0)
-
-
-@_may("the host goes mad", (120, 711), A_WHILE)
-def _mad(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world, mad_us=h.amount)
-
-
-def _by_wire(what: str, wire: Callable[[World], Wire], fault: str, most: int) -> None:
-    _may(f"{what}: {fault}", (1, most), A_WHILE)(
-        lambda stage, h: stage.during(h, wire(stage.world), **{fault: h.amount})
-    )
-
-
-def _by_lag(what: str, wire: Callable[[World], Wire]) -> None:
+def _by_lag(what: str, wire: str) -> None:
     def slower(stage: Stage, h: Happening) -> None:
         for ms in range(0, h.for_ms, 10):
-            later = Happening(h.at_ms + ms, what, for_ms=h.for_ms - ms)
-            latency_ms = 1 + ms * h.amount // 100
-            stage.world.at(
-                stage.world.now_ms + ms, partial(stage.during, later, wire(stage.world), latency_ms=latency_ms)
-            )
+            later = Happening(h.at_ms + ms, what, 1 + ms * h.amount // 100, h.for_ms - ms)
+            stage.world.at(stage.world.now_ms + ms, partial(during(wire, latency_ms=AMOUNT), stage, later))
 
     _may(f"{what}: further and further behind", (1, 99), (200, 4000))(slower)
 
 
-_by_lag("to the Arduino", lambda world: world.down)
-_by_lag("from the Arduino", lambda world: world.up)
-
+for _what, _wire in WIRES.items():
+    _by_lag(_what, _wire)
 for _fault, _most in (("latency_ms", 2500), ("lost_pct", 100), ("garbled_pct", 100)):
-    _by_wire("to the Arduino", lambda world: world.down, _fault, _most)
-    _by_wire("from the Arduino", lambda world: world.up, _fault, _most)
+    for _what, _wire in WIRES.items():
+        _may(f"{_what}: {_fault}", (1, _most), A_WHILE)(during(_wire, **{_fault: AMOUNT}))
 
 
 @_may("the cable is unplugged", for_ms=A_WHILE)
@@ -199,9 +185,7 @@ def _unplug(stage: Stage, h: Happening) -> None:
         stage.world.port.unplug()
 
 
-@_may("the port is stuck", for_ms=A_WHILE)
-def _stick(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world, stuck=True)
+_may("the port is stuck", for_ms=A_WHILE)(during("", stuck=True))
 
 
 @_may("old lines come again", (1, 200), (20, 1000))
@@ -216,29 +200,11 @@ def _intrude(stage: Stage, h: Happening) -> None:
     stage.again_and_again(h, 10, lambda: stage.world.down.send(what[h.amount]))
 
 
-@_may("the Arduino is reset")
-def _reset(stage: Stage, h: Happening) -> None:
-    stage.world.reset()
-
-
-@_may("the Arduino's loop hangs")
-def _hang(stage: Stage, h: Happening) -> None:
-    stage.world.hang()
-
-
-@_may("the transmitter is off", for_ms=A_WHILE)
-def _lose(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.hand, receiver=LOST)
-
-
-@_may("the receiver's throttle wire is off", for_ms=A_WHILE)
-def _lose_throttle(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.hand, throttle_wire=False)
-
-
-@_may("the receiver's steering wire is off", for_ms=A_WHILE)
-def _lose_steering(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.hand, steering_wire=False)
+_may("the Arduino is reset")(lambda stage, h: stage.world.reset())
+_may("the Arduino's loop hangs")(lambda stage, h: stage.world.hang())
+_may("the transmitter is off", for_ms=A_WHILE)(during("hand", receiver=LOST))
+_may("the receiver's throttle wire is off", for_ms=A_WHILE)(during("hand", throttle_wire=False))
+_may("the receiver's steering wire is off", for_ms=A_WHILE)(during("hand", steering_wire=False))
 
 
 @_may("the human steers to both sides, seconds apart", (3200, 6000))
@@ -251,16 +217,16 @@ def _steer_slowly(stage: Stage, h: Happening) -> None:
 @_may("the human drives by hand", (130, 400), (1000, 12_000))
 def _by_hand(stage: Stage, h: Happening) -> None:
     """Around corners, with stops of a second in between."""
-    hand, world = stage.world.hand, stage.world
+    world = stage.world
 
     def turn(steering_us: int, throttle_us: int) -> None:
-        hand.sticks = [STICKS_US[0] + steering_us, throttle_us]
+        world.hand.sticks = [world.rest_us[0] + steering_us, throttle_us]
         world.handle()
 
     for ms in range(0, h.for_ms, 1900):
         side = 300 if ms // 1900 % 2 else -300
-        world.at(world.now_ms + ms, partial(turn, side, h.amount))
-        world.at(world.now_ms + ms + 800, partial(turn, 0, STICKS_US[1]))
+        world.at(world.now_ms + ms, partial(turn, side, world.throttle_us(h.amount)))
+        world.at(world.now_ms + ms + 800, partial(turn, 0, world.rest_us[1]))
 
 
 @_may("the receiver sends presets", (60, 700), A_WHILE)
@@ -271,53 +237,37 @@ def _preset(stage: Stage, h: Happening) -> None:
     def make_up() -> None:
         # Only after a loss: nobody can tell presets from a human if they follow the human's own pulses at once.
         if hand.receiver == LOST:
-            stage.during(h, hand, receiver=PRESET, sent=[STICKS_US[0], h.amount])
+            stage.during(h, hand, receiver=PRESET, sent=[world.rest_us[0], world.throttle_us(h.amount)])
 
     world.at(world.now_ms + 200, make_up)
 
 
-@_may("the receiver holds its last values", for_ms=(20, 4000))
+@_may("the receiver holds its last values", for_ms=LONG)
 def _hold(stage: Stage, h: Happening) -> None:
     hand = stage.world.hand
     if hand.receiver == LIVE:
         stage.during(h, hand, receiver=HELD, sent=list(hand.sticks))
 
 
-@_may("throttle pulses are misread", (3, 10), A_WHILE)
-def _misread(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.hand, misread_in=h.amount)
-
-
-@_may("few throttle pulses come", (2, 99), A_WHILE)
-def _sparse(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.hand, one_in=h.amount)
+_may("throttle pulses are misread", (3, 10), A_WHILE)(during("hand", misread_in=AMOUNT))
+_may("few throttle pulses come", (2, 99), A_WHILE)(during("hand", one_in=AMOUNT))
 
 
 @_may("the human steers", (-400, 400), A_WHILE)
 def _steer(stage: Stage, h: Happening) -> None:
     hand = stage.world.hand
-    stage.during(h, hand, sticks=[STICKS_US[0] + h.amount, hand.sticks[1]])
+    stage.during(h, hand, sticks=[stage.world.rest_us[0] + h.amount, hand.sticks[1]])
 
 
 @_may("the human pulls the throttle", (120, 700), A_WHILE)
 def _pull(stage: Stage, h: Happening) -> None:
     hand = stage.world.hand
-    stage.during(h, hand, sticks=[hand.sticks[0], h.amount])
+    stage.during(h, hand, sticks=[hand.sticks[0], stage.world.throttle_us(h.amount)])
 
 
-@_may("the human wiggles the stick")
-def _wiggle(stage: Stage, h: Happening) -> None:
-    stage.wiggle()
-
-
-@_may("the process is stopped", for_ms=A_WHILE)
-def _pause(stage: Stage, h: Happening) -> None:
-    stage.world.pause(h.for_ms)
-
-
-@_may("the machine is suspended", for_ms=(200, 40_000))
-def _suspend(stage: Stage, h: Happening) -> None:
-    stage.world.suspend(h.for_ms)
+_may("the human wiggles the stick")(lambda stage, h: stage.wiggle())
+_may("the process is stopped", for_ms=A_WHILE)(lambda stage, h: stage.world.pause(h.for_ms))
+_may("the machine is suspended", for_ms=(200, 40_000))(lambda stage, h: stage.world.suspend(h.for_ms))
 
 
 @_may("the process stutters for long", (75, 98), (900, 2500))
@@ -356,9 +306,7 @@ def _stop_from_view(stage: Stage, h: Happening) -> None:
         stage.process.stop("view")
 
 
-@_may("the operator's connection is lost")
-def _lose_operator(stage: Stage, h: Happening) -> None:
-    stage.world.operator_gone = True
+_may("the operator's connection is lost")(lambda stage, h: setattr(stage.world, "operator_gone", True))
 
 
 @_may("the operator starts it")
@@ -375,54 +323,23 @@ def _start_and_suspend(stage: Stage, h: Happening) -> None:
     stage.world.at(stage.world.now_ms + 5, lambda: stage.world.suspend(h.for_ms))
 
 
-H = Happening
-KEPT: dict[str, tuple[Story, str]] = {  # stories that once broke an invariant, and how a drive ends in them
-    "frozen since before the start": (Story((H(0, "the camera freezes", for_ms=4800),)), "frozen"),
-    "pictures of 1.5 s ago": (Story((H(0, "frames come late", 1500, 4800),)), "before it began"),
-    "pictures of 2.5 s ago, from now on": (Story((H(2300, "frames come late", 2500, 2000),)), "too old"),
-    "presets after a loss": (Story((H(2800, "the receiver sends presets", 400, 1500),)), "signal was lost"),
-    "presets from the first moment": (
-        Story((H(0, "the receiver sends presets", 400, 4800),), wiggled=False),
-        "throttle stick is not at rest",
-    ),
-    "held since before the start": (
-        Story((H(0, "the receiver holds its last values", for_ms=4800),), wiggled=False),
-        "wiggled",
-    ),
-    "a host that asks for full throttle": (Story((H(2800, "the host goes mad", 711, 500),)), "told to stop"),
-    "every third pulse misread": (
-        Story((H(2300, "throttle pulses are misread", 3, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
-        "the human took over",
-    ),
-    "a throttle pulse every 99 ms": (
-        Story((H(2300, "few throttle pulses come", 99, 2000), H(2800, "the human pulls the throttle", 500, 1500))),
-        "signal was lost",
-    ),
-    "a link further and further behind": (
-        Story((H(1900, "to the Arduino: further and further behind", 80, 4000),)),
-        "no valid command|has not answered",  # a millisecond decides who stops it first
-    ),
-    "armed by a line that waited": (
-        Story((H(1400, "to the Arduino: further and further behind", 50, 4000),)),
-        "no answer to arming",
-    ),
-    "started again without a gesture": (
-        Story((H(2300, "the operator says stop"), H(3000, "the operator starts it"))),
-        "wiggled",
-    ),
-    "an exception while neutral is on its way": (
-        Story((H(3200, "from the Arduino: latency_ms", 617, 20), H(3800, "an exception in the loop"))),
-        "has not answered",
-    ),
-    "asked for, and then the process is stopped": (
-        Story((H(2110, "the process is stopped", for_ms=2300),), service=True),
-        "before a human armed|said nothing",
-    ),
-    "asked for, and then the machine is suspended": (
-        Story((H(2110, "the machine is suspended", for_ms=2300),), service=True),
-        "before a human armed",
-    ),
-}
+def read_stories(section: str) -> list[dict[str, Any]]:
+    """Return a section of stories.yml: "rows" or "kept"."""
+    return yaml.safe_load(Path(__file__).with_suffix(".yml").read_text())[section]
+
+
+def told(happens: Sequence[Sequence[Any]]) -> tuple[Happening, ...]:
+    """Return the happenings that stories.yml lists: at_ms, what, and the amount and for_ms if they are not 0."""
+    return tuple(Happening(*each) for each in happens)
+
+
+def _kept() -> Iterator[tuple[str, tuple[Story, str]]]:
+    for row in read_stories("kept"):
+        name, end, happenings = row.pop("name"), row.pop("end"), told(row.pop("happens"))
+        yield name, (Story(happenings, **row), end)
+
+
+KEPT = dict(_kept())  # stories that once broke an invariant, and how a drive ends in them: a regular expression
 
 
 def random_story(seed: int) -> Story:
@@ -475,14 +392,16 @@ def _simpler(story: Story) -> Iterator[Story]:
                 yield replace(story, happenings=(*before, other, *after))
 
 
-def drive_story(story: Story) -> Seen:
+def drive_story(story: Story, car: Car | None = None) -> Seen:
     """Drive a story, in some hundredths of a second, and return what was seen. Raises ArduinoError without gcc."""
-    stage = Stage(story.clock_ms)
+    stage = Stage(story.clock_ms, car)
     world = stage.world
+    world.mind.throttle = PLAN[1] if story.steady else None
     if story.wiggled:
         world.at(WIGGLE_MS, stage.wiggle)
     for h in story.happenings:
-        world.at(h.at_ms, lambda h=h: HAPPENINGS[h.what][0](stage, h))  # type: ignore[misc]
+        happen = TOLD[h.what] if h.what in TOLD else HAPPENINGS[h.what][0]
+        world.at(h.at_ms, partial(happen, stage, h))
     stop_ms = STOP_MS + story.longer_ms
     later_ms = story.longer_ms * story.late
     start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (stop_ms, "stop")))
@@ -498,4 +417,5 @@ def drive_story(story: Story) -> Seen:
             stage.process.run()
             stage.process = None
     world.close()
+    stage.stack.close()
     return world.seen

@@ -9,13 +9,15 @@ import functools
 import heapq
 import math
 import random
-from _ctypes import dlclose
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import Telemetry, parse
 from rover_lib.workshop.cache import cache_folder, key_of
 
@@ -27,8 +29,8 @@ WATCHDOG_MS = 60
 BOOT_MS = 300  # how long the boot loader runs
 LATENCY_MS = 90  # how long a plan takes
 STEERING, THROTTLE = range(2)
-STICKS_US = (1456, 120)  # at rest
 LIVE, LOST, HELD, PRESET = "live", "lost", "held", "preset"  # what the receiver sends
+GONE, SILENT, STUCK = "pulled out", "out of reach", "its L1 held since before"  # faults of a gamepad
 
 
 class Event(ctypes.Structure):
@@ -44,59 +46,70 @@ class Event(ctypes.Structure):
 
 
 @functools.cache
-def library() -> Path:
-    """Get the sketch as a library for this machine, from the cache or compiled now. Raises ArduinoError without gcc."""
+def library(human: str = "receiver") -> Path:
+    """Get the sketch as a library for this machine, from the cache or compiled now. Raises ArduinoError without gcc.
+
+    human: as in `make -C firmware HUMAN=gamepad`.
+    """
     sources = [BOARD, *sorted(p for p in (FIRMWARE / "rover").iterdir() if p.is_file())]
-    key = key_of({"names": [source.name for source in sources]}, *sources)
-    return cache_folder("board", key, functools.partial(compile_sketch, FIRMWARE)) / LIBRARY
+    key = key_of({"names": [source.name for source in sources], "human": human}, *sources)
+    return cache_folder("board", key, functools.partial(compile_sketch, FIRMWARE, human=human)) / LIBRARY
 
 
-def compile_sketch(firmware: Path, folder: Path) -> None:
+def compile_sketch(firmware: Path, folder: Path, human: str = "receiver") -> None:
     """Compile the sketch to LIBRARY in a folder. firmware: the folder with the sketch's sources."""
     rover = firmware / "rover"
     sources = ("-x", "c", BOARD, rover / "protocol.c", rover / "vehicle.c")
-    compile_c(*CC, "-shared", "-fPIC", "-I", rover, "-o", folder / LIBRARY, *sources)
+    gamepad = ["-DHUMAN_GAMEPAD"] * (human == "gamepad")
+    compile_c(*CC, *gamepad, "-shared", "-fPIC", "-I", rover, "-o", folder / LIBRARY, *sources)
 
 
 class Board:
-    """The sketch from one start to the next. Raises ArduinoError if there is no gcc."""
+    """The sketch from one start to the next, one at a time. Raises ArduinoError if there is no gcc.
 
-    def __init__(self, clock_ms: int, boot: int, cause: str):
-        self._c = ctypes.CDLL(str(library()))
+    numbers: of the car in its EEPROM. human: as for library().
+    """
+
+    def __init__(self, clock_ms: int, boot: int, cause: str, numbers: Sequence[int], human: str):
+        self.c = ctypes.CDLL(str(library(human)))
         self._text = ctypes.create_string_buffer(1024)
         self._events = (Event * 65536)()
         self._zero_ms = clock_ms
-        self._c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()))
+        car = (ctypes.c_uint16 * 9)(*numbers)
+        self.c.board_start(ctypes.c_uint32(clock_ms), boot, ctypes.c_char(cause.encode()), car)
 
-    def transmit(self, channel: int, pulse_us: int, one_in: int = 1, misread_in: int = 0) -> None:
+    def transmit(
+        self, channel: int, pulse_us: int, one_in: int = 1, misread_in: int = 0, misread_us: int = 0, period_us: int = 0
+    ) -> None:
         """Set the receiver's pulses from now on, where 0 stands for none. board.c explains the other arguments."""
-        self._c.board_transmit(channel, pulse_us, one_in, misread_in)
+        self.c.board_transmit(channel, pulse_us, one_in, misread_in, misread_us, period_us)
 
     def give(self, data: bytes) -> None:
-        self._c.board_give(data, len(data))
+        self.c.board_give(data, len(data))
 
     def run(self, ms: int) -> tuple[int, bytes]:
         """Let up to `ms` milliseconds pass. Returns how many did, and what the sketch sent in the last of them."""
-        passed = self._c.board_run(ms)
-        length = self._c.board_said(self._text)
+        passed = self.c.board_run(ms)
+        length = self.c.board_said(self._text)
         return passed, self._text.raw[:length]
 
     def events(self) -> list[tuple[int, Event]]:
         """Return the events since the last call, each with its time in milliseconds since this start."""
-        count = self._c.board_events(self._events)
+        count = self.c.board_events(self._events)
         return [((e.at_ms - self._zero_ms) % 2**32, Event.from_buffer_copy(e)) for e in self._events[:count]]
-
-    def close(self) -> None:
-        dlclose(self._c._handle)
 
 
 class Wire:
-    """One direction of the serial line, which carries whole lines in order. You may set its latency and faults."""
+    """One direction of the serial line, which carries whole lines in order. You may set its latency and faults.
+
+    change: returns the lines that come out for one that goes in, None for that line itself.
+    """
 
     def __init__(self, world: "World", arrive: Callable[[bytes], None]):
         self._world, self._arrive = world, arrive
         self.latency_ms = 1
         self.lost_pct = self.garbled_pct = 0
+        self.change: Callable[[bytes], list[bytes]] | None = None
         self._busy_ms = 0.0
         self._last_ms = 0
 
@@ -110,16 +123,18 @@ class Wire:
             bad = bytearray(line)
             bad[world.rng.randrange(len(bad))] ^= 1 << world.rng.randrange(8)
             line = bytes(bad)
-        world.at(self._last_ms, lambda: self._arrive(line))
+        for out in self.change(line) if self.change else [line]:
+            world.at(self._last_ms, functools.partial(self._arrive, out))
 
 
 @dataclass(eq=False)
 class Hand:
-    """The human's hand on the transmitter, and what the receiver makes of it."""
+    """The human's hand on the transmitter, and what the receiver makes of it. A gamepad's is LIVE while L1 is held."""
 
-    sticks: list[int] = field(default_factory=lambda: list(STICKS_US))
+    sticks: list[int]  # as pulses: steering, throttle; us
+    sent: list[int]  # pulses of a receiver that holds or sends presets
     receiver: str = LIVE
-    sent: list[int] = field(default_factory=lambda: list(STICKS_US))  # pulses of a receiver that holds or sends presets
+    pad: str = ""  # GONE, SILENT or STUCK
     throttle_wire: bool = True
     steering_wire: bool = True
     one_in: int = 1
@@ -133,8 +148,12 @@ class Hand:
 
 @dataclass(eq=False)
 class Lens:
-    """What the camera shows. frozen_ms: since when it shows the same. late_ms: how old the pictures are that come."""
+    """What the camera shows. frozen_ms: since when it shows the same. late_ms: how old the pictures are that come.
 
+    film: what it shows instead, in turn: pictures (h, w, 3) uint8 BGR, or JPEGs.
+    """
+
+    film: Sequence[np.ndarray | bytes] = ()
     frozen_ms: int | None = None
     black: bool = False
     silent: bool = False
@@ -166,6 +185,7 @@ class Asked(NamedTuple):
     content_ms: int
     planned: bool
     sequence: int
+    steering_us: int
 
 
 class Planned(NamedTuple):
@@ -185,11 +205,11 @@ class Seen:
     receiver do from a time on. commands: the drive commands as the host wrote them. asked: when an operator asked to
     arm the car. wiggled: when a gesture was complete. starts: when the sketch started. hung: from when to when its loop
     hung. phases: what the host is doing from a time on. drives: begin, end and closing sentence of each, None if it was
-    killed. log: the events of the flight log. paused_ms: for how long the host's process was stopped in all; pauses:
-    from when to when. asked_most_ms: how old a request may become. plans: as they arrived. frames: when each came, and
-    whether it was black. heard: the Arduino's statuses as the host read them: when, and the command's number. stops:
-    when a drive was to end, by a signal, the view, its limit or a missing heartbeat; and since when it must have
-    driven. sick: from a time on, whether lines or orders are spoilt.
+    killed. errors: what ended each process, None as asked. log: the events of the flight log. paused_ms: for how long
+    the host's process was stopped in all; pauses: from when to when. asked_most_ms: how old a request may become.
+    plans: as they arrived. frames: when each came, and whether it was black. heard: the Arduino's statuses as the host
+    read them: when, and the command's number. stops: when a drive was to end, by a signal, the view, its limit or a
+    missing heartbeat; and since when it must have driven. sick: from a time on, whether lines or orders are spoilt.
     """
 
     pins: list[tuple[int, Event | None]] = field(default_factory=list)
@@ -201,6 +221,7 @@ class Seen:
     hung: list[tuple[int, int]] = field(default_factory=list)
     phases: list[tuple[int, str]] = field(default_factory=list)
     drives: list[tuple[int, int, str | None]] = field(default_factory=list)
+    errors: list[tuple[int, BaseException | None]] = field(default_factory=list)
     log: list[tuple[int, str]] = field(default_factory=list)
     paused_ms: int = 0
     pauses: list[tuple[int, int]] = field(default_factory=list)
@@ -224,13 +245,21 @@ class Port(Protocol):
 
 
 class World:
-    """The whole world. Its methods and attributes are what may break. rng: decides which lines are lost or garbled."""
+    """The whole world. Its methods and attributes are what may break.
 
-    def __init__(self, clock_ms: int = 0):
+    clock_ms: the Arduino's when it is switched on. rest_us: the pulses of sticks at rest. rng: decides which lines are
+    lost or garbled. wall_step_s: by how much somebody has set the host's clock.
+    """
+
+    def __init__(self, clock_ms: int = 0, car: Car | None = None):
+        self.car = car or Car()
+        self.rest_us = self.car.numbers[2], self.car.numbers[6]
         self.now_ms = 0
+        self.wall_step_s = 0.0
         self.rng = random.Random(0)
         self.seen = Seen()
-        self.hand, self.lens, self.mind = Hand(), Lens(), Mind()
+        self.hand = Hand(list(self.rest_us), list(self.rest_us))
+        self.lens, self.mind = Lens(), Mind()
         self.board: Board | None = None
         self.port: Port | None = None  # while somebody has it open
         self.mad_us = 0
@@ -247,8 +276,14 @@ class World:
         self._count = 0
         self._started_ms = self._hung_ms = 0
         self.view_stop = self.operator_gone = False
+        self.view: Path | None = None  # the socket at which a view listens
+        self.opening: Callable[[], object] = lambda: None  # what a process opens first; it may raise
         self.down, self.up = Wire(self, self._arrive_down), Wire(self, self._arrive_up)
         self._power(clock_ms, "p")
+
+    def throttle_us(self, default_us: int) -> int:
+        """Return this car's throttle pulse that is as far from rest as that one is from the default car's."""
+        return self.rest_us[1] + default_us - 120
 
     # ---- time
 
@@ -330,7 +365,7 @@ class World:
     def _power(self, clock_ms: int, cause: str) -> None:
         self._boot += 1
         self._started_ms, self._hung_ms = self.now_ms, 0
-        self.board = Board(clock_ms, self._boot, cause)
+        self.board = Board(clock_ms, self._boot, cause, self.car.numbers, self.car.human)
         self.seen.starts.append(self.now_ms)
         self.handle()
 
@@ -340,7 +375,6 @@ class World:
             self._hung_ms = 0
         if self.board:
             self.seen.pins += [(self._started_ms + ms, event) for ms, event in self.board.events()]
-            self.board.close()
             self.board = None
 
     def handle(self) -> None:
@@ -348,13 +382,13 @@ class World:
         hand = replace(self.hand, sticks=list(self.hand.sticks), sent=list(self.hand.sent))
         self.seen.hands.append((self.now_ms, hand))
         wires = (self.down, self.up)
-        sick = any(w.latency_ms > 1 or w.lost_pct or w.garbled_pct for w in wires)
+        sick = any(w.latency_ms > 1 or w.lost_pct or w.garbled_pct or w.change for w in wires)
         sick |= bool(self.lens.late_ms or self.mind.latency_ms > LATENCY_MS)  # then the throttle fades
         self.seen.sick.append((self.now_ms, bool(sick or self.stuck or self.unplugged or self.mad_us)))
         if self.board:
             steering_us, throttle_us = hand.pulses()
             self.board.transmit(STEERING, steering_us)
-            self.board.transmit(THROTTLE, throttle_us, hand.one_in, hand.misread_in)
+            self.board.transmit(THROTTLE, throttle_us, hand.one_in, hand.misread_in, self.rest_us[1])
 
     def close(self) -> None:
         """End the world, and complete `seen`."""
@@ -402,7 +436,7 @@ class World:
             raise BlockingIOError
         self.written.append(line)
         if line.startswith(b">D"):
-            _, _, sequence, *_, throttle_us = line.split(b"*")[0].split()
-            asked = self.now_ms, int(throttle_us), self.content_ms, not self.mad_us, int(sequence)
-            self.seen.commands.append(Asked(*asked))
+            _, sequence, _, steering_us, throttle_us = map(int, line[3:].split(b"*")[0].split())
+            asked = Asked(self.now_ms, throttle_us, self.content_ms, not self.mad_us, sequence, steering_us)
+            self.seen.commands.append(asked)
         self.down.send(line)

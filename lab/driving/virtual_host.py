@@ -5,17 +5,25 @@ Code that waits lets the world go on. Only the port, the camera's driver and the
 
 import contextlib
 import functools
+import math
+import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
-from lab.driving.virtual import FRAME_MS, Killed, Planned, World
-from rover_lib.onboard.car.camera import Camera
+from lab.driving.virtual import FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
+from rover_lib.onboard.car import gamepad
+from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.drive import watch
 from rover_lib.onboard.drive.drive import arm_capped, arm_when_ready, what_is_missing
+from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
@@ -29,6 +37,7 @@ PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
 LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 WALL_S = 1.7e9
+SIZE = (128, 72)  # of the camera's pictures, and of those that the policy has seen: width, height
 
 
 class _Waiting:
@@ -50,11 +59,64 @@ class _Waiting:
         return found
 
 
-class VirtualLink(ServoLink):
-    """A ServoLink whose port and reader belong to the world."""
+class VirtualPad(gamepad.Gamepad):
+    """The real Gamepad, which reads what the world's hand does from two pipes."""
+
+    FULL = 32767
 
     def __init__(self, world: World):
-        super().__init__("the virtual port", clock=world.clock)
+        self._world = world
+        (pad, self._to_pad), (motion, self._to_motion) = os.pipe(), os.pipe()
+        for end in (pad, motion):
+            os.set_blocking(end, False)
+        axes = dict.fromkeys((gamepad.STEERING, gamepad.THROTTLE), gamepad.Stick(-self.FULL, self.FULL))
+        super().__init__("virtual", pad, motion, axes)
+        self._known: tuple[bool, list[int]] | None = None  # what its events have told
+
+    def close(self) -> None:
+        super().close()
+        self._pull_out()
+
+    def sticks(self, now_s: float | None = None) -> tuple[float, float] | None:
+        hand = self._world.hand
+        if hand.pad == GONE:
+            self._pull_out()
+        elif hand.pad == SILENT:
+            self._known = None
+        elif self._to_pad >= 0:
+            self._send(self._to_motion, gamepad.ABS, 0, self._world.now_ms)
+            known = hand.receiver != LOST, list(hand.sticks)
+            if known != self._known:
+                self._tell(*known)
+                self._known = known
+        return super().sticks(self._world.clock())
+
+    def _tell(self, held: bool, sticks_us: list[int]) -> None:
+        car = self._world.car
+        actions = car.pwm.actions_from_pulses(*sticks_us)
+        moved = -car.left * (actions.steering or 0.0), -(actions.throttle or 0.0) / car.cap
+        for axis, x in zip((gamepad.STEERING, gamepad.THROTTLE), moved, strict=True):
+            way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
+            self._send(self._to_pad, gamepad.ABS, axis, round(math.copysign(way, x) * self.FULL))
+        if not self._known or self._known[0] != held:
+            age_s = 1.0 if self._world.hand.pad == STUCK else 0.0
+            self._send(self._to_pad, gamepad.KEY, gamepad.BTN_L1, int(held), age_s)
+
+    def _send(self, end: int, kind: int, code: int, value: int, age_s: float = 0.0) -> None:
+        at_s = self._world.clock() - age_s
+        os.write(end, gamepad.EVENT.pack(int(at_s), int(at_s % 1 * 1e6), kind, code, value))
+
+    def _pull_out(self) -> None:
+        for end in {self._to_pad, self._to_motion} - {-1}:
+            os.close(end)
+        self._to_pad = self._to_motion = -1
+
+
+class VirtualLink(ServoLink):
+    """A ServoLink whose port, reader and gamepad belong to the world."""
+
+    def __init__(self, world: World):
+        super().__init__("the virtual port", car=world.car, clock=world.clock)
         self._world = world
         condition: Any = _Waiting(world)
         self._heard = condition
@@ -66,10 +128,16 @@ class VirtualLink(ServoLink):
             raise LinkError(f"{self.port}: cannot be opened", remedy="is the Arduino plugged in?")
         port: Any = self
         self._serial = port
-        return self._wait_for_hello()
+        hello = self._wait_for_hello()
+        self._tell_car(hello)
+        if self.car.human == "gamepad":
+            self._gamepad = VirtualPad(self._world)
+        return hello
 
     def _release(self) -> None:
         self._serial = self._world.port = None
+        if self._gamepad:
+            self._gamepad.close()
 
     def _write(self, line: bytes) -> None:
         try:
@@ -83,13 +151,21 @@ class VirtualLink(ServoLink):
         self._fail(f"{self.port}: reading failed")
 
     def hear(self, data: bytes) -> None:
+        now_s = self._clock()
         for line in data.split(b"\n"):
             if line:
-                self._hear(line, self._clock())
+                self._hear(line, now_s)
+        if self._gamepad:
+            self._relay(self._gamepad, now_s)
+
+
+def wall_clock(world: World) -> float:
+    """Return the time in seconds, in place of time.time()."""
+    return WALL_S + world.clock() + world.wall_step_s
 
 
 @functools.cache
-def _scenery() -> list[np.ndarray]:
+def scenery() -> list[np.ndarray]:
     """Return the pictures of a drive, (72, 128, 3) uint8 BGR, no two of them alike."""
     rng = np.random.default_rng(0)
     wide = rng.integers(30, 220, (9, 40, 3), np.uint8).repeat(8, 0).repeat(8, 1)
@@ -103,9 +179,11 @@ class Eyes:
 
     def __init__(self, world: World):
         self._world = world
-        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=lambda: WALL_S + world.clock())
+        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
-        self._next: tuple[np.ndarray, float] | None = None
+        self._next: tuple[np.ndarray | bytes, float] | None = None
+        self._failure: Exception | None = None
+        self._shown = 0  # pictures of a film
         self._seen_ms = -1_000_000
         self._turn, self._idle = threading.Semaphore(0), threading.Semaphore(0)
         self._over = False
@@ -116,11 +194,13 @@ class Eyes:
         self.on_frame: Callable[[], None] = lambda: None
         self._tick()
 
-    def _pictures(self) -> Iterator[tuple[np.ndarray, float | None]]:
+    def _pictures(self) -> Iterator[tuple[np.ndarray | bytes, float | None]]:
         try:
             while True:
                 self._idle.release()
                 self._turn.acquire()
+                if self._failure:
+                    raise self._failure
                 if self._next is None:
                     return
                 yield self._next
@@ -128,7 +208,7 @@ class Eyes:
             self._over = True
             self._idle.release()
 
-    def _give(self, picture: tuple[np.ndarray, float] | None) -> None:
+    def _give(self, picture: tuple[np.ndarray | bytes, float] | None) -> None:
         if self._over:
             return
         self._next = picture
@@ -137,8 +217,9 @@ class Eyes:
         if self._over:
             self._thread.join()
 
-    def unplug(self) -> None:
-        """Let the camera's reader come to the end of its pictures."""
+    def unplug(self, failure: Exception | None = None) -> None:
+        """Let the camera's reader come to the end of its pictures, or raise."""
+        self._failure = failure
         self._give(None)
 
     def close(self) -> None:
@@ -160,9 +241,12 @@ class Eyes:
             return  # pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        picture = _scenery()[round(content_ms / FRAME_MS) % len(_scenery())]
+        picture: np.ndarray | bytes = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
         if lens.black:
             picture = (picture - picture.min()) // 64 + world.now_ms % 2
+        if lens.film:
+            picture = lens.film[self._shown % len(lens.film)]
+            self._shown += 1
         world.seen.frames.append((world.now_ms, lens.black))
         # The driver of a frozen camera still gives each picture a new time stamp.
         self._give((picture, (seen_ms - world.suspended_ms) / 1e3))
@@ -179,7 +263,7 @@ class VirtualPlanner(Planner):
         self._looked_at = 0
         self._number = 0
         self.content: dict[int, int] = {}  # by a plan's number, when (ms) its picture's scene was really to be seen
-        super().__init__(eyes.camera, self._never, commanded, RATE_HZ, clock=world.clock)
+        super().__init__(eyes.camera, self._never, commanded, RATE_HZ, limits=world.car.limits, clock=world.clock)
         condition: Any = _Waiting(world)
         self._news = condition
         eyes.on_frame = self._look
@@ -221,7 +305,7 @@ class VirtualPlanner(Planner):
             if world.mind.does == "raise":
                 raise PolicyError("the policy was told to fail")
             self._number += 1
-            self._plan = Plan(self._number, captured_s, self._clock(), actions)
+            self._plan = Plan(self._number, captured_s, self._clock(), actions, self._limits)
             self.content[self._number] = content_ms
         except Exception as error:
             return self._fail(error)
@@ -259,9 +343,13 @@ class _Stop(threading.Event):
 
 
 class _Log:
+    """In the place of a flight log. recent, machine: for the view's feed."""
+
     def __init__(self, world: World):
         self._world = world
         self.start_s = world.clock()
+        self.recent: deque[Any] = deque()
+        self.machine: dict[str, Any] = {}
 
     def tick(self, row: Any) -> None: ...
 
@@ -299,7 +387,8 @@ class Process:
         self.eyes = Eyes(world)
         self.planner = VirtualPlanner(world, self.eyes, self.commanded)
         self._service = service
-        self._log = _Log(world)
+        self.log: Any = _Log(world)
+        self._feed = Feed(world.view, self.log, "virtual", clock=world.clock, sleep=world.sleep) if world.view else None
 
     def ask(self) -> None:
         """Let the operator ask to arm the car, as Service._answer_to() does."""
@@ -320,7 +409,7 @@ class Process:
     def _over(self) -> str | None:
         if self.world.view_stop:
             return "stopped from the view (127.0.0.1)"
-        return self._operators.over() if self._service else None
+        return (self._operators.over() if self._service else None) or (self._feed.over() if self._feed else None)
 
     def _beat(self, armed_ms: int) -> None:
         """Let the operator's heartbeats come until they are gone."""
@@ -333,20 +422,25 @@ class Process:
     def run(self) -> None:
         """Run until it ends. Raises nothing."""
         world = self.world
+        error: BaseException | None = None
         try:
             with contextlib.ExitStack() as stack:
                 link = None
                 while link is None or (self._service and not self.until.stop.is_set()):
                     with self._told(report := Report()):
+                        world.opening()
                         link = link or stack.enter_context(VirtualLink(world))
                         self._drive(link, report)
-        except (Killed, Exception):
-            pass
+        except (Killed, Exception) as raised:
+            error = raised
         finally:
+            world.seen.errors.append((world.now_ms, error))
             world.phase("off")
             world.paused_until_ms = world.now_ms
             world.failing = None
             self.eyes.close()
+            if self._feed:
+                self._feed.close()
 
     @contextlib.contextmanager
     def _told(self, report: Report) -> Iterator[None]:
@@ -365,13 +459,30 @@ class Process:
             world.seen.drives.append((begin_ms, world.now_ms, report.ended if world.alive else None))
 
     def _drive(self, link: ServoLink, report: Report) -> None:
-        world = self.world
+        world, camera = self.world, self.eyes.camera
         world.phase("ready")
-        pilot = _Pilot(self.eyes.camera, self.planner, self.commanded, _settings(), RATE_HZ)
+        if frame := camera.latest():
+            check_shape(camera.source, frame.image, SIZE)
+        pilot = _Pilot(camera, self.planner, self.commanded, _settings(), RATE_HZ, calibration=world.car.pwm)
         pilot.world, pilot.planner = world, self.planner
-        hooks = Hooks(arm=functools.partial(self._arm, pilot, link), record=self.record)
-        drive(pilot, link, self._log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
+        show = functools.partial(self._feed.tick, report, camera, pilot) if self._feed else None
+        arm = functools.partial(self._arm, pilot, link)
+        hooks = Hooks(arm, self._warnings(pilot, link, report), self.record, show)
+        drive(pilot, link, self.log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
               clock=world.clock, sleep=world.sleep)  # fmt: skip
+
+    def _warnings(self, pilot: PolicyPilot, link: ServoLink, report: Report) -> Callable[[], list[str]]:
+        """Return the sources of warnings that drive.py has, less what they say of the machine that this runs on."""
+        clocks = SimpleNamespace(time=functools.partial(wall_clock, self.world), monotonic=self.world.clock)
+        with patch.object(watch, "time", clocks):
+            health = watch.HealthWatch(report, link)
+
+        def warnings() -> list[str]:
+            with patch.object(watch, "time", clocks):
+                said = [*pilot.warnings(), *health()]
+            return [text for text in said if not text.startswith(("this machine", "this virtual machine"))]
+
+        return warnings
 
     def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
         """Arm the car as drive.py does: for whoever asks the service, for a human in a terminal, or at once."""
@@ -383,7 +494,7 @@ class Process:
             return wait(attempt, checks, functools.partial(what_is_missing, link))
         world.seen.asked.append(world.now_ms)
         if self._terminal:
-            stop, notify = self.until.stop, self._log.event
+            stop, notify = self.until.stop, self.log.event
             return arm_when_ready(attempt, link, stop, notify, checks, clock=world.boottime)
         return attempt()
 
@@ -395,10 +506,10 @@ class Process:
             self.planner.renew(_settings().fade_s)
             pilot.check_sight()
             wanted = self._operators.check_request if self._service else lambda: None
-            self.armed = arm_capped(link, limit, limit, self._log.event, wanted)
+            self.armed = arm_capped(link, limit, limit, self.log.event, wanted)
         except RoverError as error:
             world.phase("disarmed")
-            self._log.event(f"not armed: {error}")
+            self.log.event(f"not armed: {error}")
             raise
         world.phase("driving")
         world.view_stop = False

@@ -122,10 +122,6 @@ def _faults(root: Path) -> list[Row]:
         ("faults that must not stop it: it drove on while its plan was young enough", right("continues")),
         ("faults that must keep it from being armed", right("refused")),
         ("from a moved stick to the human's pulses", f"at most {takeover:.0f} ms"),
-        (
-            "pulses, recorded, replayed and measured again",
-            f"within {report['bytes']['worst_us']:.0f} us",
-        ),
         ("random drives in virtual time that broke a safety rule", broken),
     ]
 

@@ -127,7 +127,7 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
 def watched(demo_run, folder):
     """A drive of 300 ticks in the world, its view's server, and an open page that shows it."""
     pytest.importorskip("aiohttp", reason="needs the extra view")
-    from lab.driving.page import Page, ViewServer
+    from view_page import Page, ViewServer
 
     options = ["--world", "--ticks", "300", "--view", folder / "view", "--log", folder / "flight.log"]
     options += ["--json", folder / "drive"]

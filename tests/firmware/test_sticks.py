@@ -40,12 +40,6 @@ def test_the_human_drives(board):
     assert board.run(40)[-1] == (1700, CAP_US)
 
 
-def test_throttle_passes_only_once_it_was_at_rest():
-    board = NativeArduino(gamepad=True)
-    board.sticks[THROTTLE] = 200
-    assert not moved_after_ms(board.run(1000))
-
-
 @pytest.mark.parametrize("stop", ["let go", "silence", "late"])
 @pytest.mark.parametrize("autonomous", [False, True])
 def test_each_loss_stops_within_200_ms(board, stop, autonomous):
@@ -69,17 +63,6 @@ def test_each_loss_stops_within_200_ms(board, stop, autonomous):
     assert not autonomous or (board.status.state, board.status.reason) == (State.STOPPED, "s")
     board.sticks = [1456, 200]  # and what was held is not taken up again
     assert not moved_after_ms(board.run(500))
-
-
-def test_a_gesture_without_the_button_all_the_while_does_not_arm(board):
-    board.wiggle()
-    board.send_sticks(0, 0, board.now_ms)
-    board.run(400)
-    assert board.command("A") == "w"
-    board.wiggle()
-    board.sticks = [0, 0]
-    board.run(400)
-    assert board.command("A") == "s"
 
 
 def test_arming_wants_a_young_whole_gesture_and_uses_it_up(board):

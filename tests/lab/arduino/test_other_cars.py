@@ -1,32 +1,25 @@
-"""The firmware as it is flashed, told of two other cars, in simavr: judged by the pulses on its pins.
-
-A 50 Hz servo and speed controller with reverse, and a car with the pulses of the default whose steering is inverted.
-"""
+"""The firmware as it is flashed, told of other cars, in simavr: pulses of 50 Hz, and the car that the EEPROM keeps."""
 
 import random
 import struct
 import zlib
 from itertools import pairwise
-from pathlib import Path
 from types import SimpleNamespace
 
 import needs
 import pytest
-from uno import EEPROM_BYTES, LINE_IN, RESET, Uno, pulses, widths
+from uno import EEPROM_BYTES, REPOSITORY, RESET, Uno, pulses, widths
 
 from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
-CARS = Path(__file__).parents[3] / "lab" / "cars"
 pytestmark = [pytest.mark.emulated, needs.simavr]
-
-CRAWLER, INVERTED = (read_car(CARS / f"{name}.yml") for name in ("crawler", "inverted"))
+CRAWLER, INVERTED = (read_car(REPOSITORY / "lab" / "cars" / f"{name}.yml") for name in ("crawler", "inverted"))
 ALL_CARS = [Car(), CRAWLER, INVERTED]
 EDGE_US = 0.3
 STEP_US = ARDUINO_STEP_US + EDGE_US
 ANSWER_MS = 25
-TIMEOUT_MS, TAKEOVER_MS = 150, 50  # the cap and a lost signal are the state machine's: tests/firmware/test_cars.py
 
 
 def told(board, car):
@@ -36,13 +29,10 @@ def told(board, car):
     assert board.status.result == "k", board.lines[-3:]
 
 
-def sticks(board, steering_us, throttle_us):
-    board.transmitter(
-        steering_us,
-        throttle_us,
-        steering_period_us=board.car.numbers[0] + 30,  # receiver and Arduino have each a clock of their own
-        throttle_period_us=board.car.numbers[4] + (30 if board.car.reverses else 0),
-    )
+def sticks_rest(board, car):
+    """Near neutral; receiver and Arduino have each a clock of their own."""
+    periods = {"steering_period_us": car.numbers[0] + 30, "throttle_period_us": car.numbers[4] + 30 * car.reverses}
+    board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, **periods)
 
 
 def arm(board):
@@ -53,159 +43,103 @@ def arm(board):
     assert (board.status.state, board.status.result) == ("A", "k"), board.lines[-3:]
 
 
-@pytest.fixture(params=[CRAWLER, INVERTED], ids=["crawler", "inverted"])
-def armed(request):
+def on_pins(events, steering_us, throttle_us, within_us=ARDUINO_STEP_US / 2 + EDGE_US):
+    for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
+        measured = widths(events, pin)
+        assert measured, f"no {pin} pulses"
+        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"
+
+
+def has_periods(events, car):
+    for pin, period_us in (("steering", car.numbers[0]), ("throttle", car.numbers[4])):
+        assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
+
+
+@pytest.fixture
+def crawler():
+    """Armed."""
     board = Uno()
-    board.car = car = request.param
-    board.neutral = SimpleNamespace(steering=car.numbers[2], throttle=car.numbers[6])
     board.run_ms(60)
-    told(board, car)
-    sticks(board, board.neutral.steering + 4, board.neutral.throttle + 4)
+    told(board, CRAWLER)
+    sticks_rest(board, CRAWLER)
     arm(board)
     yield board
     board.close()
 
 
-def on_pins(events, steering_us, throttle_us, after_us=0, within_us=ARDUINO_STEP_US / 2 + EDGE_US):
-    for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
-        measured = widths(events, pin, after_us)
-        assert measured, f"no {pin} pulses"
-        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"
-
-
-def is_neutral(board, events, after_us=0):
-    on_pins(events, board.neutral.steering, board.neutral.throttle, after_us)
-
-
-def fastest(board):
-    """Full lock, and the cap."""
-    return board.car.numbers[3], board.neutral.throttle + board.car.cap_us
-
-
-def test_the_pins_are_car_ymls_over_the_whole_range(armed):
-    car = armed.car
-    for share in range(11):
-        steering = share / 5 - 1
-        throttle = car.cap * (steering if car.reverses else share / 10)
-        wanted = car.pwm.pulses(steering, throttle)
-        armed.drive(wanted.steering_us, wanted.throttle_us, 330)
-        events = armed.drive(wanted.steering_us, wanted.throttle_us, 90)
+def test_the_pins_are_car_ymls_over_the_whole_range(crawler):
+    for share in range(6):
+        action = share / 2.5 - 1
+        wanted = CRAWLER.pwm.pulses(action, CRAWLER.cap * action)
+        crawler.drive(wanted.steering_us, wanted.throttle_us, 330)
+        events = crawler.drive(wanted.steering_us, wanted.throttle_us, 90)
         on_pins(events, wanted.steering_us, wanted.throttle_us)
-        for pin, period_us in (("steering", car.numbers[0]), ("throttle", car.numbers[4])):
-            assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
-    assert armed.status.state == "A"
-    assert car.pwm.pulses(1, 0).steering_us == (2000 if car is CRAWLER else 900)  # left
+        has_periods(events, CRAWLER)
+    assert crawler.status.state == "A"
 
 
-def test_the_human_drives_over_the_whole_range(armed):
-    armed.command("N")
-    for _ in range(2):  # the first takes the car over, and his throttle passes once it was at rest
-        sticks(armed, armed.neutral.steering + 100, armed.neutral.throttle)
-        armed.run_ms(400)
-    least_us, most_us = (800, 2200) if armed.car.reverses else (40, 948)
-    for share in range(8):
-        steering_us, throttle_us = 820 + 190 * share, least_us + (most_us - least_us) / 7 * share
-        sticks(armed, steering_us, throttle_us)
-        armed.run_ms(120)
-        on_pins(armed.run_ms(90), steering_us, throttle_us, within_us=STEP_US + 1)
-        assert abs(armed.status.receiver_steering_us - steering_us) <= STEP_US
-        assert abs(armed.status.receiver_throttle_us - throttle_us) <= 2  # captured by hardware
-        periods = armed.status.receiver_steering_period_us - 30, armed.status.receiver_throttle_period_us
-        assert abs(periods[0] - armed.car.numbers[0]) <= 2 * ARDUINO_STEP_US
-        assert abs(periods[1] - armed.car.numbers[4]) <= 30 + 2 * ARDUINO_STEP_US
-
-
-def test_a_pulse_is_whole_whenever_it_changes(armed):
+def test_a_pulse_is_whole_whenever_it_changes(crawler):
     """Commands at any phase: no slow pulse is a round of Timer2 too long or too short, none is missing."""
     rng = random.Random(1)
-    low_us, high_us = armed.neutral.throttle, armed.neutral.throttle + 40
-    armed.drive(armed.neutral.steering, low_us, 100)
+    crawler.drive(1500, 1500, 100)
     events = []
     for n in range(120):
         ms = rng.uniform(3, 9)
-        events += armed.drive(armed.neutral.steering + 20 * (n % 2), (low_us, high_us)[n // 6 % 2], ms, every_ms=ms)
-    for pin, low, high in (
-        ("steering", armed.neutral.steering, armed.neutral.steering + 20),
-        ("throttle", low_us, high_us),
-    ):
-        assert min(widths(events, pin)) >= low - 2 - EDGE_US
-        assert max(widths(events, pin)) <= high + 2 + EDGE_US
-        period_us = armed.car.numbers[0 if pin == "steering" else 4]
-        assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin))
+        events += crawler.drive(1500 + 20 * (n % 2), 1500 + 40 * (n // 6 % 2), ms, every_ms=ms)
+    for pin, most_us in (("steering", 1520), ("throttle", 1540)):
+        assert min(widths(events, pin)) >= 1500 - 2 - EDGE_US
+        assert max(widths(events, pin)) <= most_us + 2 + EDGE_US
+    has_periods(events, CRAWLER)
 
 
-def test_silence_stops_it_at_its_neutral(armed):
-    rng = random.Random(2)
-    for _ in range(4):
-        armed.drive(*fastest(armed), 300 + rng.uniform(0, 25), every_ms=20)
-        armed.command("D", *fastest(armed))
-        events = armed.run_ms(400)
-        command_us = max(e.at_us for e in events if e.kind == LINE_IN)
-        is_neutral(armed, events, after_us=command_us + (TIMEOUT_MS + 24) * 1000)
-        moving = [e for e in pulses(events, "throttle") if armed.car.pwm.throttle.moves(e.pulse_us)]
-        last_us = max(e.at_us + e.pulse_us for e in moving) - command_us
-        assert (TIMEOUT_MS - 25) * 1000 <= last_us <= (TIMEOUT_MS + 25) * 1000
-        assert (armed.status.state, armed.status.reason) == ("S", "t")
-        arm(armed)
-
-
-@pytest.mark.parametrize(("steering_us", "throttle_us"), [(110, 0), (-110, 0), (0, 80), (0, -70)])
-def test_the_human_takes_over_within_50_ms(armed, steering_us, throttle_us):
-    rng = random.Random(3)
-    latest = 0
-    for _ in range(5):
-        armed.drive(*fastest(armed), 300 + rng.uniform(0, 25), every_ms=20)
-        start_us = armed.now_us
-        human = armed.neutral.steering + 4 + steering_us, armed.neutral.throttle + 4 + throttle_us
-        sticks(armed, *human)
-        events = armed.drive(*fastest(armed), 100, every_ms=20)
-        human = human[0], human[1] if not throttle_us else armed.neutral.throttle
-        if not throttle_us:  # his throttle passes at once where it is at rest, which a slow one's takes 160 ms to be
-            events = [e for e in events if e.channel == 0 or abs(e.pulse_us - armed.neutral.throttle) > STEP_US] + [
-                e for e in events if e.channel == 1 and e.kind == 1
-            ]
-        on_pins(events, *human, after_us=start_us + TAKEOVER_MS * 1000, within_us=STEP_US + 1)
-        moving = [e for e in pulses(events, "throttle", start_us) if abs(e.pulse_us - fastest(armed)[1]) <= STEP_US]
-        latest = max([latest, *(e.at_us + e.pulse_us - start_us for e in moving)])
-        assert (armed.status.state, armed.status.reason) == ("M", "h")
-        sticks(armed, armed.neutral.steering + 4, armed.neutral.throttle + 4)
-        armed.run_ms(60)
-        arm(armed)
-    print(f"the host's last throttle at most {latest / 1000:.1f} ms after")
-    assert latest <= TAKEOVER_MS * 1000
-
-
-@pytest.mark.parametrize("how", ["hang", "reset", "power"])
-def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(armed, how):
+@pytest.mark.parametrize("how", ["hang", "power"])
+def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(crawler, how):
     """A watchdog's reset in a drive gave the default's neutral, 120 us at 984 Hz, to a speed controller of 50 Hz."""
-    armed.drive(*fastest(armed), 297)
-    armed.transmitter(0, 0)
-    getattr(armed, how)()
-    events = armed.run_ms(400)
-    reset_us = next(e.at_us for e in events if e.kind == RESET) if how == "hang" else 0
-    later = [e for e in armed.events if e.at_us > max(reset_us, max(e.at_us for e in armed.events if e.kind == RESET))]
-    is_neutral(armed, later)
-    for pin, period_us in (("steering", armed.car.numbers[0]), ("throttle", armed.car.numbers[4])):
-        assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(later, pin)[1:])
-    sticks(armed, armed.neutral.steering, armed.neutral.throttle)
-    armed.run_ms(400)
-    armed.wiggle()
-    armed.command("A")
-    armed.run_ms(ANSWER_MS)
-    if armed.car is INVERTED:  # its pins are the default's: which way is left, only the host knows
-        assert (armed.status.state, armed.status.result) == ("A", "k")
-        return
-    assert (armed.status.state, armed.status.result) == ("M", "c")
-    told(armed, armed.car)
-    arm(armed)
+    crawler.drive(2000, 1500 + CRAWLER.cap_us, 297)
+    crawler.transmitter(0, 0)
+    getattr(crawler, how)()
+    crawler.run_ms(400)
+    reset_us = max(e.at_us for e in crawler.events if e.kind == RESET)
+    later = [e for e in crawler.events if e.at_us > reset_us]
+    on_pins(later, 1500, 1500)
+    has_periods(later, CRAWLER)
+    sticks_rest(crawler, CRAWLER)
+    crawler.run_ms(400)
+    crawler.wiggle()
+    crawler.command("A")
+    crawler.run_ms(ANSWER_MS)
+    assert (crawler.status.state, crawler.status.result) == ("M", "c")
+    told(crawler, CRAWLER)
+    arm(crawler)
+
+
+def test_told_of_another_car_no_pulse_is_cut():
+    """There and back while a human steers, the throttle at rest: each pulse on the way is one neutral or the other."""
+    rng = random.Random(4)
+    board = Uno()
+    board.transmitter(1700, 124)
+    board.run_ms(150)
+    for before, car in pairwise((Car(), CRAWLER, Car(), INVERTED, CRAWLER)):
+        board.transmitter(1700, before.numbers[6])
+        board.run_ms(rng.uniform(260, 280))
+        start = len(board.events)
+        told(board, car)
+        board.run_ms(100)
+        # The very next throttle pulses may be the human's last; from then on each is one neutral or the other.
+        after = pulses(board.events[start:], "throttle")[10:]
+        may_be = before.numbers[6], car.numbers[6], 124
+        assert all(min(abs(e.pulse_us - us) for us in may_be) <= STEP_US for e in after)
+        assert abs(after[-1].pulse_us - car.numbers[6]) <= STEP_US
+        assert all(us > 1400 for us in widths(board.events[start:], "steering"))
+        assert board.now_us / 1000 - 35 <= board.status.uptime_ms <= board.now_us / 1000  # the clock's timer changed
+    board.close()
 
 
 # ---- the car that it keeps
 
 
 @pytest.mark.parametrize("car", ALL_CARS, ids=lambda car: car.name)
-@pytest.mark.parametrize("signals", [False, True])
-def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car, signals):
+def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car):
     """Before, they had 120 us at 984 Hz until a host opened the port, whatever the car was."""
     board = Uno(eeprom=b"")
     board.run_ms(60)
@@ -214,52 +148,28 @@ def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car, s
     assert board.eeprom[2:] == eeprom_of(car)[2:]
     start_us = board.now_us
     board.power()
-    if signals:
-        board.transmitter(car.numbers[2], car.numbers[6] + 100, steering_period_us=car.numbers[0],
-                          throttle_period_us=car.numbers[4])  # fmt: skip
     board.run_ms(300)
-    for pin, at in (("steering", 0), ("throttle", 4)):
-        seen = pulses(board.events, pin, start_us)
-        print(f"{pin} after {seen[0].at_us - start_us:.0f} us")
-        assert seen[0].at_us - start_us < 1500
-        assert all(abs(e.pulse_us - car.numbers[at + 2]) <= ARDUINO_STEP_US / 2 + EDGE_US for e in seen)
-        assert all(abs(e.period_us - car.numbers[at]) <= EDGE_US for e in seen[1:])
+    events = [e for e in board.events if e.at_us >= start_us]
+    assert all(pulses(events, pin)[0].at_us - start_us < 1500 for pin in ("steering", "throttle"))
+    on_pins(events, car.numbers[2], car.numbers[6])
+    has_periods(events, car)
     assert any(line.endswith(f" p {car.id}") for line in board.lines)
-    assert board.status.state == "M"
     board.close()
 
 
-def spoilt():
-    """EEPROMs without a car: erased, of another version, cut short, and with one bit of each byte flipped."""
-    good = eeprom_of(CRAWLER)
-    yield from (b"", eeprom_of(CRAWLER, version=0), good[: EEPROM_BYTES - 1], eeprom_of(Car())[:10] + good[10:])
-    for at in range(2, EEPROM_BYTES):
-        yield good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :]
-    beyond = (*CRAWLER.numbers[:8], 119)  # the cap
-    yield eeprom_of(SimpleNamespace(numbers=beyond, id=zlib.crc32(struct.pack("<9H", *beyond))))
-
-
 def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
-    for eeprom in spoilt():
+    good = eeprom_of(CRAWLER)
+    flipped = [good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :] for at in range(2, EEPROM_BYTES, 3)]
+    beyond = (*CRAWLER.numbers[:8], 119)  # the cap
+    beyond_all = eeprom_of(SimpleNamespace(numbers=beyond, id=zlib.crc32(struct.pack("<9H", *beyond))))
+    for eeprom in (b"", eeprom_of(CRAWLER, version=0), good[: EEPROM_BYTES - 1], beyond_all, *flipped):
         board = Uno(eeprom=eeprom)
         board.transmitter(1700, 500)
-        events = board.run_ms(90)
-        assert not [e for e in events if e.channel >= 0], eeprom.hex()
+        assert not [e for e in board.run_ms(90) if e.channel >= 0], eeprom.hex()
         assert (board.status.missing, board.status.steering_us, board.status.throttle_us) == ("s", 0, 0)
-        board.close()
-    for car in ALL_CARS:
-        board = Uno(eeprom=b"")
-        board.run_ms(random.Random(car.id).uniform(40, 70))
         board.command("A")
         board.run_ms(ANSWER_MS)
         assert board.status.result == "c"
-        told(board, car)
-        board.run_ms(100)
-        board.neutral = SimpleNamespace(steering=car.numbers[2], throttle=car.numbers[6])
-        is_neutral(board, board.events)
-        board.car = car
-        sticks(board, board.neutral.steering + 4, board.neutral.throttle + 4)
-        arm(board)
         board.close()
 
 
@@ -277,97 +187,18 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
     board.run_ms(100)
     assert board.eeprom == images[-1]  # and no more
     board.close()
-    rng = random.Random(6)
     between = {
         before[:at] + bytes([byte]) + before[at + 1 :]
         for before, after in pairwise(images)
         for at in range(EEPROM_BYTES)
         if before[at] != after[at]
-        for byte in (0xFF, 0, before[at] & after[at], rng.randrange(256))
+        for byte in (0xFF, 0, before[at] & after[at])
     }
-    found = []
     for eeprom in sorted({*images, *between}):
         board = Uno(eeprom=eeprom)
         pins = {(e.channel, round(e.pulse_us)) for e in board.run_ms(25)}
-        found.append(int(board.lines[0].split()[-1]))
-        car = next((car for car in (INVERTED, CRAWLER) if car.id == found[-1]), None)
+        found = int(board.lines[0].split()[-1])
+        car = next((car for car in (INVERTED, CRAWLER) if car.id == found), None)
         assert pins == ({(0, car.numbers[2]), (1, car.numbers[6])} if car else set()), eeprom.hex()
         board.close()
     assert len(images) > 12
-    assert found.count(zlib.crc32(bytes(18))) > len(images)
-
-
-def test_what_it_keeps_already_is_not_written_again():
-    board = Uno(eeprom=eeprom_of(CRAWLER))
-    board.run_ms(60)
-    for _ in range(5):
-        told(board, CRAWLER)
-    board._c.uno_eeprom(board._uno, b"\0" * EEPROM_BYTES, EEPROM_BYTES, True)  # what was written would show
-    for _ in range(5):
-        told(board, CRAWLER)
-    assert not any(board.eeprom)
-    board.close()
-
-
-def test_told_of_another_car_no_pulse_is_cut():
-    """There and back while a human steers, the throttle at rest: each pulse on the way is one neutral or the other."""
-    rng = random.Random(4)
-    board = Uno()
-    board.transmitter(1700, 124)
-    board.run_ms(150)
-    cars = (CRAWLER, Car(), INVERTED, CRAWLER, INVERTED)
-    for before, car in zip((Car(), *cars), cars, strict=False):
-        board.transmitter(1700, before.numbers[6])
-        board.run_ms(rng.uniform(260, 280))
-        start = len(board.events)
-        told(board, car)
-        board.run_ms(100)
-        # The very next throttle pulse may be the human's last; from then on it is one neutral or the other.
-        after = [e for e in board.events[start:] if e.kind == 1 and e.channel == 1]
-        neutrals = before.numbers[6], car.numbers[6]
-        assert all(min(abs(e.pulse_us - us) for us in (*neutrals, 124)) <= STEP_US for e in after[10:])
-        assert abs(after[-1].pulse_us - car.numbers[6]) <= STEP_US
-        short = 0.9 * min(e.pulse_us for e in after if e.pulse_us > 100)
-        assert all(e.pulse_us > short for e in after)
-        for e in pulses(board.events[start:], "steering"):
-            assert min(abs(e.pulse_us - us) for us in (1700, 1456, 1500)) <= STEP_US
-        board.run_ms(80)
-        periods = [e.period_us for e in pulses(board.events, "steering")[-2:]]
-        assert all(abs(us - car.numbers[0]) <= EDGE_US for us in periods)
-    board.close()
-
-
-def test_the_clock_is_true_through_changes_of_the_period():
-    board = Uno()
-    board.run_ms(50)
-    for car in (CRAWLER, Car(), CRAWLER, INVERTED, CRAWLER):
-        told(board, car)
-        board.run_ms(333)
-        assert board.now_us / 1000 - 35 <= board.status.uptime_ms <= board.now_us / 1000
-    board.close()
-
-
-def test_a_turn_of_the_loop_takes_less_than_two_milliseconds(armed):
-    """Telling a car is the longest line that there is."""
-    armed.watch_loop()
-    for n in range(30):
-        armed.command("C", *armed.car.numbers)
-        armed.command("D", armed.neutral.steering + n, armed.neutral.throttle + n)
-        armed.run_ms(25)
-    assert (armed.status.state, armed.status.lost) == ("A", 0)
-    print(f"the loop's longest turn takes {armed.longest_ms:.2f} ms")
-    assert 0.1 < armed.longest_ms < 2
-
-
-def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(armed):
-    armed.command("N")
-    rng = random.Random(5)
-    errors = []
-    for _ in range(200):
-        steering_us = rng.uniform(1010, 1940)
-        sticks(armed, steering_us, rng.uniform(*((1010, 1990) if armed.car.reverses else (120, 700))))
-        for _ in range(6):
-            armed.command("N")
-            armed.run_ms(rng.uniform(9, 12))
-        errors.append(armed.status.receiver_steering_us - steering_us)
-    assert max(map(abs, errors)) <= STEP_US + 0.5

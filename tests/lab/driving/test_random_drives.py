@@ -85,7 +85,7 @@ def test_a_planted_fault_of_the_firmware_is_found(tmp_path, monkeypatch, invaria
     source.write_text(text.replace(good, bad))
     monkeypatch.setattr(loop, "LATE_S", 99.0)  # the host's own limit, which would hide that the firmware has none
     virtual.compile_sketch(tmp_path / "firmware", tmp_path)
-    monkeypatch.setattr(virtual, "library", lambda: tmp_path / virtual.LIBRARY)
+    monkeypatch.setattr(virtual, "library", lambda human: tmp_path / virtual.LIBRARY)
     found = list(broken(drive_story(KEPT[story][0] if isinstance(story, str) else story)))
     assert any(sentence.startswith(f"{invariant}: ") for sentence in found), found
 
@@ -125,4 +125,4 @@ def test_every_happening_is_in_some_story():
 def test_the_command(tmp_path):
     done = CliRunner().invoke(main, ["random", str(tmp_path / "random.json"), "--drives", "3", "--jobs", "1"])
     assert done.exit_code == 0, done.output
-    assert "firmware_transitions" in (tmp_path / "random.json").read_text()
+    assert "firmware_states" in (tmp_path / "random.json").read_text()

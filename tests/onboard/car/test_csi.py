@@ -6,8 +6,8 @@ import time
 import cv2
 import numpy as np
 import pytest
+import rpicam_vid
 
-from lab.driving import rpicam_vid
 from rover_lib.onboard.car.camera import Camera, CameraError
 from rover_lib.onboard.car.csi import command, is_csi
 from rover_lib.onboard.care.doctor import camera_rate

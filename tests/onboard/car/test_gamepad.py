@@ -5,8 +5,8 @@ import time
 from functools import partial
 
 import pytest
+from virtual_gamepad import VirtualGamepad, open_virtual
 
-from lab.driving.virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of

@@ -1,19 +1,13 @@
 """A gamepad made of two FIFOs that speak struct input_event, where the kernel has no uinput."""
 
 import contextlib
-import math
 import os
 import threading
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from lab.driving.pins import CAR
 from lab.driving.priority import boost
-from rover_lib.onboard.car import servo_link
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DEAD, EVENT, KEY, STEERING, SYN, THROTTLE, Gamepad, Stick
-from rover_lib.onboard.car.servo_link import State, Telemetry
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, EVENT, KEY, STEERING, SYN, THROTTLE, Gamepad, Stick
 
 FULL = 32767
 EVERY_S = 0.004  # between two reports of its motion sensors
@@ -97,62 +91,7 @@ class VirtualGamepad:
             self._write(self._motion, (ABS, 0, value))
 
 
-class GamepadHuman:
-    """Who holds the gamepad, as an EmulatedArduino's human holds a transmitter. A context manager.
-
-    status: returns the Arduino's newest. Whoever holds L1 presses it again when the Arduino says that it has no signal,
-    and whoever is ready wiggles when only that is missing. A car that is armed is left alone.
-    """
-
-    def __init__(self, pad: VirtualGamepad, status: Callable[[], Telemetry | None]):
-        self.pad, self._status = pad, status
-        self._holds = self._ready = False
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> "GamepadHuman":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def transmitter(self, steering_us: float, throttle_us: float) -> None:
-        """Hold L1, and move the sticks to where the Arduino gets these pulses; with a 0, let go of L1."""
-        held = bool(steering_us and throttle_us)
-        if held:
-            actions = CAR.pwm.actions_from_pulses(steering_us, throttle_us)
-            moved = -CAR.left * (actions.steering or 0.0), (actions.throttle or 0.0) / CAR.cap
-            self.pad.move(*(math.copysign(DEAD + (1 - DEAD) * min(abs(x), 1.0), x) if x else 0.0 for x in moved))
-        if held != self._holds:
-            self._holds = held
-            self.pad.hold(held)
-
-    def ready(self, ready: bool) -> None:
-        """Set whether they wiggle the stick unasked."""
-        self._ready = ready
-
-    def _run(self) -> None:
-        boost(threading.get_native_id())
-        while not self._over.wait(0.02):
-            status = self._status()
-            if not status or status.state is State.AUTONOMOUS:
-                continue
-            if status.missing == "s" and self._holds:
-                self.pad.hold(False)
-                self.pad.hold(True)
-                self._over.wait(0.3)
-            elif status.missing == "w" and self._ready:
-                self.pad.wiggle()
-
-
 def open_virtual(folder: Path) -> Gamepad:
     """Open it as open_gamepad() opens a real one."""
     pad, motion = (os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK) for name in ("pad", "motion"))
     return Gamepad("virtual", pad, motion, {axis: Stick(-FULL, FULL) for axis in (STEERING, THROTTLE)})
-
-
-def plug_in(folder: Path | str) -> None:
-    """Make it the gamepad of each ServoLink of this process."""
-    servo_link.open_gamepad = partial(open_virtual, Path(folder))

@@ -1,0 +1,170 @@
+"""The faults that docs/safety.md names, in virtual time; and two of those on pins."""
+
+import logging
+import re
+from dataclasses import replace
+
+import needs
+import pytest
+from click.testing import CliRunner
+
+from lab.__main__ import main
+from lab.arduino.emulator import REPOSITORY
+from lab.driving import faults
+from lab.driving.on_pins import PIN_ROWS, FaultError
+from lab.driving.pins import CONTINUES, REFUSED, STOPPED
+from lab.driving.rows import all_rows, rows_of, run_row
+from lab.driving.stories import KEPT
+from lab.driving.virtual import LOST, STUCK, World
+from lab.driving.virtual_host import VirtualLink
+from rover_lib.onboard.car.car import Car, read_car
+from rover_lib.onboard.car.servo_link import LinkError, State
+from rover_lib.onboard.stage import read_stage
+
+SAFETY = (REPOSITORY / "docs" / "safety.md").read_text()
+CARS = REPOSITORY / "lab" / "cars"
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog):
+    caplog.set_level(logging.CRITICAL)  # the link warns of what is broken here on purpose
+
+
+@needs.gcc
+@pytest.mark.parametrize(
+    "row",
+    [pytest.param(r, id=r.name, marks=() if f"`{r.name}`" in SAFETY else pytest.mark.slow) for r in rows_of(Car())],
+)
+def test_a_fault_ends_as_it_should(row):
+    assert run_row(row)["wrong"] == []
+
+
+@needs.gcc
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["crawler", "inverted", "gamepad"])
+def test_they_end_so_on_other_cars(name):
+    car = read_car(CARS / f"{name}.yml")
+    rows = [run_row(row, car) for row in rows_of(car)]
+    assert {row["fault"]: row["wrong"] for row in rows if row["wrong"]} == {}
+    assert len(rows) > 60
+
+
+@needs.gcc
+@pytest.mark.parametrize(
+    ("name", "expected"), [("frames late", STOPPED), ("receiver lost", CONTINUES), ("camera frozen", REFUSED)]
+)
+def test_a_fault_that_ends_otherwise_is_wrong(name, expected):
+    assert run_row(replace(all_rows()[name], expected=expected))["wrong"]
+
+
+def test_every_row_is_judged_and_there_are_enough():
+    gates = faults.Gates.of_params()
+    here = rows_of(Car())
+    assert len(here) >= gates.rows and sum(row.expected == STOPPED for row in here) >= gates.stopped_rows
+    assert len(PIN_ROWS) == len({row.name for row in PIN_ROWS}) == 12
+
+
+def test_what_proves_safety_exists():
+    """Each name in the last column of the page's tables is a row, a kept story, or a test."""
+    rows = [line.split("|") for line in SAFETY.splitlines() if line.startswith("| ") and "proven by" not in line]
+    tests = {
+        name
+        for path in (REPOSITORY / "tests").rglob("test_*.py")
+        for name in re.findall(r"def (test_\w+)", path.read_text())
+    }
+    for cell in (row[-2] for row in rows):
+        names = re.findall(r"`([^`]+)`", cell)
+        assert names, f"a hazard that nothing proves: {cell}"
+        assert set(names) <= all_rows().keys() | {row.name for row in PIN_ROWS} | KEPT.keys() | tests
+
+
+# ---- a gamepad's human, without a drive
+
+
+class Relay:
+    """An open link with a gamepad, whose human holds L1."""
+
+    def __init__(self):
+        self.world = World(car=Car(human="gamepad"))
+        self.link = VirtualLink(self.world)
+        self.link.open()
+        self.does(0.3)
+
+    def does(self, seconds, steering_us=0, throttle_us=0, **hand):
+        """Let the human hold the sticks so (from rest) and return the throttle's pulses."""
+        vars(self.world.hand).update(hand, sticks=[1456 + steering_us, 120 + throttle_us])
+        self.world.handle()
+        begin_ms = self.world.now_ms
+        self.world.sleep(seconds)
+        events = self.world.board.events()
+        return [event.throttle_us for ms, event in events if ms >= begin_ms - self.world._started_ms]
+
+    def wiggles(self):
+        for steering_us in (300, -300, 0):
+            self.does(0.12, steering_us)
+        self.does(1.1)
+
+    def refused(self):
+        with pytest.raises(LinkError) as refusal:
+            self.link.arm()
+        return str(refusal.value)
+
+
+@pytest.fixture
+def relay():
+    relay = Relay()
+    yield relay
+    relay.link.close()
+    relay.world.close()
+
+
+@needs.gcc
+@pytest.mark.parametrize("fault", [{"receiver": LOST}, {"pad": "pulled out"}, {"pad": "out of reach"}])
+def test_a_human_at_full_throttle_who_is_lost_stops(relay, fault):
+    assert relay.does(0.5, 100, 591)[-1] == 238  # the cap
+    relay.does(0.2, 100, 591, **fault)
+    assert set(relay.does(1.0, 100, 591)) <= {120}
+    if "receiver" in fault:  # a stick that is stuck gives no throttle to whoever presses L1 again
+        assert set(relay.does(0.5, 100, 591, receiver="live")) <= {120}
+        relay.does(0.3)
+        assert relay.does(0.5, 0, 100)[-1] == 220
+
+
+@needs.gcc
+def test_nothing_arms_it_unattended(relay):
+    relay.does(0.5, receiver=LOST)
+    relay.wiggles()
+    assert "hold L1" in relay.refused()
+    relay.does(0.6, receiver="live", pad=STUCK)  # held since before
+    assert "hold L1" in relay.refused()
+    relay.does(0.3, receiver=LOST, pad="")
+    relay.does(0.6, receiver="live")  # a press that is seen, and no gesture
+    assert "wiggled" in relay.refused()
+    relay.wiggles()
+    relay.does(0.3, receiver=LOST)  # the gesture is over with it
+    relay.does(0.6, receiver="live")
+    assert "wiggled" in relay.refused()
+    relay.wiggles()
+    assert relay.link.arm().state is State.AUTONOMOUS
+
+
+# ---- the command
+
+
+def test_a_fault_that_is_none():
+    done = CliRunner().invoke(main, ["faults", "--only", "camera melted"])
+    assert done.exit_code == 1 and "camera melted" in done.output
+    with pytest.raises(FaultError):
+        faults.run_faults(kinds=["weather"])
+
+
+@pytest.mark.emulated
+@needs.simavr
+def test_some_faults_in_the_command(tmp_path):
+    """Two on the pins, of which one's line only the next start writes; `make faults` has all."""
+    names = ["camera frozen", "Arduino loop hung", "SIGKILL"]
+    done = CliRunner().invoke(main, ["faults", str(tmp_path / "f.json"), *(f"--only={name}" for name in names)])
+    assert done.exit_code == 0, done.output
+    rows = {row["fault"]: row for row in read_stage(tmp_path / "f.json", "faults")["metrics"]["faults"]}
+    assert set(rows) == set(names) and all(row["recovered"] and row["log_line"] for row in rows.values())
+    assert rows["SIGKILL"]["stopped_after_ms"] > 50  # it is the Arduino that stops
