@@ -40,7 +40,7 @@ def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> 
         del report[name]  # too long to print; the file has them
     show({done: report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
-        from rover_lib.onboard.care.release import Expected
+        from rover_lib.onboard.artifact.acceptance import Expected
 
         if (frames := report["frames_in_a_usual_episode"]) < Expected.chunk:
             click.echo(

@@ -10,14 +10,12 @@ import json
 import os
 import pickle
 import resource
-import shutil
 import signal
 import struct
 import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +25,9 @@ from archives import Edit, manifest_with, rewritten, vectors_with
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
+from rover_lib.onboard.artifact.acceptance import Expected
 from rover_lib.onboard.car.host import Host
-from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, check_signature, pack, sign
+from rover_lib.onboard.care.release import Releases
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.policy.confine import confine, memory_mb
 from rover_lib.onboard.policy.torch_engine import (
@@ -67,7 +66,7 @@ def judge(path: Path, folder: Path, proof: bool) -> tuple[bool, str, float, floa
     before_mb, start, staged, sentence = Host().process_peak_memory_mb(), own_s(), False, ""
     try:
         releases = Releases(folder / "models", expected=EITHER)
-        name = releases.stage(path, unsigned=True).name
+        name = releases.stage(path).name
         staged = True
         if proof:
             confine(memory_mb(path, 1))
@@ -470,57 +469,14 @@ def a_fifo(path: Path) -> None:
     [
         (a_fifo, "not a file"),
         (lambda path: path.symlink_to("/dev/zero"), "not a file"),
-        (Path.mkdir, "not what 'rover release pack' writes"),
-        (lambda path: path.symlink_to("nothing"), "not found"),
+        (Path.mkdir, "not a file"),
+        (lambda path: path.symlink_to("nothing"), "not a file"),
     ],
     ids=["a FIFO", "a device", "an empty folder", "nothing"],
 )
 def test_what_is_no_artifact_is_not_waited_for(tmp_path, refused, make, message):
     make(tmp_path / "x")
     refused(tmp_path / "x", message)
-
-
-def replaced_by(make: Callable[[Path], object]) -> Callable[[Path], None]:
-    def replace(path: Path) -> None:
-        path.unlink()
-        make(path)
-
-    return replace
-
-
-def describes(**values: object) -> Callable[[Path], None]:
-    return lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | values)) and None
-
-
-PACKED = {
-    "a policy that is a FIFO": ("policy.pt", replaced_by(a_fifo), "not a file"),
-    "a policy without end": ("policy.pt", replaced_by(lambda p: p.symlink_to("/dev/zero")), "not a file"),
-    "a policy that is larger": ("policy.pt", lambda p: p.write_bytes(bytes(50 << 20)), "larger than it can be"),
-    "a description that is a FIFO": ("release.json", replaced_by(a_fifo), "not what 'rover release pack' writes"),
-    "a deep description": (
-        "release.json",
-        lambda p: p.write_text("[" * 90_000),
-        "not what 'rover release pack' writes",
-    ),
-    "a long description": ("release.json", lambda p: p.write_text(" " * 9_000_000), "not what 'rover release pack'"),
-    "a terabyte": ("release.json", describes(bytes=10**12), "its size is impossible"),
-    "less than nothing": ("release.json", describes(bytes=-1), "its size is impossible"),
-    "fewer bytes than there are": ("release.json", describes(bytes=1000), "larger than it can be"),
-    "another name": ("release.json", describes(name="../../harm"), "its name or sha256 is not a hash"),
-    "a terminal's commands": (
-        "release.json",
-        describes(origin={"file": "\x1b[2J", "host": ""}),
-        "its origin is not printable text",
-    ),
-}
-
-
-@pytest.mark.parametrize("what", PACKED)
-def test_nothing_packed_in_another_form_is_staged(artifacts, tmp_path, refused, what):
-    name, change, message = PACKED[what]
-    pack(artifacts["fp32"], tmp_path / "packed", EITHER)
-    change(tmp_path / "packed" / name)
-    refused(tmp_path / "packed", message)
 
 
 def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifacts, tmp_path):
@@ -532,116 +488,6 @@ def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifa
         changes = {program.removeprefix("archive/"): lambda raw, name=name: raw.replace(b"input", name, 1)}
         hashes.add(artifact.content_hash(rewritten(artifacts["static"], tmp_path / "other.pt", changes)))
     assert len(hashes) == 4
-
-
-# Signatures
-
-
-def signed_by_another(path: Path, keys: Path) -> None:
-    Path(f"{path}.sig").write_bytes(sign(path, keys / "theirs"))
-
-
-def signed_for_another_purpose(path: Path, keys: Path) -> None:
-    subprocess.run(["ssh-keygen", "-q", "-Y", "sign", "-n", "file", "-f", keys / "ours", path], check=True)
-
-
-def changed_where_no_hash_looks(path: Path, keys: Path) -> None:
-    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
-    other = rewritten(path, path.with_name("other.pt"), {"serialization_id": lambda raw: raw[::-1]})
-    assert artifact.content_hash(other) == artifact.content_hash(path)
-    other.replace(path)
-
-
-def cut_short(path: Path, keys: Path) -> None:
-    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours")[:-60])
-
-
-def a_signature_that_is_a_fifo(path: Path, keys: Path) -> None:
-    os.mkfifo(f"{path}.sig")
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [lambda path, keys: None, signed_by_another, signed_for_another_purpose, changed_where_no_hash_looks, cut_short,
-     a_signature_that_is_a_fifo],
-)  # fmt: skip
-def test_a_rover_takes_only_what_its_own_laptops_signed(artifacts, tmp_path, keys, spoil):
-    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
-    spoil(path, keys)
-    releases = Releases(tmp_path / "models", signers=keys / "signers")
-    with pytest.raises(ReleaseError, match=r"not signed.*; deploy it from a laptop that has provisioned this rover"):
-        releases.stage(path)
-    assert not releases.all()
-    Path(f"{path}.sig").unlink(missing_ok=True)
-    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
-    name = releases.stage(path).name
-    check_signature(releases.path_of(name), releases.path_of(name).with_name("policy.pt.sig"), keys / "signers")
-    assert [r.signed for r in releases.all()] == [True]
-
-
-def test_a_rover_without_signers_takes_nothing_unless_it_is_told_to(artifacts, tmp_path, keys):
-    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
-    Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
-    releases = Releases(tmp_path / "models", signers=tmp_path / "none")
-    with pytest.raises(ReleaseError, match=r"this rover knows no laptop.* or say --unsigned"):
-        releases.stage(path)
-    releases.stage(path, unsigned=True)
-    assert [r.signed for r in releases.all()] == [False]
-
-
-def test_what_was_once_taken_unsigned_needs_a_signature_later(artifacts, tmp_path, keys):
-    """It was taken without one, even from a folder with nothing but release.json in it, and switched to."""
-    path = Path(shutil.copy(artifacts["static"], tmp_path / "x.pt"))
-    releases = Releases(tmp_path / "models", signers=keys / "signers", check=lambda name: None)
-    name = releases.stage(path, unsigned=True).name
-    pack(path, tmp_path / "packed")
-    for source in (path, tmp_path / "packed"):
-        with pytest.raises(ReleaseError, match=r"not signed.*--unsigned"):
-            releases.stage(source)
-    with pytest.raises(ReleaseError, match=r"not signed; no model is in use"):
-        releases.switch(name)
-    assert releases.switch(name, unsigned=True)
-    pack(path, tmp_path / "packed", key=keys / "ours")
-    assert vars(releases.stage(tmp_path / "packed")) == {"name": name, "changed": True}
-    assert [r.signed for r in releases.all()] == [True]
-    assert not releases.stage(tmp_path / "packed").changed and not releases.switch(name)
-
-
-def test_a_key_that_is_revoked_is_good_for_no_switch(artifacts, tmp_path, keys):
-    """Its releases stayed usable for ever."""
-    signers = Path(shutil.copy(keys / "signers", tmp_path / "signers"))
-    releases = Releases(tmp_path / "models", signers=signers, check=lambda name: None)
-    names = []
-    for mode in ("static", "fp32"):
-        path = Path(shutil.copy(artifacts[mode], tmp_path / f"{mode}.pt"))
-        Path(f"{path}.sig").write_bytes(sign(path, keys / "ours"))
-        names.append(releases.stage(path, allow=["mode"]).name)
-        releases.switch(names[-1])
-    signers.write_text("")
-    for name in names:
-        with pytest.raises(ReleaseError, match=rf"not signed by a laptop.*{names[1][:12]} stays in use"):
-            releases.switch(name)
-    with pytest.raises(ReleaseError, match="the laptop that signed it is not known any more"):
-        releases.rollback()
-    assert [r.signed for r in releases.all()] == [False, False]
-
-
-@pytest.mark.parametrize("name", ["policy.pt", "policy.pt.sha256", "policy.pt.sig", "release.json"])
-def test_a_pipe_in_a_release_is_not_waited_for(artifacts, tmp_path, name):
-    releases = Releases(tmp_path / "models", check=lambda name: None)
-    release = releases.path_of(releases.stage(artifacts["static"], unsigned=True).name).parent
-    (release / name).unlink(missing_ok=True)
-    os.mkfifo(release / name)
-    with pytest.raises(ReleaseError):
-        releases.switch(release.name)
-    assert bool(releases.all()[0].wrong) is (name != "policy.pt.sig")
-
-
-def test_a_key_that_is_none_signs_nothing(artifacts, tmp_path):
-    (tmp_path / "key").write_text("no key")
-    with pytest.raises(ReleaseError, match="cannot be signed"):
-        pack(artifacts["static"], tmp_path / "packed", key=tmp_path / "key")
-    assert not (tmp_path / "packed").exists()
 
 
 # Root

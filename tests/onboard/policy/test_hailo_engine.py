@@ -12,8 +12,8 @@ from policies import memory_samples
 
 from rover_hailo import compile as hailo_compile
 from rover_lib.onboard.artifact import engines
+from rover_lib.onboard.artifact.acceptance import inspect_artifact
 from rover_lib.onboard.artifact.manifest import content_hash
-from rover_lib.onboard.care.release import ReleaseError, inspect_artifact
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.policy.load import load_policy
@@ -104,5 +104,5 @@ def test_a_chip_that_answers_no_more_is_no_action(packed, monkeypatch):
 
 def test_it_is_an_artifact_and_no_release_yet(packed):
     assert kinds_of(packed["backbone"]) == ("artifact",)
-    with pytest.raises(ReleaseError, match="hailo_platform"):
+    with pytest.raises(ArtifactError, match="hailo_platform"):
         inspect_artifact(packed["backbone"], allow=("camera",))
