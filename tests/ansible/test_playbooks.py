@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -254,27 +255,13 @@ def units(tmp_path) -> Path:
     return tmp_path
 
 
-def analyze(*arguments: object) -> subprocess.CompletedProcess:
-    env = {**os.environ, "SYSTEMD_LOG_LEVEL": "debug"}
-    return subprocess.run(["systemd-analyze", *map(str, arguments)], capture_output=True, text=True, env=env)
+def analyze(*arguments: object) -> None:
+    done = subprocess.run(["systemd-analyze", *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr + done.stdout[-3000:]
 
 
-def verify(unit: Path) -> subprocess.CompletedProcess:
-    return analyze("verify", "--man=no", "--recursive-errors=no", unit)
-
-
-def commands(unit: Path) -> dict[str, list[str]]:
-    """The command lines of a unit, by kind, in words: systemd's own reading, which it prints while it verifies."""
-    found = re.findall(r"-> (Exec\w+):\n\s+Command Line: (.*)", verify(unit).stdout)
-    words = {kind: re.findall(r'"(?:[^"\\]|\\.)*"|\S+', line) for kind, line in found}
-    return {kind: [unquote(word) for word in line] for kind, line in words.items()}
-
-
-def unquote(word: str) -> str:
-    """A word as systemd prints it: in C's way if it needs that; $$ is a $ once it is started."""
-    text = re.sub(r"\\([$`])", r"\1", word.strip('"') if word[0] != '"' else word[1:-1])
-    text = text.encode("latin-1", "backslashreplace").decode("unicode_escape") if "\\" in text else text
-    return text.replace("$$", "$")
+def command(unit: str) -> list[str]:
+    return shlex.split(re.search("^ExecStart=(.*)", unit, re.M)[1])[1:]
 
 
 @pytest.mark.parametrize(
@@ -285,16 +272,8 @@ def unquote(word: str) -> str:
 def test_systemd_understands_the_units_and_finds_them_closed_enough(units, given):
     for name, threshold in EXPOSURE.items():
         (units / name).write_text(render(name, rover_home=units, **given))
-        found = verify(units / name)
-        assert found.returncode == 0, found.stderr
-        found = analyze("security", "--offline=true", f"--threshold={threshold}", "--no-pager", units / name)
-        assert found.returncode == 0, found.stdout[-3000:]
-
-
-def test_systemd_would_not_understand_nonsense(units):
-    (units / DRIVE).write_text((units / DRIVE).read_text().replace("WatchdogSec=2", "WatchdogSec=soon"))
-    found = verify(units / DRIVE)
-    assert re.search(r"rover-drive\.service:\d+: ", found.stdout + found.stderr)
+        analyze("verify", "--man=no", "--recursive-errors=no", units / name)
+        analyze("security", "--offline=true", f"--threshold={threshold}", "--no-pager", units / name)
 
 
 def test_no_unit_lets_root_load_an_artifact_and_no_playbook_runs_one_itself(units):
@@ -318,7 +297,7 @@ def test_the_check_has_the_sandbox_of_the_drive_and_no_more(units):
 
 
 def test_the_units_say_what_the_command_line_takes(units):
-    drive, check, view = (commands(units / name)["ExecStart"][1:] for name in (DRIVE, CHECK, VIEW))
+    drive, check, view = (command((units / name).read_text()) for name in (DRIVE, CHECK, VIEW))
     for words in (drive, view):
         assert CliRunner().invoke(main, [*words, "--help"]).exit_code == 0
         known = {o for p in main.commands[words[0]].params for o in p.opts}
@@ -328,17 +307,11 @@ def test_the_units_say_what_the_command_line_takes(units):
     assert drive[drive.index("--view") + 1] == view[view.index("--feed") + 1]
 
 
-@pytest.mark.parametrize(
-    "value", ["/dev/video0 --throttle-limit 1", "/a\nExecStartPre=+/bin/touch /etc/mine", "$HOME %h \"'\\"]
-)
-def test_a_value_in_the_unit_is_one_word_of_its_command(units, value):
-    """As systemd itself reads it; until then a camera could carry options, and a newline a command for root."""
-    unit = units / DRIVE
-    unit.write_text(render(DRIVE, rover_home=units, rover_camera="CAMERA", rover_port="PORT"))
-    expected = [value if word in ("CAMERA", "PORT") else word for word in commands(unit)["ExecStart"]]
-    before = commands(unit)["ExecStartPre"]
-    unit.write_text(render(DRIVE, rover_home=units, rover_camera=value, rover_port=value))
-    assert commands(unit) == {"ExecStart": expected, "ExecStartPre": before}
+def test_a_value_in_a_unit_is_one_word_of_its_command():
+    """Otherwise a camera could carry options, or a newline a command for root."""
+    words = command(render(DRIVE, rover_camera='/dev/video0 --hz 1\nUser="root"', rover_models="/%h $HOME"))
+    assert words[words.index("--camera") + 1] == '/dev/video0 --hz 1\\nUser="root"'
+    assert words[2] == "/%%h $$HOME/current/policy.pt"  # which systemd reads as one % and one $
 
 
 def test_the_service_may_open_what_its_camera_and_its_human_need_and_no_more():
