@@ -17,7 +17,7 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants pi-fast firmware flash notebooks tables docs clean
+.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
@@ -39,7 +39,7 @@ help:
 	@echo "make faults-cars                            the same on other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
-	@echo "make pi-fast                                every playbook on an emulated Pi in a container: root, Debian 12"
+	@echo "make pi                                     the playbooks on an emulated Pi in a container: root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
 	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
 	@echo "make tables                                 the pages' tables alone"
@@ -106,7 +106,7 @@ check-release: lint $(DEMO)
 	$(MAKE) demo-more
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
-	$(MAKE) faults faults-cars random mutants pi-fast
+	$(MAKE) faults faults-cars random mutants pi
 
 coverage: $(DEMO)
 	$(VENV)/bin/pytest $(PACKAGES:%=--cov=%) --cov-report=term
@@ -130,10 +130,10 @@ random: $(READY)
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
 
-# This deploys the demo's artifacts.
-pi-fast: $(READY)
-	@test -f runs/demo/policy_mixed.pt || $(MAKE) demo
-	$(LAB) pi fast runs/pi-fast.json
+# This deploys the demo's artifact.
+pi: $(READY)
+	@test -f runs/demo/policy_static.pt || $(MAKE) demo
+	$(LAB) pi runs/pi.json
 
 firmware:
 	$(MAKE) -C firmware

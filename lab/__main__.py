@@ -182,46 +182,20 @@ def random_drives(ctx: click.Context, output: Path | None, drives: int, first: i
     _end(ctx, failures)
 
 
-@main.group()
-def pi() -> None:
-    """Test playbooks, the service and its faults on emulated Pis: real Debian arm64 systems. Needs root and Debian."""
-
-
-def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
-    click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
-    _end(ctx, wrong)
-
-
-@pi.command("fast")
-@click.argument("output", type=FILE, default="runs/pi-fast.json")
-@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
-@click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", help="Of the Pi.")
-@click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, and drive.")
-@click.option("--view", is_flag=True, help="With --short: the view's service beside a drive too.")
-@click.option(
-    "--faults/--no-faults",
-    default=True,
-    help="Leave out a deployment's faults, which are met with torch only.",
-)
-@click.option(
-    "--pieces",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Only provision, cut off after each Nth task that changes something.",
-)
+@main.command()
+@click.argument("output", type=FILE, default="runs/pi.json")
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifact is deployed.")
 @click.pass_context
-def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:
-    """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
+def pi(ctx: click.Context, output: Path, demo: Path) -> None:
+    """Provision an emulated Pi in a container, deploy to it, drive it and roll back, by the playbooks.
 
-    The container has real systemd and sshd, aarch64 programs, and the real firmware on an emulated Arduino. Writes
-    OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1 if anything is not as expected.
+    The container has real systemd and sshd, aarch64 programs, and the real firmware on an emulated Arduino. Needs root
+    and Debian 12 or 13. Writes OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1 if anything
+    is not as expected.
     """
-    from lab.pi.container_run import run_container
+    from lab.pi.deployment import deploy_and_drive
 
-    outcome = run_container(output, demo, **options, say=click.echo)
-    for gate in outcome.metrics.get("gates", []):
-        click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
-    _end_pi(ctx, outcome.wrong, output)
+    _end(ctx, deploy_and_drive(output, demo, click.echo).wrong)
 
 
 if __name__ == "__main__":

@@ -549,55 +549,34 @@ def heartbeat() -> None:
     show_default=True,
     help="Width of its pictures divided by their height.",
 )
-@click.option("--signers", type=FILE, help="Keys whose artifacts are accepted [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
-def release(
-    ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, signers: Path | None, sandboxed: bool
-) -> None:
+def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
     """Manage the rover's models: stage them, verify them, use them. A switch happens completely or not at all.
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
     """
-    from rover_lib.onboard.care import release as r
+    from rover_lib.onboard.artifact.acceptance import Expected
+    from rover_lib.onboard.care.release import Releases, check_in_sandbox
 
-    expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
-    ctx.obj = r.Releases(models, check=r.check_in_sandbox if sandboxed else None, expected=expected, signers=signers)
+    expected = Expected(chunk=chunk, camera=camera, aspect=aspect)
+    ctx.obj = Releases(models, check=check_in_sandbox if sandboxed else None, expected=expected)
 
 
-ALLOW = click.option(
+@release.command(short_help="Make a release of an artifact without using it.")
+@click.argument("source", type=ARTIFACT)
+@click.option("--sha256", help="The SHA-256 that the artifact must have.")
+@click.option("--origin", help="Where it came from, for `status` [default: this host and path].")
+@click.option(
     "--allow",
     multiple=True,
     type=click.Choice(["mode", "chunk", "camera", "aspect"]),
     help="Accept an artifact that differs in this.",
 )
-
-
-@release.command(short_help="Sign and describe an artifact for the transfer.")
-@click.argument("artifact", type=ARTIFACT)
-@click.argument("folder", type=FILE)
-@click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
-@ALLOW
 @click.pass_obj
-def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
-    """Put ARTIFACT into FOLDER for the transfer, signed and described. Refuses what the rover would refuse."""
-    from rover_lib.onboard.care.release import pack as pack_release
-
-    show(pack_release(artifact, folder, releases.expected, allow, sign_key), True)
-
-
-UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
-
-
-@release.command(short_help="Make a release of an artifact without using it.")
-@click.argument("source", type=FILE)
-@click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@UNSIGNED
-@ALLOW
-@click.pass_obj
-def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
-    """Make a release of SOURCE, an artifact or what `pack` wrote. The release in use stays in use."""
-    show(vars(releases.stage(source, sha256=sha256, allow=allow, unsigned=unsigned)), True)
+def stage(releases: Any, source: Path, **options: Any) -> None:
+    """Make a release of the artifact SOURCE. The release in use stays in use."""
+    show(vars(releases.stage(source, **options)), True)
 
 
 @release.command(short_help="Verify that a release computes what it should.")
@@ -618,16 +597,15 @@ def verify(releases: Any, name: str, confined: bool) -> None:
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
             click.echo(f"rover: not confined: {unconfined}", err=True)
     releases.check(name)
-    click.echo(f"{name}: whole, and computes what it should")
+    click.echo(f"{name}: verified")
 
 
 @release.command(short_help="Use a release from now on.")
 @click.argument("name")
-@UNSIGNED
 @click.pass_obj
-def switch(releases: Any, name: str, unsigned: bool) -> None:
+def switch(releases: Any, name: str) -> None:
     """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
-    show({"name": name, "changed": releases.switch(name, unsigned=unsigned)}, True)
+    show({"name": name, "changed": releases.switch(name)}, True)
 
 
 @release.command(short_help="Go back to the release before the one in use.")
@@ -666,10 +644,8 @@ def status(releases: Any, as_json: bool) -> None:
         report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
         return show(report, True)
     for r in report["releases"]:
-        mark, unsigned = "*" if r["current"] else " ", "" if r["signed"] else ", not signed"
-        click.echo(
-            f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}{unsigned}"
-        )
+        mark = "*" if r["current"] else " "
+        click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
     if not report["healthy"]:
         raise RoverError(report["trouble"])
 

@@ -81,7 +81,7 @@ WRONG = [
     ("world trial best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run CHECKPOINT"),
     ("log policy_static.pt", "policy_static.pt: this is an artifact", "rover drive wrote"),
     ("log notes.txt", "notes.txt: this is a document", "that it describes"),
-    ("release pack best_model.pth parts", "best_model.pth: this is a trainer's checkpoint", "rover run"),
+    ("release stage best_model.pth", "best_model.pth: this is a trainer's checkpoint", "rover run"),
     ("inspect damaged.zip", "damaged.zip", ";"),
     # wrong folder
     ("run runs/mine episodes", "runs/mine: this is a run's folder", "load.json names"),

@@ -12,7 +12,7 @@ there is an artifact to deploy whenever the policy itself drives. `advice` says 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rover_lib.onboard.care.release import MAY_DIFFER
+from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
 from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import advice
 from rover_lib.workshop.judge import recorded_range as judge

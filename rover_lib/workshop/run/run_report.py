@@ -16,8 +16,8 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup, escape
 
+from rover_lib.onboard.artifact.acceptance import THIS_CAR
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.release import THIS_CAR
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params

@@ -13,7 +13,7 @@ from policies import memory_samples
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
-from rover_lib.onboard.care.release import pack
+from rover_lib.onboard.artifact.acceptance import inspect_artifact
 from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
 from rover_lib.onboard.policy import memory
 
@@ -71,7 +71,7 @@ def test_equals_the_policy_it_was_made_of(thin, artifacts):
 
 
 @pytest.mark.slow
-def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
+def test_a_policy_of_gelu_drives_and_is_accepted(tiny, tmp_path):
     """If an operator has changed since it was new, as gelu has, torch names a record of its archive differently."""
     from rover_lib.workshop.act import ACT, inputs_of
     from rover_lib.workshop.int8.export import export
@@ -84,7 +84,7 @@ def test_a_policy_of_gelu_drives_and_is_packed(tiny, tmp_path):
     with torch.inference_mode():
         expected = model(*inputs_of(sample, other.config))[0].numpy()
     assert np.abs(found - expected).max() < 1e-5
-    pack(path, tmp_path / "packed", allow=("mode",))
+    inspect_artifact(path, allow=("mode",))
 
 
 @pytest.mark.parametrize(

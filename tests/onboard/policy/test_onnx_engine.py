@@ -10,9 +10,10 @@ from archives import manifest_with, rewritten, vectors_with
 from policies import memory_samples
 
 from rover_lib.onboard import load_policy
+from rover_lib.onboard.artifact.acceptance import inspect_artifact
 from rover_lib.onboard.artifact.archive import ONNX, open_archive, read_record
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.release import Expected, ReleaseError, Releases, pack
+from rover_lib.onboard.care.release import Releases
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
@@ -80,9 +81,8 @@ def test_runs_confined_in_a_process_of_its_own(onnx_static):
 
 
 def test_is_released_like_the_other(onnx_static, tmp_path):
-    pack(onnx_static, tmp_path / "packed")
-    releases = Releases(tmp_path / "models", expected=Expected())
-    name = releases.stage(tmp_path / "packed", unsigned=True).name
+    releases = Releases(tmp_path / "models")
+    name = releases.stage(onnx_static).name
     releases.verify(name)
     assert name == content_hash(onnx_static)
 
@@ -101,9 +101,9 @@ def test_says_what_to_install(onnx_static, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.delitem(sys.modules, "rover_lib.onboard.policy.onnx_engine", raising=False)
     assert "install onnxruntime, or use an artifact of another engine" in refused(onnx_static)
-    monkeypatch.setattr("rover_lib.onboard.care.release.version_of", lambda package: None)
-    with pytest.raises(ReleaseError, match="it needs onnxruntime, which is not installed here"):
-        pack(onnx_static, tmp_path / "packed")
+    monkeypatch.setattr("rover_lib.onboard.artifact.acceptance.version_of", lambda package: None)
+    with pytest.raises(ArtifactError, match="it needs onnxruntime, which is not installed here"):
+        inspect_artifact(onnx_static)
 
 
 def test_a_changed_weight_is_seen(onnx_static, tmp_path):
