@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rover_lib.onboard.care.release import MAY_DIFFER
+from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED
 

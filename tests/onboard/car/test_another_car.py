@@ -16,12 +16,12 @@ from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.cli import main
-from rover_lib.onboard.drive.drive import another_car, arm_capped
-from rover_lib.onboard.drive.pilot import ReplayPilot
+from rover_lib.onboard.drive.arming import arm_capped
+from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import About, Controls, EpisodeWriter, read_car_of, read_controls
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of, read_controls
 from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples
@@ -126,14 +126,6 @@ def test_plans_with_reverse():
     assert follower.command(0.0).throttle == 0.0  # the first car has no reverse
 
 
-def test_a_replay_with_reverse_is_limited_on_both_sides():
-    controls = Controls(np.arange(4) / 30, np.array([1500] * 4), np.array([1000, 1450, 1550, 2000]), 0)
-    pilot = ReplayPilot(controls, throttle_limit=0.2, calibration=CRAWLER.pwm)
-    sent = [pilot.order(n / 30).throttle_us for n in range(4)]
-    assert sent == [1400, 1450, 1550, 1600]
-    assert pilot.most_throttle == pytest.approx(0.2)
-
-
 class Link:
     calibration = CRAWLER.pwm
 
@@ -150,10 +142,10 @@ class Link:
 
 def test_the_cap_of_a_car_with_reverse():
     said = []
-    assert arm_capped(Link(1600), 0.2, 0.2, said.append) == "armed"
+    assert arm_capped(Link(1600), 0.2, said.append) == "armed"
     assert not said
     link = Link(1550)
-    arm_capped(link, 0.2, 0.2, said.append)
+    arm_capped(link, 0.2, said.append)
     assert abs(link.lowered[0] - 1500) == 100
     assert "at most throttle 0.10 (1550 us)" in said[0]
 
@@ -164,13 +156,6 @@ def crawler_here(monkeypatch, tmp_path):
     path.write_text(yaml_of(CRAWLER))
     monkeypatch.setenv(car_module.FILE_VARIABLE, str(path))
     return path
-
-
-def test_a_replay_of_another_cars_pulses_is_refused(crawler_here, tmp_path):
-    folder = episode(tmp_path / "episodes", Car())
-    done = CliRunner().invoke(main, ["drive", "--replay", str(folder), "--dry-run", "--log", str(tmp_path / "log")])
-    assert done.exit_code == 1
-    assert "its pulses are of another car" in done.output
 
 
 def test_a_bad_car_file_ends_in_one_sentence(monkeypatch, tmp_path):
