@@ -17,7 +17,7 @@ Its disk is a layer over folders that stay as they are, so that many containers 
 Its systemd is this machine's own program, of the same version, so everything that makes a service's sandbox is real.
 All other programs are aarch64. A container has no kernel of its own, so it has no udev, no V4L2 camera (a FIFO of JPEGs
 replaces it) and no time of its own. This machine's kernel gets every write at once, so a power cut ends all programs at
-one moment, but no write that was not synced is lost. The whole machine (machine.py) has all that.
+one moment, but no write that was not synced is lost.
 """
 
 import ast

@@ -6,13 +6,12 @@ It goes from a flashed card to a driving service: provision, twice and in check 
 a second model, rollback. Then it proves what is installed, what the service's sandbox lets through, what systemd does
 if a loop hangs, if the camera is gone, and at boot, and how a Pi camera and a gamepad end a drive. The Pi is a
 container (container.py); its Arduino is the real firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's
-packages come from the network by this machine's own settings, as they would for a newcomer. Provisioning without
-internet is tested in the whole machine (`make pi`).
+packages come from the network by this machine's own settings, as they would for a newcomer.
 
 Times of the emulated programs say nothing about a Pi: they are some ten times slower. systemd and the Arduino take
 their real time. An INT8 plan takes half a second here, which is too long to drive by. So the small policy of the fault
 bench drives, deployed like any other, at HZ. The INT8 policy is deployed, proven by its parity vectors in the service's
-sandbox, loaded by the service until it could drive, and timed. It drives in `make pi`, whose clock is slower.
+sandbox, loaded by the service until it could drive, and timed.
 
 runs/pi-fast.json is a stage "pi-fast" (onboard/stage.py). Its metrics:
     steps          [{step, seconds, ok, ...}], for a playbook also play and recap (Ansible's counts by host)

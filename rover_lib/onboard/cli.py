@@ -711,7 +711,7 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of rover_look, or
+    opened: called with its URL. shown: what is shown instead of the drives that connect:
     balloon_world's Simulation, whose `ask` gets what is asked for on the page.
     """
     import asyncio
@@ -727,7 +727,6 @@ def open_view(
         token,
         place,
         drive_user=drive_user,
-        replay=shown is not None and ask is None,
         car=shown and shown.car,
         ask=ask,
     )

@@ -99,9 +99,9 @@ def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "A
     """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
 
     weights: all of them, by LeRobot's names without the leading `model.`; copied, as float32. None: random ones, which
-    take most of the time.
+    take most of the time. Empty: none, on torch's meta device.
     """
-    # Imported here, because it takes ten seconds, and code that only reads or quantizes a checkpoint does not need it.
+    # Imported here, because it takes seconds, and code that only quantizes or exports does not need it.
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -133,8 +133,14 @@ def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "A
         return ACTPolicy(config)
     with torch.device("meta"):
         policy = ACTPolicy(config)
-    policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
+    if weights:
+        policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
     return policy
+
+
+def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
+    """Return the name and shape of every weight that LeRobot's ACT of this config has."""
+    return {name: tuple(w.shape) for name, w in lerobot_act(c, {}).model.state_dict().items()}
 
 
 def positions_2d(dim: int, h: int, w: int) -> Tensor:

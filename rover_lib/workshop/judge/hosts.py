@@ -18,7 +18,7 @@ from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
-CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # written by `python -m lab clock`
+CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # its program: commit 545214c
 SAME_WORK = 0.01
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 

@@ -5,7 +5,6 @@
 The copy is a run like any other: `rover report runs/try1` judges it again, and `rover list` says whether it must.
 """
 
-import json
 import os
 import re
 import shutil
@@ -36,9 +35,8 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     with build_beside(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
-        own = "run_dir = " + json.dumps(json.dumps(str(folder)))[1:-1]
-        for path in new.glob("*.ipynb"):  # whatever folder papermill wrote there: the run may have been moved since
-            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', lambda _: own, path.read_text()))
+        for path in new.glob("*.ipynb"):  # earlier versions wrote the run's own folder into them
+            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', r"run_dir = \".\"", path.read_text()))
     return folder
 
 

@@ -11,7 +11,7 @@ from archives import rewritten
 from hailo_kit import normalised
 from policies import memory_samples
 
-from rover_hailo import compile as hailo_compile
+from rover_exchange.hailo import compile as hailo_compile
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy

@@ -70,7 +70,7 @@ def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
 def test_sizes_are_refused_before_any_recording_is_read(tiny, monkeypatch):
     """Plans of a million steps, in a file of a few megabytes, would fill the memory with the samples of a drive."""
     long = replace(tiny, config=replace(tiny.config, chunk=1_000_000))
-    monkeypatch.setattr(session, "load_checkpoint", lambda path: long)
+    monkeypatch.setattr(session, "load_checkpoint", lambda *_: long)
     monkeypatch.setattr(session, "load_recordings", lambda *given: pytest.fail("they were read"))
     with pytest.raises(CheckpointError, match=r"from 1 to 256, found 1e\+06"):
         load(long.path, "episodes")
@@ -78,6 +78,6 @@ def test_sizes_are_refused_before_any_recording_is_read(tiny, monkeypatch):
 
 def test_a_rate_of_the_recordings_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
     slow = replace(tiny, config=replace(tiny.config, rate_hz=2.0))
-    monkeypatch.setattr(session, "load_checkpoint", lambda path: slow)
+    monkeypatch.setattr(session, "load_checkpoint", lambda *_: slow)
     with pytest.raises(CheckpointError, match="from 5 to 120, found 2"):
         load(slow.path, record_drives(tmp_path / "episodes", frames=300))

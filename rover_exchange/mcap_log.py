@@ -13,51 +13,34 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from rover_exchange.moments import began_s, find_recording, pictures_of
 from rover_lib.onboard.car.picture import PictureError, read_jpeg
 from rover_lib.onboard.drive.flight_log import Flight, Tick
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS, DRIVERS, json_controls, number_of
 from rover_lib.onboard.stage import atomic_path, plain
-from rover_look.replay import began_s, find_recording, pictures_of
 
 TICK, EVENT, MACHINE, CONTROL, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/control", "/camera")
 INFO = 2  # a level of foxglove.Log
 MOST_S = 1.8e10  # the latest time: MCAP counts nanoseconds in 64 bits
+TICK_TEXTS = ("state", "reason")
 _NUMBER = {"type": ["number", "null"]}
 _TEXT = {"type": ["string", "null"]}
-_TIME = {"type": "object", "title": "time", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
+_WORD, _WHOLE = {"type": "string"}, {"type": "integer"}
+_TIME = {"type": "object", "title": "time", "properties": {"sec": _WHOLE, "nsec": _WHOLE}}
+_LOG = {"timestamp": _TIME, "level": _WHOLE, "message": _WORD, "name": _WORD, "file": _WORD, "line": _WHOLE}
+_IMAGE = {"timestamp": _TIME, "frame_id": _WORD, "format": _WORD, "data": {**_WORD, "contentEncoding": "base64"}}
+SCHEMAS = {  # by topic: the schema's name, and its properties
+    TICK: ("rover.Tick", {name: _TEXT if name in TICK_TEXTS else _NUMBER for name in Tick._fields}),
+    EVENT: ("foxglove.Log", _LOG),
+    MACHINE: ("rover.Machine", {"temperature_c": _NUMBER, "throttled": _TEXT}),
+    CONTROL: ("rover.Control", {**dict.fromkeys(CONTROL_FIELDS, _NUMBER), "driver": {"enum": [*DRIVERS, None]}}),
+    PICTURE: ("foxglove.CompressedImage", _IMAGE),
+}
 
-
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-_TICK_TEXTS = ("state", "reason")
-SCHEMAS = {  # by topic: the schema's name, and the schema
-    TICK: ("rover.Tick", _object(**{name: _TEXT if name in _TICK_TEXTS else _NUMBER for name in Tick._fields})),
-    EVENT: (
-        "foxglove.Log",
-        _object(timestamp=_TIME, level={"type": "integer"}, message={"type": "string"}, name={"type": "string"},
-                file={"type": "string"}, line={"type": "integer"}),
-    ),
-    MACHINE: ("rover.Machine", _object(temperature_c=_NUMBER, throttled=_TEXT)),
-    CONTROL: ("rover.Control", _object(**dict.fromkeys(CONTROL_FIELDS, _NUMBER), driver={"enum": [*DRIVERS, None]})),
-    PICTURE: (
-        "foxglove.CompressedImage",
-        _object(timestamp=_TIME, frame_id={"type": "string"}, format={"type": "string"},
-                data={"type": "string", "contentEncoding": "base64"}),
-    ),
-}  # fmt: skip
-
-
-class _Message(NamedTuple):
-    """at_ns: nanoseconds by the system's clock. content: the message, or for a picture its file."""
-
-    at_ns: int
-    topic: str
-    content: dict[str, Any] | Path
+Message = tuple[int, str, dict[str, Any] | Path]  # nanoseconds by the system's clock, topic, content or picture's file
 
 
 def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[str, int]:
@@ -69,29 +52,21 @@ def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[
     """
     from mcap.writer import Writer  # imported here, so that only this export needs it
 
-    messages = list(_of_flight(flight))
-    if episode is None:
-        try:
-            episode = find_recording(flight)
-        except EpisodeError:
-            episode = None
-    if episode is not None:
-        messages += _of_episode(episode)
-    messages.sort(key=lambda message: message.at_ns)
+    messages = [*_of_flight(flight), *_of_episode(episode or _find(flight))]
+    messages.sort(key=lambda message: message[0])
     counts: Counter[str] = Counter()
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(library="rover")
         channels = {}
-        for topic in TOPICS:
-            if any(message.topic == topic for message in messages):
-                name, schema = SCHEMAS[topic]
-                number = writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
-                channels[topic] = writer.register_channel(topic, "json", number)
+        for topic in sorted({topic for _, topic, _ in messages}, key=TOPICS.index):
+            name, properties = SCHEMAS[topic]
+            schema = json.dumps({"type": "object", "properties": properties}).encode()
+            channels[topic] = writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", schema))
         header = {key: json.dumps(plain(value)) for key, value in flight.header.items()}
         writer.add_metadata("flight log", header)
         for at_ns, topic, content in messages:
-            row = _picture(at_ns, content) if isinstance(content, Path) else content
+            row = _image(at_ns, content) if isinstance(content, Path) else content
             if row is not None:
                 data = json.dumps(row, allow_nan=False).encode()
                 writer.add_message(channels[topic], at_ns, data, at_ns, sequence=counts[topic])
@@ -100,32 +75,39 @@ def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[
     return {topic.removeprefix("/"): counts[topic] for topic in TOPICS if counts[topic]}
 
 
-def _of_flight(flight: Flight) -> Iterator[_Message]:
+def _find(flight: Flight) -> Path | None:
+    try:
+        return find_recording(flight)
+    except EpisodeError:
+        return None
+
+
+def _of_flight(flight: Flight) -> Iterator[Message]:
     begin_s = began_s(flight)
     ticks, machine = flight.ticks, flight.machine
     for i, t_s in enumerate(ticks["t_s"].tolist()):
-        row = plain({name: str(ticks[name][i]) if name in _TICK_TEXTS else ticks[name][i] for name in Tick._fields})
-        yield _Message(_ns(begin_s + t_s), TICK, row)
+        yield _ns(begin_s + t_s), TICK, plain({name: ticks[name][i] for name in Tick._fields})
     for event in flight.events:
         at_ns = _ns(begin_s + event.t_s)
-        yield _Message(at_ns, EVENT, {"timestamp": _time(at_ns), "level": INFO, "message": str(event), "name": "rover",
-                                      "file": "", "line": 0})  # fmt: skip
+        row = {"timestamp": _time(at_ns), "level": INFO, "message": str(event), "name": "rover", "file": "", "line": 0}
+        yield at_ns, EVENT, row
     for i, t_s in enumerate(machine["t_s"].tolist()):
-        row = plain({"temperature_c": machine["temperature_c"][i], "throttled": machine["throttled"][i]})
-        yield _Message(_ns(begin_s + t_s), MACHINE, row)
+        yield _ns(begin_s + t_s), MACHINE, plain({name: machine[name][i] for name in ("temperature_c", "throttled")})
 
 
-def _of_episode(episode: Path) -> Iterator[_Message]:
+def _of_episode(episode: Path | None) -> Iterator[Message]:
+    if episode is None:
+        return
     for at_s, picture in pictures_of(episode):
         if 0 <= at_s < MOST_S:
-            yield _Message(_ns(at_s), PICTURE, picture)
+            yield _ns(at_s), PICTURE, picture
     for row in json_controls(episode / "episode_data.json"):
         control_s = number_of(row.get("system_timestamp"))
         if control_s is not None and 0 <= control_s < MOST_S:  # not NaN either
-            yield _Message(_ns(control_s), CONTROL, plain(row))
+            yield _ns(control_s), CONTROL, plain(row)
 
 
-def _picture(at_ns: int, file: Path) -> dict[str, Any] | None:
+def _image(at_ns: int, file: Path) -> dict[str, Any] | None:
     """Return the message with a picture, whose JPEG is as recorded; None if it is damaged or gone."""
     try:
         read_jpeg(file)
