@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from rover_exchange.moments import pictures_of
 from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log

@@ -9,18 +9,15 @@ import yaml
 from click.testing import CliRunner
 
 from lab.driving.policy import make_artifact
-from rover_learn.lessons import as_driven
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.cli import main
 from rover_lib.onboard.drive.drive import another_car, arm_capped
-from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of, read_controls
-from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples
 
@@ -52,19 +49,6 @@ def test_a_recording_carries_its_car(tmp_path):
     assert actions[:, 1].min() == pytest.approx(-0.1)
     assert actions[:, 1].max() == pytest.approx(0.1)
     assert actions[:, 0] == pytest.approx(0.5)
-
-
-def test_samples_know_their_car_whatever_this_machine_has(tmp_path):
-    """There is no car.yml here. Plans of a car with reverse are still clipped to that car's limits, and drawn with its
-    pulses.
-    """
-    episode(tmp_path, CRAWLER)
-    recordings = load_recordings(tmp_path)
-    assert car_of_samples(recordings.samples) == CRAWLER
-    plans = np.tile(np.float32([0.2, -0.6]), (1, 4, 1))
-    assert (as_driven(plans, ("steering", "throttle"), recordings.samples) == plans).all()
-    drawn = [line.get_ydata() for ax in episode_overview(recordings.episodes[0]).axes for line in ax.lines]
-    assert [1550, 1450] in [[max(line), min(line)] for line in drawn]
 
 
 def test_recordings_of_two_cars_make_no_policy(tmp_path):
@@ -99,16 +83,6 @@ def test_an_artifact_says_whose_it_is():
     assert "calibrated for 'crawler', and this car is" in another_car(manifest, Car())
     assert another_car(manifest, CRAWLER) == another_car({}, Car()) == ""
     assert action_limits(["throttle", "wrist"], CRAWLER).tolist() == [[-1, -np.inf], [1, np.inf]]
-
-
-def test_plans_with_reverse():
-    chunk = np.tile([0.2, -0.6], (8, 1))
-    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
-    follower.add(Plan(1, 0.0, 0.0, chunk, CRAWLER.limits), 0.0)
-    assert follower.command(0.0).throttle == -0.3  # the limit holds in both directions
-    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
-    follower.add(Plan(1, 0.0, 0.0, chunk + np.array([0, 0.4])), 0.0)
-    assert follower.command(0.0).throttle == 0.0  # the first car has no reverse
 
 
 class Link:

@@ -171,12 +171,6 @@ def test_a_film_that_begins_again_is_no_frozen_camera():
     assert repeats() == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_file_of_jpegs(tmp_path):
-    (tmp_path / "drive.mjpeg").write_bytes(b"".join(jpeg(v) for v in (10, 20, 30)))
-    with Camera(tmp_path / "drive.mjpeg", rate_hz=100) as camera, pytest.raises(CameraError, match="after 3 frames"):
-        camera.wait(3, 1.0)
-
-
 # ---- what is no frame, on a virtual clock
 
 
@@ -239,16 +233,6 @@ def test_a_ring_of_old_pictures_shows_nothing_new(readings, ring):
     repeats = [repeats for _, repeats, _ in newest]
     assert repeats[:50] == [0] * 50
     assert repeats[50:90] == list(range(1, 41))
-
-
-def test_a_frozen_picture_on_which_a_pixel_flickers_shows_nothing_new(readings):
-    rng = np.random.default_rng(0)
-    pictures = []
-    for _ in range(20):
-        picture = hostile.scene()
-        picture[rng.integers(360), rng.integers(640)] = rng.integers(256, size=3)
-        pictures.append(hostile.jpeg(picture))
-    assert readings.read(pictures)[-1][1] == 19
 
 
 def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):

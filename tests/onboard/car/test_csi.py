@@ -76,16 +76,6 @@ def test_what_goes_wrong_is_said(csi, monkeypatch, fault, sentence):
             camera.wait(camera.frames, 0.1)
 
 
-def test_a_frozen_one_gives_no_new_frame_and_is_ended(csi):
-    with csi("freeze 20") as camera:
-        end = time.monotonic() + 3
-        while camera.wait(camera.frames, 0.3) and time.monotonic() < end:
-            pass
-        assert time.monotonic() < end
-        start = time.monotonic()
-    assert time.monotonic() - start < 1.0
-
-
 def test_without_the_program_it_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CameraError, match="rpicam-apps"):

@@ -9,7 +9,7 @@ from lab.driving.virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError, Stick
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink
 
 
@@ -92,11 +92,6 @@ def test_one_that_is_back_is_opened_again(pad, monkeypatch):
     pad.hold(True)
     assert link._gamepad is not first and link._gamepad.sticks() and first.sticks() is None
     link._gamepad.close()
-
-
-@pytest.mark.parametrize(("value", "deflection"), [(0, -1), (127, 0), (140, 0), (255, 1), (300, 1)])
-def test_a_stick_of_eight_bits(value, deflection):
-    assert Stick(0, 255).deflection(value) == deflection
 
 
 def kernel(root, *nodes):

@@ -94,12 +94,6 @@ def test_pulses_out_of_range_are_not_sent(steering_us, throttle_us):
         assert [b for b in board.heard if b.startswith(">D")] == [">D 7 1 999 900 711"]
 
 
-def test_sequence_numbers_go_on_where_the_arduino_was():
-    hello = f"<H 4 4.1.1 9 4294967294 e {DEFAULT}"
-    with board_of(hello=hello, answer=lambda b, _: b.status("S", "n", boot=9)) as board, ServoLink(board.port) as link:
-        assert [link.send(1456, 120) for _ in range(3)] == [4294967295, 0, 1]
-
-
 def test_another_firmware_is_refused():
     with board_of(hello="<H 5 5.0.0 something else") as board:
         with pytest.raises(LinkError, match=r"5\.0\.0 \(protocol 5\).*make"):
@@ -120,11 +114,6 @@ def test_an_arduino_that_is_not_reset_is_asked():
         with ServoLink(board.port) as link:
             assert link.hello.sequence == 40
         assert board.heard[0] == ">Q"
-
-
-def test_no_hello():
-    with board_of(hello=None) as board, pytest.raises(LinkError, match=r"no hello .* within 0\.4 s"):
-        ServoLink(board.port, boot_s=0.4).open()
 
 
 def test_arming_refused():
@@ -151,15 +140,6 @@ def test_the_arduino_is_told_when_somebody_asked():
         until(lambda: link.resets)
         with pytest.raises(LinkError, match="reset since the car was asked for"):
             link.arm()
-
-
-def test_an_arduino_that_has_just_started_may_not_know_the_signals_yet():
-    def answer(board, body):
-        asked = sum(b.startswith(">A") for b in board.heard)
-        board.status(*(("A", "a") if asked == 3 else ("M", "r", "s")), ms=50 * asked)
-
-    with board_of(answer=answer) as board, ServoLink(board.port) as link:
-        assert link.arm().state is State.AUTONOMOUS
 
 
 @pytest.mark.parametrize("of", [pytest.param({"sequence": 4294967290}, marks=pytest.mark.slow), {"boot": 9}])

@@ -262,7 +262,7 @@ def test_no_pulse_is_a_flag_and_no_value(tmp_path):
 def test_further_columns_must_be_new_and_plain(tmp_path):
     with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         for extra in ({"steering_measured": 1}, {"arduino_timestamp": 1}):
-            with pytest.raises(EpisodeError, match="no further column"):
+            with pytest.raises(EpisodeError, match="is taken"):
                 writer.control(1.0, 0, 1500, 136, 21308, 1016, **extra)
         with pytest.raises(EpisodeError, match="cannot be written"):
             writer.control(1.0, 0, 1500, 136, 21308, 1016, mode=object())
