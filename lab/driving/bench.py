@@ -62,7 +62,7 @@ def _break_logger() -> None:
     def broken(*_: Any) -> bytes:
         raise RuntimeError("raised in the logger")
 
-    telemetry._seal = telemetry._tick_line = broken  # type: ignore[assignment]  # this is the fault
+    telemetry._line = broken  # type: ignore[assignment]  # this is the fault
 
 
 # A drive waits for its human's gesture only if stdin is a terminal.

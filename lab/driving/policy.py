@@ -1,6 +1,5 @@
 """A policy that does what the picture's corner tells it to, so that a test can choose what happens in an inference."""
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -85,7 +84,7 @@ def obey_pictures() -> None:
     """
     from rover_lib.onboard.drive.inference import PolicyProcess
 
-    PolicyProcess.program = __name__
+    PolicyProcess.loaded = staticmethod(obey)
 
 
 def obey(policy: Any) -> None:
@@ -128,9 +127,3 @@ def pictures(instruction: int, size: tuple[int, int] = SIZE, level: int = 100, c
             picture[: height // 3, : width // 3] += rng.integers(0, 12, (height // 3, width // 3, 3), np.uint8)
         made.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
     return made
-
-
-if __name__ == "__main__":
-    from rover_lib.onboard.drive.inference import main
-
-    main(sys.argv[1:], loaded=obey)

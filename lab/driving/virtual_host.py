@@ -15,7 +15,7 @@ import numpy as np
 from lab.driving.virtual import FRAME_MS, Killed, Planned, World
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
-from rover_lib.onboard.drive.drive import arm_capped, arm_when_ready, what_is_missing
+from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, what_is_missing
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
@@ -395,7 +395,7 @@ class Process:
             self.planner.renew(_settings().fade_s)
             pilot.check_sight()
             wanted = self._operators.check_request if self._service else lambda: None
-            self.armed = arm_capped(link, limit, limit, self._log.event, wanted)
+            self.armed = arm_capped(link, limit, self._log.event, wanted)
         except RoverError as error:
             world.phase("disarmed")
             self._log.event(f"not armed: {error}")

@@ -181,7 +181,7 @@ def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
 
 
 drive_options = with_options(  # on the rover and in the balloon world
-    click.argument("artifact", type=ARTIFACT, required=False),
+    click.argument("artifact", type=ARTIFACT),
     CAMERA,
     PORT,
     click.option("--hz", type=Number(10, 100), default=30.0, show_default=True, help="Commands a second."),
@@ -190,9 +190,7 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
-    click.option(
-        "--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml; with --replay: none]."
-    ),
+    click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
     click.option(
         "--blend-ticks",
         type=click.IntRange(min=0),
@@ -215,7 +213,6 @@ drive_options = with_options(  # on the rover and in the balloon world
         callback=_check_json_file,
         help="Write a summary of the drive to this file; - prints it.",
     ),
-    click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
     click.option(
         "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
@@ -230,25 +227,24 @@ drive_options = with_options(  # on the rover and in the balloon world
 def drive(ctx: click.Context, **options: Any) -> None:
     """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
 
-    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
-    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
-    --service, which waits disarmed after each drive, another request does.
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with --service, which
+    waits disarmed after each drive, another request does.
     """
     ctx.exit(run_drive(**options))
 
 
 def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
-    from rover_lib.onboard.drive.drive import DriveOptions, drive_car
+    from rover_lib.onboard.drive.drive import drive_car
     from rover_lib.onboard.drive.loop import Report
+    from rover_lib.onboard.drive.opening import DriveOptions
     from rover_lib.onboard.drive.service import NotArmed
     from rover_lib.onboard.errors import DriveFault, TakenOver
 
     o = DriveOptions(**options)
-    if bool(o.artifact) == bool(o.replay):
-        raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
-    if o.service and (o.replay or o.dry_run):
-        raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
+    if o.service and o.dry_run:
+        raise click.UsageError("--service drives a car: no --dry-run")
     if o.record_mb and not o.record:
         raise click.UsageError("--record-mb belongs to --record")
     report, code = Report(), 0
@@ -711,8 +707,8 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. shown: what is shown instead of the drives that connect:
-    balloon_world's Simulation, whose `ask` gets what is asked for on the page.
+    opened: called with its URL. shown: what is shown instead of the drives that connect: balloon_world's Simulation,
+    whose `ask` gets what is asked for on the page.
     """
     import asyncio
 
@@ -721,15 +717,8 @@ def open_view(
 
     token = read_token(token_file) if token_file else new_token()
     place = None if shown else feed or default_view()
-    ask = getattr(shown, "ask", None)
-    view = View(
-        Address(web_port, interface),
-        token,
-        place,
-        drive_user=drive_user,
-        car=shown and shown.car,
-        ask=ask,
-    )
+    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
+    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.

@@ -121,7 +121,7 @@ WRONG = [
     ("drive policy_static.pt --json policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
     # what is not there, or not meant
     ("inspect nothing.pt", "nothing.pt: not found", "pretrained_model"),
-    ("drive", "ARTIFACT", "--replay EPISODE"),
+    ("drive", "ARTIFACT", "Missing"),
     ("drive policy_static.pt --latency-ms 100", "--latency-ms", "--world"),
     # no number
     ("drive policy_static.pt --max-seconds nan", "--max-seconds", "nan is not a finite number"),

@@ -14,7 +14,9 @@ from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.cli import main
-from rover_lib.onboard.drive.drive import another_car, arm_capped
+from rover_lib.onboard.drive.arming import arm_capped
+from rover_lib.onboard.drive.opening import another_car
+from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of, read_controls
@@ -85,6 +87,16 @@ def test_an_artifact_says_whose_it_is():
     assert action_limits(["throttle", "wrist"], CRAWLER).tolist() == [[-1, -np.inf], [1, np.inf]]
 
 
+def test_plans_with_reverse():
+    chunk = np.tile([0.2, -0.6], (8, 1))
+    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
+    follower.add(Plan(1, 0.0, 0.0, chunk, CRAWLER.limits), 0.0)
+    assert follower.command(0.0).throttle == -0.3  # the limit holds in both directions
+    follower = Follower(Settings(blend_ticks=0, throttle_limit=0.3), 30.0)
+    follower.add(Plan(1, 0.0, 0.0, chunk + np.array([0, 0.4])), 0.0)
+    assert follower.command(0.0).throttle == 0.0  # the first car has no reverse
+
+
 class Link:
     calibration = CRAWLER.pwm
 
@@ -101,10 +113,10 @@ class Link:
 
 def test_the_cap_of_a_car_with_reverse():
     said = []
-    assert arm_capped(Link(1600), 0.2, 0.2, said.append) == "armed"
+    assert arm_capped(Link(1600), 0.2, said.append) == "armed"
     assert not said
     link = Link(1550)
-    arm_capped(link, 0.2, 0.2, said.append)
+    arm_capped(link, 0.2, said.append)
     assert abs(link.lowered[0] - 1500) == 100
     assert "at most throttle 0.10 (1550 us)" in said[0]
 
