@@ -23,11 +23,13 @@ import numpy as np
 
 from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
 from rover_lib.onboard.care.lower_bound import floor_ms
+from rover_lib.onboard.checked import broken_rule, number, optional, whole
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.policy.confined import load_confined, run_confined
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
+MOST = 10**9  # rounds, threads or seconds: a limit that nobody meets
 THROTTLED_S = 1.0  # between two readings of the firmware's throttling
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
@@ -123,17 +125,16 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     of the inferences end within their period (1000 / p95).
     """
     x = np.asarray(latencies_ms, float)
-    metrics: dict[str, float | int] = {
-        f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()
+    mean_ms, p95_ms = float(x.mean()), float(np.percentile(x, 95))
+    return {
+        **{f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()},
+        "latency_min_ms": float(x.min()),
+        "latency_mean_ms": mean_ms,
+        "latency_max_ms": float(x.max()),
+        "n": len(x),
+        "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
+        "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
     }
-    metrics["latency_min_ms"] = float(x.min())
-    metrics["latency_mean_ms"] = float(x.mean())
-    metrics["latency_max_ms"] = float(x.max())
-    metrics["n"] = len(x)
-    metrics["throughput_fps"] = float(1000 / x.mean()) if x.mean() > 0 else math.inf
-    p95_ms = metrics["latency_p95_ms"]
-    metrics["control_rate_hz"] = 1000 / p95_ms if p95_ms > 0 else math.inf
-    return metrics
 
 
 def _silent(items: Iterable, **_: object) -> Iterable:
@@ -146,8 +147,7 @@ class BenchmarkOptions:
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
     test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
-    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. rate_hz: at most that many
-    inferences per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose
+    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. main: the policy whose
     figures are at the top level (None: the first). reference: the policy that the speed of the others is compared with.
     memory_alone: measure each artifact's memory in a process of its own, which takes seconds each.
     """
@@ -157,29 +157,28 @@ class BenchmarkOptions:
     threads: int | None = None
     duration_s: float | None = None
     at_most_s: float | None = None
-    rate_hz: float | None = None
     main: str | None = None
     reference: str | None = None
     memory_alone: bool = False
 
     def __post_init__(self) -> None:
-        if self.warmup < 0 or self.iterations < 1:
-            counts = f"{self.warmup} and {self.iterations}"
-            raise ParamsError("warmup must be from 0 and iterations from 1", found=counts)
-        for name, value in (("duration_s", self.duration_s), ("at_most_s", self.at_most_s), ("rate_hz", self.rate_hz)):
-            if value is not None and not 0 < value < math.inf:
-                raise ParamsError(f"{name} must be above 0", found=value)
-        if self.threads is not None and self.threads < 0:
-            raise ParamsError("threads must be from 0 (all cores)", found=self.threads)
+        rules = {
+            "warmup": whole(0, MOST),
+            "iterations": whole(1, MOST),
+            "threads": optional(whole(0, MOST)),
+            "duration_s": optional(number(0.001, MOST)),
+            "at_most_s": optional(number(0.001, MOST)),
+        }
+        if broken := broken_rule(vars(self), rules):
+            raise ParamsError(f"{broken[0]} of a benchmark must be {broken[1]}", found=broken[2])
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """The clocks of a benchmark, all in seconds: elapsed time, processor time, and a function that waits."""
+    """The clocks of a benchmark, both in seconds: elapsed time, and processor time."""
 
     wall: Callable[[], float] = time.perf_counter
     cpu: Callable[[], float] = time.process_time
-    sleep: Callable[[float], None] = time.sleep
 
 
 DEFAULTS = BenchmarkOptions()
@@ -249,8 +248,6 @@ def benchmark(
         "warmup": options.warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
-        "rate_hz": options.rate_hz,
-        "missed_deadlines": run.missed if options.rate_hz else None,
         "artifacts": artifacts,
         "series": run.series if options.duration_s is not None else None,
     }
@@ -282,13 +279,12 @@ class _Run:
         self.cpu_s = dict.fromkeys(policies, 0.0)
         self.readings: list[dict[str, Any]] = []
         self.series: list[dict[str, Any]] = []
-        self.missed = 0
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
     def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
         """Time `iterations` rounds, or as many as begin within duration_s, and fill the lists."""
-        duration_s, rate_hz = options.duration_s, options.rate_hz
+        duration_s = options.duration_s
         if duration_s is None:
             rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
         else:
@@ -299,15 +295,13 @@ class _Run:
         self.readings.append(self.host.reading())
         before = self.host.core_ticks()
         cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
-        due_s, tick_s, seen = start_s, start_s + every_s, dict.fromkeys(names, 0)
+        tick_s, seen = start_s + every_s, dict.fromkeys(names, 0)
         for i in rounds:
             if duration_s is not None and self.clocks.wall() - start_s >= duration_s and i > 0:
                 break
             if options.at_most_s and i >= LEAST_ROUNDS and self.clocks.wall() - start_s >= options.at_most_s:
                 break
             for k in range(len(names)):
-                if rate_hz:
-                    due_s = self._wait(due_s, 1 / rate_hz)
                 self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
             if duration_s is not None and (now_s := self.clocks.wall()) >= tick_s:
                 self._note(now_s - start_s, seen)
@@ -366,15 +360,6 @@ class _Run:
         end_s, cpu_end_s = self.clocks.wall(), self.clocks.cpu()
         self.latencies_ms[name].append((end_s - start_s) * 1000)
         self.cpu_s[name] += cpu_end_s - cpu_start_s
-
-    def _wait(self, due_s: float, period_s: float) -> float:
-        """Wait for a deadline and return the next one. A deadline that has passed is counted and skipped."""
-        now_s = self.clocks.wall()
-        if now_s < due_s:
-            self.clocks.sleep(due_s - now_s)
-        behind = math.floor((now_s - due_s) / period_s) if now_s > due_s else 0
-        self.missed += behind
-        return due_s + (behind + 1) * period_s
 
     def _note(self, t_s: float, seen: dict[str, int]) -> None:
         """Add one point to the time series: the latencies since the last point, and the host's state."""

@@ -9,8 +9,6 @@ import yaml
 from click.testing import CliRunner
 
 from lab.driving.policy import make_artifact
-from rover_learn.lessons import as_driven
-from rover_lib.onboard.artifact import manifest as artifact_module
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import Car, yaml_of
@@ -22,7 +20,6 @@ from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of, read_controls
-from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples
 
@@ -48,7 +45,7 @@ def episode(folder, car, name="episode_20260101_000000"):
 
 def test_a_recording_carries_its_car(tmp_path):
     folder = episode(tmp_path, CRAWLER)
-    assert read_car_of(folder) == CRAWLER
+    assert read_car_of(folder) == CRAWLER and read_car_of(episode(tmp_path / "first", Car())) == Car()
     assert set(read_controls(folder).throttle_us.tolist()) == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
     assert actions[:, 1].min() == pytest.approx(-0.1)
@@ -56,30 +53,11 @@ def test_a_recording_carries_its_car(tmp_path):
     assert actions[:, 0] == pytest.approx(0.5)
 
 
-def test_a_recording_of_the_first_car_is_as_ever(tmp_path):
-    folder = episode(tmp_path, Car())
-    assert "car" not in json.loads((folder / "episode_data.json").read_text())["metadata"]
-    assert read_car_of(folder) == Car()
-
-
-def test_samples_know_their_car_whatever_this_machine_has(tmp_path):
-    """There is no car.yml here. Plans of a car with reverse are still clipped to that car's limits, and drawn with its
-    pulses.
-    """
-    episode(tmp_path, CRAWLER)
-    recordings = load_recordings(tmp_path)
-    assert car_of_samples(recordings.samples) == CRAWLER
-    plans = np.tile(np.float32([0.2, -0.6]), (1, 4, 1))
-    assert (as_driven(plans, ("steering", "throttle"), recordings.samples) == plans).all()
-    drawn = [line.get_ydata() for ax in episode_overview(recordings.episodes[0]).axes for line in ax.lines]
-    assert [1550, 1450] in [[max(line), min(line)] for line in drawn]
-
-
 def test_recordings_of_two_cars_make_no_policy(tmp_path):
     episode(tmp_path, CRAWLER)
     episode(tmp_path, Car(), "episode_20260101_000100")
     samples = load_recordings(tmp_path).samples
-    with pytest.raises(EpisodeError, match="of several cars, found crawler, the recordings' car; use those of one car"):
+    with pytest.raises(EpisodeError, match="of several cars"):
         car_of_samples(samples)
     same = Car.of(CRAWLER.description() | {"name": "its twin"})
     twins = [replace(sample, car=same) if i % 2 else sample for i, sample in enumerate(samples[:20])]
@@ -107,13 +85,6 @@ def test_an_artifact_says_whose_it_is():
     assert "calibrated for 'crawler', and this car is" in another_car(manifest, Car())
     assert another_car(manifest, CRAWLER) == another_car({}, Car()) == ""
     assert action_limits(["throttle", "wrist"], CRAWLER).tolist() == [[-1, -np.inf], [1, np.inf]]
-
-
-def test_a_damaged_car_in_an_artifact_is_refused(tmp_path, monkeypatch):
-    checked = artifact_module.check_manifest
-    monkeypatch.setattr(artifact_module, "check_manifest", lambda m, where: m.update(car=3) or checked(m, where))
-    with pytest.raises(ArtifactError, match="must be a mapping, found 3"):
-        make_artifact(tmp_path / "policy.pt")
 
 
 def test_plans_with_reverse():

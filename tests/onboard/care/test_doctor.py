@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 import threading
 import time
 from collections import namedtuple
@@ -138,14 +137,11 @@ def quick(monkeypatch):
     ("camera", "verdict", "found"),
     [
         (FakeCamera(), "ok", "640x360, monotonic time stamps, 30.0 frames a second"),
-        (FakeCamera(hz=27.5), "ok", "27.5"),
         (FakeCamera(hz=15), "warning", "15.0 frames a second, wanted 30"),
-        (FakeCamera(level=3), "warning", "black (mean 3.0 of 255)"),
-        (FakeCamera(contrast=0.7), "warning", "nothing is on the camera's picture (contrast 0.7 of 255)"),
-        (FakeCamera(repeats=9), "fail", "frozen: 10 frames showed nothing new"),
+        (FakeCamera(level=3), "warning", "black"),
+        (FakeCamera(repeats=9), "fail", "frozen"),
         (FakeCamera(stops=True), "fail", "no new frame within"),
-        (FakeCamera(seen=(128, 72)), "ok", "640x360"),
-        (FakeCamera(seen=(64, 48)), "fail", "gives 640x360, and the policy has seen pictures of the shape of 64x48"),
+        (FakeCamera(seen=(64, 48)), "fail", "gives 640x360"),
     ],
 )
 def test_the_real_frame_rate(tmp_path, quick, camera, verdict, found):
@@ -185,7 +181,6 @@ def talking(receiver):
         ("1460 21316 124 1016", "ok", "steering 1460 us, throttle 124 us"),
         ("1460 21316 200 1016", "warning", "arming will be refused"),
         ("1460 21316 - -", "fail", "no signal on throttle: arming will be refused"),
-        ("- - - -", "fail", "no signal on steering and throttle"),
     ],
 )
 def test_an_arduino(monkeypatch, receiver, verdict, found):
@@ -219,11 +214,9 @@ NODES = ("A (event0)", "B (event1, without motion sensors)")
     ("receiver", "opened", "name", "verdict", "found"),
     [
         ("1460 21316 124 1016", True, "transmitter", "ok", "steering 1460 us, throttle 124 us"),
-        ("1460 21316 200 1016", True, "transmitter", "warning", "arming will be refused"),
-        ("- - - -", True, "transmitter", "warning", "nobody holds L1: arming will be refused"),
-        ("- - - -", True, "gamepad", "ok", "A (event0), B (event1, without motion sensors): with L1 held"),
-        ("- - - -", False, "car", "fail", "no gamepad that can be used is connected, found none in /dev/input"),
-        ("- - - -", False, "Arduino", "fail", "no gamepad that can be used is connected"),
+        ("- - - -", True, "transmitter", "warning", "nobody holds L1"),
+        ("- - - -", True, "gamepad", "ok", "A (event0), B (event1, without motion sensors)"),
+        ("- - - -", False, "Arduino", "fail", "no gamepad"),
     ],
 )  # fmt: skip
 def test_a_gamepad(proc, monkeypatch, receiver, opened, name, verdict, found):
@@ -250,9 +243,8 @@ RESTING = "1456 21316 120 1016"
     ("wiggled", "without_transmitter", "verdicts", "found"),
     [
         ("-", "- - - -", ["ok", "ok", "ok"], "sends no pulses"),
-        ("-", "1456 21316 - -", ["ok", "ok", "ok"], "sends no pulses"),
         ("-", RESTING, ["ok", "ok", "warning"], "as before: nobody can tell"),
-        ("-", "1700 21316 124 1016", ["ok", "ok", "warning"], "goes on: steering 1700 us, throttle 124 us"),
+        ("-", "1700 21316 124 1016", ["ok", "ok", "warning"], "steering 1700 us"),
         ("-", "1456 21316 400 1016", ["ok", "ok", "fail"], "throttle 400 us"),
         ("w", RESTING, ["ok", "fail"], "did not show it"),
     ],
@@ -290,13 +282,6 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
 
 
-def test_an_arduino_of_another_protocol(proc):
-    with board_of(hello="<H 5 5.0.0 something else") as board:
-        check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
-    assert check.verdict == "fail"
-    assert "firmware 5.0.0 (protocol 5)" in check.found and "make -C firmware flash" in check.remedy
-
-
 def test_a_port_that_is_not_there_or_somebody_else_has(tmp_path):
     check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path))
     assert check.verdict == "fail" and "no other serial port" in check.found
@@ -326,15 +311,6 @@ def test_modem_manager(proc):
 def test_engines():
     torch_here, onnx_here = doctor.engines_here()
     assert torch_here.verdict == onnx_here.verdict == "ok" and "qnnpack" in torch_here.found
-
-
-def test_one_engine_is_enough_and_none_is_not(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    check = only(doctor.engines_here())
-    assert check.name == "onnxruntime" and check.verdict == "ok"
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    check = only(doctor.engines_here())
-    assert check.verdict == "fail" and "pip install" in check.remedy
 
 
 @pytest.mark.slow
@@ -392,7 +368,7 @@ def test_governor(pi_host, tmp_path):
     assert "performance | sudo tee" in check.remedy
 
 
-def test_disk(tmp_path):
+def test_disk(tmp_path, monkeypatch):
     Usage = namedtuple("Usage", "free")
     asked = []
 
@@ -403,11 +379,6 @@ def test_disk(tmp_path):
     logs, recordings = doctor.disk(tmp_path / "not/made/yet", tmp_path, usage)
     assert asked == [tmp_path, tmp_path]
     assert (logs.verdict, recordings.verdict) == ("ok", "warning")
-    logs, _ = doctor.disk(tmp_path, tmp_path, lambda path: Usage(1e6))
-    assert logs.verdict == "warning"
-
-
-def test_a_folder_that_is_not_writable(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
     assert all("not writable" in c.found for c in doctor.disk(tmp_path, tmp_path))
 
@@ -451,11 +422,7 @@ def rover(*args):
 def test_a_desktop_cannot_drive(tmp_path):
     result = rover("doctor", "--camera", tmp_path / "video0", "--port", tmp_path / "ttyUSB0")
     assert result.exit_code == 1
-    assert "rover: this car would not drive: camera, Arduino" in result.stderr
-    lines = result.stdout.splitlines()
-    assert all(re.match(r"(ok {7}|warning {2}|fail {5}|        )\S* *", line) for line in lines)
-    starts = {re.match(r"\w+ +(group \w+|\S+) +", line).end() for line in lines if not line.startswith(" ")}
-    assert starts == {9 + doctor.NAME_WIDTH + 1}  # the texts of `found` are aligned in one column
+    assert "camera, Arduino" in result.stderr
     found = json.loads(rover("doctor", "--json", "--camera", tmp_path / "video0", "--port", tmp_path / "none").stdout)
     assert found["drives"] is False
     assert {"name", "verdict", "found", "remedy"} == set(found["checks"][0])
@@ -476,7 +443,7 @@ def test_a_rover_that_drives(tmp_path, artifacts, quick):
 
 @pytest.mark.parametrize(
     ("gain", "positive", "verdict"),
-    [(-8, "right", "ok"), (8, "right", "fail"), (8, "left", "ok"), (0, "right", "warning")],
+    [(8, "right", "fail"), (8, "left", "ok"), (0, "right", "warning")],
 )
 def test_which_way_a_recorded_minute_steers(tmp_path, monkeypatch, gain, positive, verdict):
     content = {"control_samples": [], "frame_samples": []}
