@@ -68,8 +68,9 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
             continue
         lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
-        values = {n: number_of(row.get(n)) for n in CONTROL_FIELDS if n.split("_")[0] not in lost}
-        if bad := [name for name, value in values.items() if value is None]:
+        wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
+        values = {n: number for n in wanted if (number := number_of(row.get(n))) is not None}
+        if bad := [name for name in wanted if name not in values]:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
             continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan := [name for name, value in values.items() if math.isnan(value)]:
