@@ -172,7 +172,7 @@ class Normaliser:
             return
         self.where = folder / "config.json"
         features = {**said.input_features, **said.output_features}
-        stats = {}
+        stats: dict[str, Tensor] = {}
         for key in features:
             begin = f"{prefix}{key.replace('.', '_')}."
             stats |= {f"{key}.{k.removeprefix(begin)}": v for k, v in buffers.items() if k.startswith(begin)}

@@ -28,11 +28,6 @@ from rover_lib.workshop.checkpoint.contents import (
 )
 from rover_lib.workshop.untrusted import quote, quote_all
 
-# The trainer's names for the whole numbers that the shape of the policy needs.
-SIZES = {
-    "chunk": "chunk_size", "dim": "hidden_size", "heads": "n_heads", "feedforward": "feedforward_dim",
-    "encoder_layers": "n_encoder_layers", "decoder_layers": "n_decoder_layers",
-}  # fmt: skip
 TRAINER_CAMERA = "cam_front"
 
 
@@ -92,7 +87,12 @@ def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor]) -> ActC
         action_names=name_numbers(last("action_head.bias"), "action"),
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
-        **{ours: whole(theirs) for ours, theirs in SIZES.items()},
+        chunk=whole("chunk_size"),
+        dim=whole("hidden_size"),
+        heads=whole("n_heads"),
+        feedforward=whole("feedforward_dim"),
+        encoder_layers=whole("n_encoder_layers"),
+        decoder_layers=whole("n_decoder_layers"),
     )
 
 
