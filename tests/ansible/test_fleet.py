@@ -266,8 +266,9 @@ def test_a_fleet_is_not_armed_at_once(fleet):
 
 DRIVING = """#!/bin/sh
 echo "$*" >> {folder}/rover
-case $1 in
-  heartbeat) [ $(grep -c ^heartbeat {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
+case "$*" in
+  "arm-car --heartbeat")
+    [ $(grep -c heartbeat$ {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
 esac
 """
 
@@ -285,5 +286,5 @@ def test_the_model_that_was_checked_is_armed_and_the_laptop_is_heard(fleet, arti
     doctor, *asked = (fleet.folder / "rover").read_text().splitlines()
     model = content_hash(artifacts["static"])
     assert doctor.startswith("doctor ")
-    assert asked == [f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10", "heartbeat", "heartbeat"]
+    assert asked == [f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10", *["arm-car --heartbeat"] * 2]
     assert "stop" in (fleet.folder / "asked").read_text().splitlines()[-1]
