@@ -24,7 +24,6 @@ import torch
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -339,29 +338,6 @@ def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
         "fp32": worst.reference,
         "int8": worst.other,
     }
-
-
-def comparison_rows(
-    summaries: Mapping[str, Mapping[str, Any]], sizes_mb: Mapping[str, float], reference_mb: float
-) -> list[list[str]]:
-    """Artifacts beside their reference, a header first: each action's mean, 95th percentile and largest error.
-
-    summaries: `Fidelity.summary` by name. sizes_mb: of the same artifacts. reference_mb: of what they are compared
-    with, which stands first; an artifact may be called "reference" too.
-    """
-    keys = next(iter(summaries.values()))
-    actions = [key.removesuffix("_mae_pct") for key in keys if key.endswith("_mae_pct")]
-    header = ["", "MB", "times smaller"]
-    for action in actions:
-        header += [f"{action} mean %", "p95", "largest", "mean us"]
-    rows = [header, ["reference", number(reference_mb), "1.0", *["-"] * (len(header) - 3)]]
-    for name, summary in summaries.items():
-        row = [name, number(sizes_mb[name]), number(ratio(reference_mb, sizes_mb[name]))]
-        for action in actions:
-            row += [number(summary[f"{action}_{which}_pct"], ".2f") for which in ("mae", "p95", "max")]
-            row.append(number(summary.get(f"{action}_mae_us"), ".2f"))
-        rows.append(row)
-    return rows
 
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:

@@ -108,10 +108,9 @@ def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_pa
     for observer in (m for m in graph.modules() if isinstance(m, RangeObserver)):
         low, high = observer.range()
         assert observer.min_val <= low <= 0 <= high <= max(observer.max_val, 0)
-    for wrong, said in (({"wider": (("layer9", 0.5),)}, "layer9"), ({"wider": (("x", 2.0),)}, "in \\[0, 1\\]")):
-        with pytest.raises(QuantizeError, match=said):
-            restore_observed(dazzled, Scheme(observer="frames", usual_pct=75, **wrong), again)
-    with pytest.raises(QuantizeError, match="kept no frames; calibrate again"):
+    with pytest.raises(QuantizeError, match="layer9"):
+        restore_observed(dazzled, Scheme(observer="frames", usual_pct=75, wider=(("layer9", 0.5),)), again)
+    with pytest.raises(QuantizeError, match="kept no frames"):
         restore_observed(dazzled, Scheme(observer="frames"), replace(again, frames={}))
 
 
