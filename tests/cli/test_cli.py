@@ -9,7 +9,6 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
-from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import show
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import load_policy
@@ -36,56 +35,12 @@ def test_each_command_has_help_and_they_are_few():
     assert len(main.commands) <= 21
 
 
-@pytest.mark.parametrize("group", [main, main.commands["world"], main.commands["release"], onboard.main])
-def test_commands_are_said_whole_in_80_columns(group):
-    lines = CliRunner().invoke(group, ["--help"], terminal_width=80).output.splitlines()[1:]
-    assert max(map(len, lines)) <= 80 and not [line for line in lines if line.endswith("...")]
-
-
-def test_completion_is_of_commands_and_options():
-    """What docs/install.md puts into ~/.bashrc asks this."""
-    words = {"_ROVER_COMPLETE": "bash_complete", "COMP_CWORD": "1"}
-    found = CliRunner().invoke(main, [], prog_name="rover", env=words | {"COMP_WORDS": "rover ins"})
-    assert found.output.split() == ["plain,inspect"]
-    found = CliRunner().invoke(
-        main, [], prog_name="rover", env=words | {"COMP_WORDS": "rover log --d", "COMP_CWORD": "2"}
-    )
-    assert found.output.split() == ["plain,--drive"]
-
-
 def test_inspects_each_kind_of_file(artifacts, tiny_file):
     content = json.loads(rover("inspect", artifacts["static"], "--json").output)
     assert content["artifact"]["mode"] == "static" and len(content["artifact"]["content_hash"]) == 64
     content = json.loads(rover("inspect", tiny_file, "--json").output)
     assert content["checkpoint"]["format"] == "trainer"
     assert "parameters_acting" in rover("inspect", tiny_file).output
-
-
-@pytest.mark.parametrize(
-    "args",
-    [
-        ["inspect", "nothing.pt"],
-        ["report", "nothing"],
-        ["benchmark", "nothing.pt"],
-        pytest.param(["run", "nothing.pth", "none"], marks=pytest.mark.slow),  # starts a kernel
-        ["distill", "nothing.pth", "none", "--size", "320x180", "--name", "fast"],
-        ["finetune", "nothing.pth", "none", "--name", "better"],
-        ["export", "none", "--onnx"],
-        ["export-dataset", "none", "out"],
-        ["world", "train", "none", "out.pth"],
-        ["world", "trial", "nothing.pt"],
-        ["world", "students", "nothing", "none"],
-        ["world", "learn", "nothing"],
-    ],
-    ids=" ".join,
-)
-def test_bad_input_is_one_sentence(args, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = rover(*args)
-    assert result.exit_code == 1
-    lines = [line for line in result.output.splitlines() if line]
-    assert len(lines) == 1 and lines[0].startswith("rover: "), result.output
-    assert [p for p in tmp_path.rglob("*") if p.is_file()] == []  # nothing half-written
 
 
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):

@@ -66,6 +66,10 @@ WRONG = [
     ("log notes.txt", "notes.txt: this is a document"),
     ("export-dataset empty out", "empty: no episode folders in it"),
     ("world trial nothing.pt", "nothing.pt"),
+    ("world learn runs/mine", "best_model.pth"),
+    ("world train nothing out.pth", "nothing"),
+    ("finetune nothing.pth none --name better", "no"),
+    ("distill nothing.pth none --size 320 --name fast", "320x180"),
     ("world students runs/mine pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),
     # no device
     ("drive policy_static.pt --dry-run --camera 99", "policy_static.pt: a record that no artifact has"),

@@ -133,16 +133,6 @@ def test_odd_frames_take_no_steps_from_the_others(dazzled, jumping, jumped):
 
 
 @pytest.mark.slow
-def test_odd_frames_weigh_what_they_are_among_unseen_ones(dazzled, jumping, jumped):
-    """Training knows the frames that calibrate: of others, a policy found four times as many odd."""
-    odd = frames.odd_samples(jumped.frames, jumped.seen, jumping)  # an eighth of those
-    for white, share in ((0, 1 / 8), (2, 1 / 4)):
-        unseen = [*memory_samples(8 - white, seed=9), *odd[:white]]
-        chooser = Chooser(dazzled, jumped, unseen, RANGE, odd)
-        assert (chooser.weights * chooser.is_odd).sum() / chooser.weights.sum() == pytest.approx(share)
-
-
-@pytest.mark.slow
 def test_a_policy_from_elsewhere_keeps_its_gates(tmp_path):
     """In 3 to 4 % of these frames layer4 is 50 to 270 times larger; every other observer is 2 and 10 % off."""
     folder = odd_policy()

@@ -3,7 +3,6 @@
 import functools
 import gc
 import itertools
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,15 +11,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies import TINY, lerobot_policy, memory_samples, saved, trainer_content
+from policies import TINY, lerobot_policy, memory_samples, saved
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act
-from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
+from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct
@@ -413,17 +411,3 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     with pytest.raises(QuantizeError, match="throttle of the written graph differs"):
         export(policy, tiny, tmp_path / "a.pt", memory_samples(2), calibration)
     assert not (tmp_path / "a.pt").exists()
-
-
-@pytest.mark.slow
-def test_an_artifact_has_the_weights_that_act_and_no_optimizer(tiny_policy, tiny, calibration, made, tmp_path):
-    """Static: a byte for each and at most 3 % more, so the user's 66.5 million take less than 70 MB."""
-    assert "optimizer_state_dict" in trainer_content(tiny_policy)
-    acting = sum(v.numel() for k, v in tiny_policy.state_dict().items() if "vae" not in k) / 1e6
-    fp32, static = tmp_path / "policy_fp32.pt", tmp_path / "policy_static.pt"
-    export(ACT(tiny.config, tiny.weights), tiny, fp32, memory_samples(1))
-    export(made(Scheme()), tiny, static, memory_samples(1), calibration)
-    assert fp32.stat().st_size / 1e6 < 1.05 * 4 * acting + 0.3
-    assert acting < static.stat().st_size / 1e6 < 1.03 * acting
-    shapes = expected_shapes(replace(ActConfig(), vae_layers=0)).values()
-    assert sum(map(math.prod, shapes)) / 1e6 == pytest.approx(66.5, abs=0.1)
