@@ -210,16 +210,7 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
-def doctor(
-    ctx: click.Context,
-    artifact: Path | None,
-    camera: str,
-    port: str,
-    hz: float,
-    receiver: bool,
-    recording: Path | None,
-    as_json: bool,
-) -> None:
+def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
     Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
@@ -231,10 +222,7 @@ def doctor(
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
     else:
-        log_folder = default_log().parent
-        found = checking.examine(
-            artifact, camera=camera, port=port, rate_hz=hz, log_folder=log_folder, recording=recording
-        )
+        found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
     checks = []
     for check in found:
         checks.append(check)

@@ -157,18 +157,12 @@ class Fidelity:
         judged = list(units)
         per_frame = self.errors(mode).mean(1)[:, judged] * list(units.values())  # (n, judged actions)
         order = np.argsort(-per_frame.max(1), kind="stable")[:count]
-        return [
-            WorstFrame(
-                mode,
-                self.action_names[judged[int(per_frame[i].argmax())]],
-                int(i),
-                float(per_frame[i].max()),
-                self.samples[i],
-                self.reference[i],
-                self.chunks[mode][i],
-            )
-            for i in order
-        ]
+        found = []
+        for i in order:
+            action, error_pct = self.action_names[judged[int(per_frame[i].argmax())]], float(per_frame[i].max())
+            plans = self.reference[i], self.chunks[mode][i]
+            found.append(WorstFrame(mode, action, int(i), error_pct, self.samples[i], *plans))
+        return found
 
 
 class LerobotEager:
@@ -254,15 +248,10 @@ def fidelity(
         raise PolicyError("there are no frames to compare on", remedy="record more, or hold out a larger share")
     for mode, policy in others.items():
         if (tuple(policy.action_names), policy.chunk) != (names, reference.chunk):
-            raise PolicyError(
-                f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 {reference.chunk} "
-                f"of {list(names)}",
-                remedy="compare artifacts of one checkpoint",
-            )
+            what = f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 other ones"
+            raise PolicyError(what, remedy="compare artifacts of one checkpoint")
     if missing := [n for n in names if n not in action_range]:
-        raise PolicyError(
-            f"no recorded range of action {missing}", found=sorted(action_range), remedy="use other recordings"
-        )
+        raise PolicyError(f"no recorded range of action {missing}", remedy="use other recordings")
     expected: list[np.ndarray] = []
     planned: dict[str, list[np.ndarray]] = {mode: [] for mode in others}
     for sample in progress(samples, desc="comparing", total=len(samples)):
@@ -361,26 +350,17 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     speed are `onboard.care.limits.check_gates`.
     """
     fp32, judged = compared["fp32"], compared["modes"][mode]
-    rows = [
-        gate(f"{mode} {key}", judged[key], "<=", limits[key])
-        for key in judged
-        if key.endswith("_mae_pct") and key in limits
-    ]
-    rows += [
-        gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"])
-        for key in judged
-        if key.endswith("_of_spread_pct") and judged[key] is not None
-    ]
+    original, size_mb = limits["original"], judged["size_mb"]
+    errors = [key for key in judged if key.endswith("_mae_pct")]
+    spreads = [key for key in judged if key.endswith("_of_spread_pct") and judged[key] is not None]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
-    rows += [
+    loss = judge.worst(judged[key] for key in errors)
+    return [
+        *(gate(f"{mode} {key}", judged[key], "<=", limits[key]) for key in errors if key in limits),
+        *(gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"]) for key in spreads),
         gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
         gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"]),
-        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"]),
-    ]
-    original = limits["original"]
-    loss = judge.worst(v for k, v in judged.items() if k.endswith("_mae_pct"))
-    rows += [
-        gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"]),
+        gate(f"{mode} size_mb", size_mb, "<=", limits["size_full_mb"]),
+        gate(f"{mode} model_size_mb", size_mb, "<=", original["model_size_mb"]),
         gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"]),
     ]
-    return rows
