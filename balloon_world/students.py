@@ -145,7 +145,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
         if own_manifest["checkpoint"]["sha256"] not in content["metrics"]["files_sha256"].values():
             raise DistillError(
                 f"{student / ARTIFACT}: is not made of the student that was distilled there",
-                remedy="'rover quantize' or 'rover run' makes it anew",
+                remedy="'rover run' makes it anew",
             )
         runs.append(
             _Run(student.name, student / ARTIFACT, own_manifest, content["metrics"]["students"][1], _counts(student))
@@ -163,7 +163,7 @@ def _read_distilled(student: Path) -> dict[str, Any]:
 
 def _artifact_of(run_dir: Path) -> Path:
     if not (path := run_dir / ARTIFACT).is_file():
-        raise DistillError(f"{path}: not there", remedy="'rover quantize' or 'rover run' makes it")
+        raise DistillError(f"{path}: not there", remedy="'rover run' makes it")
     return path
 
 
@@ -211,7 +211,7 @@ def _errors(
     """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
-        remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
+        remedy = "'rover run CHECKPOINT EPISODES' makes it"
         raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy=remedy)
     taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]

@@ -4,173 +4,43 @@ It is thin: it parses arguments, calls the library and prints.
 """
 
 import contextlib
-import functools
 import json
 import os
 import platform
-import re
 import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any
 
 import click
 
 from rover_lib.onboard.columns import align, benchmark_rows, number
-from rover_lib.onboard.errors import RoverError, of_system, printable
+from rover_lib.onboard.command import (
+    ARTIFACT,
+    AS_JSON,
+    CAMERA,
+    FILE,
+    LOG_DRIVE,
+    MOST_THREADS,
+    PORT,
+    SECONDS,
+    VERSION,
+    Rover,
+    show,
+    with_options,
+)
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
-FILE = click.Path(path_type=Path)
-ARTIFACT = PathTo("artifact")
-MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
-LONG_LIST = 12  # longer lists are for programs, and not printed for people
 BUSY = 0.5  # load per core in the last minute; above it, times are only rough
-# Options that several commands share:
-CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder, FIFO or .mjpeg."
-)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
-LOG_DRIVE = click.option(
-    "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
-)
 
 
-SECONDS = Number(min=0, min_open=True)
-
-
-class Unread:
-    """Standard output whose reader may have gone, as with `| head`.
-
-    That changes neither what a command does nor its exit code.
-    """
-
-    def __init__(self, stream: Any):
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        try:
-            return self._stream.write(text)
-        except BrokenPipeError:
-            return self._closed(len(text))
-
-    def flush(self) -> None:
-        try:
-            self._stream.flush()
-        except BrokenPipeError:
-            self._closed(0)
-
-    def _closed(self, written: int) -> int:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self._stream.fileno())  # so that Python's own flush at the end finds a reader too
-        os.close(nowhere)
-        return written
-
-
-class Rover(click.Group):
-    """A group of commands in which a bad input ends in one sentence and exit code 1; --debug adds the traceback."""
-
-    def main(self, *args: Any, **options: Any) -> Any:
-        with contextlib.redirect_stdout(cast(TextIO, Unread(sys.stdout))):
-            return super().main(*args, **options)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except RoverError as e:
-            if ctx.params.get("debug"):
-                raise
-            click.echo(f"rover: {printable(str(e))}", err=True)
-        except ModuleNotFoundError as e:
-            if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
-                raise
-            sentence = f"this command needs {e.name}, which only a workstation has: make demo sets one up"
-            if e.name == "aiohttp":
-                sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
-            click.echo(f"rover: {sentence}", err=True)
-        except OSError as e:
-            if ctx.params.get("debug"):
-                raise
-            click.echo(f"rover: {of_system(e)}", err=True)
-        except MemoryError:
-            if ctx.params.get("debug"):
-                raise
-            click.echo("rover: there is not enough memory; end other programs, or use fewer samples", err=True)
-        ctx.exit(1)
-
-
-class OnlyOnboard(Rover):
-    """The rover's commands alone. Any other ends in a sentence that says where there are more, and exit code 2."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if re.fullmatch("[a-z][a-z-]*", args[0]) and args[0] not in self.commands:
-            sentence = (
-                f"a rover has no `rover {args[0]}`: see `rover --help`, or type it on a workstation, which has more"
-            )
-            click.echo(f"rover: {sentence}", err=True)
-            ctx.exit(2)
-        return super().resolve_command(ctx, args)
-
-
-def show(value: Any, as_json: bool) -> None:
-    """Print a nested dict for people, or as JSON."""
-    from rover_lib.onboard.stage import plain
-
-    value = plain(value)
-    if as_json:
-        click.echo(json.dumps(value, indent=2))
-        return
-
-    def lines(v: Any, indent: str) -> None:
-        for key, inner in v.items() if isinstance(v, dict) else enumerate(v):
-            if isinstance(inner, list) and len(inner) > LONG_LIST:
-                click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
-            elif isinstance(inner, (dict, list)) and inner:
-                click.echo(f"{indent}{printable(key)}")
-                lines(inner, indent + "  ")
-            else:
-                text = f"{inner:.4g}" if isinstance(inner, float) else printable(inner)
-                click.echo(f"{indent}{printable(key):<28} {text}")
-
-    lines(value, "")
-
-
-def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
-    if asked and not ctx.resilient_parsing:
-        from rover_lib.onboard.versions import versions
-
-        click.echo("\n".join(versions()))
-        ctx.exit()
-
-
-VERSION = click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_versions,
-    help="Show the versions of this program, Python and the engines.",
-)
-
-
-@click.group(
-    "rover", cls=OnlyOnboard, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
-)
+@click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @VERSION
 def main(debug: bool) -> None:
     """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
-
-
-def with_options(*options: Callable) -> Callable[[Callable], Callable]:
-    """Make one decorator of several options that more than one command has."""
-    return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
 
 
 def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
@@ -336,16 +206,7 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
-def doctor(
-    ctx: click.Context,
-    artifact: Path | None,
-    camera: str,
-    port: str,
-    hz: float,
-    receiver: bool,
-    recording: Path | None,
-    as_json: bool,
-) -> None:
+def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
     Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
@@ -357,10 +218,7 @@ def doctor(
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
     else:
-        log_folder = default_log().parent
-        found = checking.examine(
-            artifact, camera=camera, port=port, rate_hz=hz, log_folder=log_folder, recording=recording
-        )
+        found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
     checks = []
     for check in found:
         checks.append(check)
@@ -500,7 +358,7 @@ def benchmark(
     "--model", default="", help="Content hash that the loaded model must have; otherwise the car is not armed."
 )
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
-@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
+@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no --heartbeat comes for this long.")
 @click.option(
     "--wait-s",
     type=Number(min=0),
@@ -508,14 +366,20 @@ def benchmark(
     show_default=True,
     help="How long to wait for the human's part of arming.",
 )
-def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float) -> None:
+@click.option("--heartbeat", is_flag=True, help="Only tell the drive that its operator is still there.")
+def arm_car(
+    yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float, heartbeat: bool
+) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
     Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
     steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
     """
-    from rover_lib.onboard.drive.service import Request
+    from rover_lib.onboard.drive.service import Request, ask_service
     from rover_lib.onboard.drive.service import arm_car as arm
+
+    if heartbeat:
+        return click.echo(ask_service(ask="heartbeat")["text"])
 
     def confirm(state: dict[str, Any]) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
@@ -524,14 +388,6 @@ def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float
     request = Request(max_seconds, heartbeat_s)
     ask = (lambda state: None) if yes else confirm
     click.echo(arm(request, model=model, confirm=ask, notify=click.echo, wait_s=wait_s))
-
-
-@main.command(short_help="Tell the drive that its operator is there.")
-def heartbeat() -> None:
-    """Tell the drive that its operator is there, and say what the car does. See `rover arm-car --heartbeat-s`."""
-    from rover_lib.onboard.drive.service import ask_service
-
-    click.echo(ask_service(ask="heartbeat")["text"])
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")

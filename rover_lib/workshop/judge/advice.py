@@ -4,7 +4,10 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+from jinja2 import ChainableUndefined, Environment, FileSystemLoader
 
 from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
 from rover_lib.workshop.judge import recorded_range as judge
@@ -97,68 +100,40 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:MOST_EPISODES]) + more
 
 
-# --- what to do about a gate that was missed --------------------------------------------------------------------------
+def _lines(template: str, **values: Any) -> list[str]:
+    """Fill in a template of this folder, and return its lines that are not empty."""
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=ChainableUndefined)
+    text = pages.get_template(template).render(some=_some, count=count, error_pct=error_pct, errors=_errors, **values)
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _errors(errors: Mapping[str, float | None]) -> str:
+    return ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
 
 
 def list_remedies(
     gate: str, stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
-    """Say what to do about a gate that FP32 or static INT8 misses, the cheapest remedy first."""
-    key = gate.partition(" ")[2]
-    if gate == "fp32 hits":
-        return [
-            "No other format can fix this: train longer, on more recordings.",
-            "Record drives in which the car has left its way and is steered back, so that the policy learns it.",
-        ]
-    smaller = f"a smaller policy can: `{_smaller(stages, names)}`."
-    if key == "floor_ms":
-        return [f"Driving at 30 Hz does not need it: one plan covers a second. No program can be faster, but {smaller}"]
-    if key in ("size_mb", "model_size_mb"):
-        return [f"INT8 cannot make it smaller; {smaller}"]
-    return _of_errors(key.removesuffix("_mae_pct").removesuffix("_of_spread_pct"), stages, params, names, rows)
-
-
-def _of_errors(
-    action: str, stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
-) -> list[str]:
-    quantized = stages["quantize"]
-    remedies = [_of_mixed(params, rows)]
-    # Where frames are odd, training with INT8's rounding began from bad ranges and repaired little. From good
-    # ones it is untried.
-    if quantized.get("odd"):
-        remedies.append(
-            "The frames that the cautions name take the steps of INT8 from all others: leave out drives that should "
-            "not be there, or train on more frames like them, so that the policy answers them as it does the others."
-        )
-    else:
-        remedies.append(f"Train it for INT8: `{_qat(names)}`, then `rover run` on what it leaves.")
+    """Say what to do about a gate that FP32 or static INT8 misses, the cheapest remedy first: remedies.txt."""
+    key, quantized = gate.partition(" ")[2], stages["quantize"]
+    action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct")
     alone = {block: errors.get(f"{action}_mae_pct") for block, errors in quantized.get("sensitivity", {}).items()}
-    if judged := {block: error for block, error in alone.items() if error is not None}:
-        block = max(judged, key=lambda name: judged[name])
-        remedies.append(f"Most of it comes from {block}: {judged[block]:.2f} % with that alone in INT8 (notebook 03).")
+    judged = {block: error for block, error in alone.items() if error is not None}
     limit = params["quantization"]["clipped_warn_pct"]
-    if clipped := [row["name"] for row in quantized.get("layers", []) if (row.get("clipped_pct") or 0) > limit]:
-        remedies.append(
-            f"{_some(clipped)} met larger values than in calibration: record more of what was missing there, such as "
-            "other light, other places, sharper turns."
-        )
-    frames = [w for w in stages["compare"].get("worst", []) if (w["mode"], w["action"]) == (GATED, action)]
-    if worst := list(dict.fromkeys(str(w["episode"]) for w in frames if w["episode"])):
-        where = "where the error is largest (notebook 04 shows the frames)"
-        remedies.append(f"Record more drives like {_some(worst)}, {where}.")
-    return remedies
-
-
-def _of_mixed(params: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> str:
-    mixed = rows.get("mixed")
-    if mixed is None or not mixed["float_blocks"]:
-        most = params["quantization"]["mixed_max_cost_pct"]
-        return f"Mixed can leave no block in float within a cost of {most:g} %: raise mixed_max_cost_pct in params.yml."
-    leaves = f"it leaves {', '.join(mixed['float_blocks'])} in float"
-    if mixed["missed_gates"]:
-        missed = ", ".join(row["words"] for row in mixed["missed_gates"])
-        return f"Mixed does not fix it: {leaves}, and still misses: {missed}."
-    return f"Mixed fixes it: {leaves}, and its largest error is {error_pct(mixed):.2f} %."
+    worst = [w for w in stages["compare"].get("worst", []) if (w["mode"], w["action"]) == (GATED, action)]
+    return _lines(
+        "remedies.txt",
+        gate=gate,
+        key=key,
+        smaller=_smaller(stages, names),
+        qat=_qat(names),
+        mixed=rows.get("mixed", {}),
+        most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
+        odd=quantized.get("odd"),
+        worst_block=max(judged.items(), key=lambda item: item[1], default=None),
+        clipped=[row["name"] for row in quantized.get("layers", []) if (row.get("clipped_pct") or 0) > limit],
+        episodes=list(dict.fromkeys(str(w["episode"]) for w in worst if w["episode"])),
+    )
 
 
 def _qat(names: Names) -> str:
@@ -181,90 +156,31 @@ def _smaller(stages: Stages, names: Names) -> str:
     return names.distill(*(shape or ["--feedforward", "1600"]), name=f"{names.name}-small")
 
 
-# --- what weakens the verdict -----------------------------------------------------------------------------------------
-
-
 def list_cautions(
     stages: Stages, params: Mapping[str, Any], judged: Mapping[str, Any], best: Mapping[str, Any], busy: str
 ) -> list[str]:
     """Say what weakens the verdict, such as numbers that do not fit, too few recordings, no trial drives, or times that
-    were not measured on a Pi. best: the row of the mode that the rule takes. busy: what shows that the machine was.
+    were not measured on a Pi: cautions.txt. best: the row of the mode that the rule takes. busy: what shows that the
+    machine was.
     """
-    compared, deploy = stages["compare"], judged["deploy"]
-    lines = _of_recordings(stages, params)
-    if deploy and not compared["fp32"]["trials"]:
-        lines.append(
-            "Nobody drove: only errors on recordings were judged. The first metres are the test, so hold the stick."
-        )
-    if odd := stages["quantize"].get("odd"):
-        lines.append(_of_odd_frames(odd))
-    notes = stages["load"]["checkpoint"].get("notes", [])
-    told = (*notes, *compared.get("warnings", []), *stages["quantize"].get("warnings", []))
-    lines += [f"{warning}." for warning in dict.fromkeys(told)]  # two stages may say the same
-    if judged["timing"] == "measured here":
-        lines.append(
-            "The times are this machine's; on a Pi another mode may be fastest: `ansible/benchmark.yml` measures it."
-        )
-    if busy:
-        least = "the least time of each mode is compared, and " if judged["compared"] == "least ms" else ""
-        lines.append(
-            f"This machine was busy when it took the times ({busy}): {least}a quiet machine gives better figures."
-        )
-    if best["mode"] == "fp32" and best["floor_ms"]:
-        lines.append(f"A plan in FP32 takes a Pi 5 at least {best['floor_ms']:.0f} ms (computed).")
-    student = stages.get("students", {}).get("recommendation", {}).get("name", "teacher")
-    if student != "teacher":
-        lines.append(f"A smaller policy may replace this one: {student}, as `rover world students` found.")
-    allowed = [why for kind, why in judged["refused"].items() if kind in MAY_DIFFER and kind != "mode"]
-    if deploy and allowed:
-        lines.append(
-            f"Was it trained for this car? A rover takes it only if rover_allow says so: {'; '.join(allowed)}."
-        )
-    return lines
-
-
-def _of_recordings(stages: Stages, params: Mapping[str, Any]) -> list[str]:
-    load, compared, lines = stages["load"], stages["compare"], []
-    if recomputed := load.get("recordings", {}).get("recomputed"):
-        lines.append(f"{recomputed[0].upper()}{recomputed[1:]}.")
-    if units := (load["checkpoint"].get("normalisation") or {}).get("units"):
-        lines.append(f"The policy was {units} once, in its artifacts: its 0.1687 meant stopped.")
-    steering = load.get("steering", {})
-    if steering.get("denied"):
-        lines.append(
-            f"The pictures show that positive steering turns {steering['side']}, and their car's file says otherwise: "
-            "is the camera's picture mirrored? `rover doctor` tells after a recorded minute."
-        )
-    if mirrored := steering.get("mirrored", []):
-        lines.append(f"Pictures of {_some(mirrored)} are mirrored beside the others': leave them out, or turn them.")
-    most, limit = compared.get("action_range", {}).get("throttle", (0, 0))[1], params["drive"]["throttle_limit"]
-    if most > limit:
-        place = "throttle_limit in rover_lib/onboard/params.yml"
-        lines.append(f"The recordings have throttle up to {most:.2f}, and a rover cuts it at {limit:g}: {place}.")
-    held_out = load["split"]["held_out"]
-    shared = set(held_out) & set(load["split"]["calibration"])
-    if shared or len(held_out) < params["verdict"]["held_out_episodes"]:
-        alone = ", which were also used to calibrate" if shared else ""
-        few = f"Judged on {compared['frames']} frames of {count(len(held_out), 'episode')}{alone}"
-        lines.append(f"{few}: too few to be sure. Record some 20 drives more, in other light and places.")
-    return lines
-
-
-def _of_odd_frames(odd: Mapping[str, Any]) -> str:
-    """Name the frames that the policy answers far more strongly than the others, and how far INT8 is off there.
-
-    odd: `frames.describe_odd`, and errors: {usual, odd: {<action>_mae_pct}} of static INT8.
-    """
-    off = {
-        kind: ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
-        for kind, errors in odd["errors"].items()
-    }
-    others = f", by {off['usual']} % on the others" if "usual" in off else ""
-    at_start = f", frame {max(odd['rows'])} or earlier" if max(odd["rows"]) < EARLY_FRAMES else ""
-    return (
-        f"In {odd['share_pct']:.1f} % of the frames ({_some(list(odd['episodes']))}{at_start}) {odd['block']} answers "
-        f"{odd['times']:.0f} times more than usual: what is special there? Static INT8 is off by {off['odd']} % on "
-        f"them{others}."
+    load, compared, quantized = stages["load"], stages["compare"], stages["quantize"]
+    told = [stage.get("warnings", []) for stage in (compared, quantized)]
+    return _lines(
+        "cautions.txt",
+        **stages,
+        judged=judged,
+        best=best,
+        busy=busy,
+        limits=params["verdict"],
+        early_frames=EARLY_FRAMES,
+        odd=quantized.get("odd"),
+        most_throttle=compared.get("action_range", {}).get("throttle", (0, 0))[1],
+        throttle_limit=params["drive"]["throttle_limit"],
+        held_out=load["split"]["held_out"],
+        shared=set(load["split"]["held_out"]) & set(load["split"]["calibration"]),
+        # Two stages may say the same.
+        warnings=dict.fromkeys([*load["checkpoint"].get("notes", []), *told[0], *told[1]]),
+        allowed=[why for kind, why in judged["refused"].items() if kind in MAY_DIFFER and kind != "mode"],
     )
 
 

@@ -2,7 +2,7 @@
 
     python -m rover_lib.workshop.run.copy_run demo try1     # what `make notebooks-open NAME=demo AS=try1` does
 
-The copy is a run like any other: `rover report runs/try1` judges it again, and `rover list` says whether it must.
+The copy is a run like any other: `rover report runs/try1` judges it again, and `rover inspect` says whether it must.
 """
 
 import os
@@ -25,7 +25,7 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     """
     source, folder = (run_folder(runs_dir, n, NotebookError) for n in (name, copy or f"{name}-copy"))
     if not (source / f"{NAMES[0]}.ipynb").is_file():
-        raise NotebookError(f"there is no run {source}", remedy="rover list shows the runs that there are")
+        raise NotebookError(f"there is no run {source}", remedy="rover inspect shows the runs that there are")
     if folder == source:
         raise NotebookError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
     if (folder / f"{NAMES[0]}.ipynb").is_file():

@@ -152,6 +152,14 @@ def files_of_a_run(folder: Path) -> list[Path]:
     return [path for path in own if path.exists()]
 
 
+def find_notebook(asked: str) -> str:
+    """The name of the notebook that begins like `asked`, such as 04. Raises NotebookError if there is none."""
+    found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
+    if len(found) != 1:
+        raise NotebookError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
+    return found[0]
+
+
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 

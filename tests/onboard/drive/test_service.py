@@ -862,7 +862,7 @@ def test_arming_asks_first(systemd):
     def operator() -> None:
         for options in (["--model", "cd34"], ["--max-seconds", "9"], ["--max-seconds", "9"]):
             results.append(CliRunner().invoke(main, ["arm-car", *options], input="y\n" if results[1:] else "n\n"))
-        results.append(CliRunner().invoke(main, ["heartbeat"]))
+        results.append(CliRunner().invoke(main, ["arm-car", "--heartbeat"]))
 
     with served() as service:
         thread = beside(systemd, operator)
