@@ -114,7 +114,6 @@ WRONG = [
     ("quantize best_model.pth episodes -o notes.txt/a/o.pt", "notes.txt: this is a file", "name a file elsewhere"),
     ("quantize best_model.pth episodes -o /dev/null", "/dev/null: this is no ordinary file", "another name"),
     ("benchmark policy_static.pt --output policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
-    ("world train episodes policy_static.pt", "policy_static.pt: this is an artifact", "another name"),
     ("log flight.log -o flight.log", "flight.log: this is a flight log", "another name"),
     ("log flight.log --mcap flight.log", "flight.log: this is a flight log", "another name"),
     ("drive policy_static.pt --log best_model.pth", "best_model.pth: this is a trainer's checkpoint", "another name"),
