@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from executed import shown, text_of
 
-from balloon_world import frontier, latency
+from balloon_world import latency, students
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
@@ -78,11 +78,11 @@ def test_a_student_of_its_own_is_judged_beside_it(demo_run):
     assert teacher["trials"] == teacher["pushed_trials"] == student["trials"] == student["pushed_trials"] == 40
     assert teacher["hits"] >= 36 and student["hits"] >= 36  # it has learned enough to be worth a look
     assert teacher["teacher_steering_pct"] < 0.5 < student["teacher_steering_pct"] < 5
-    gates = frontier.gates_of(student, teacher, params()["students"])
+    gates = students.gates_of(student, teacher, params()["students"])
     assert metrics["recommendation"]["gates"] == gates
     assert metrics["recommendation"]["name"] == ("demo-small" if all(g["passed"] for g in gates) else "teacher")
     text = shown(demo_run / "08_distill.ipynb")
-    assert "\n".join(frontier.sentences(metrics)) in text and str(frontier.table(metrics)) in text
+    assert "\n".join(students.sentences(metrics)) in text and str(students.table(metrics)) in text
     figures = {p.stem for p in (demo_run / "figures").glob("08_*.png")}
     assert figures == {f"08_{figure}" for figure in ("frontier", "losses")}
 

@@ -17,7 +17,7 @@ from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
 from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act
-from rover_lib.workshop.act import ACT, ActConfig, expected_shapes, inputs_of, predictions
+from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
