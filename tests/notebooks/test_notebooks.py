@@ -10,10 +10,8 @@ import nbformat
 import pytest
 from executed import run_cells
 
-from lab.repository import publish
-from lab.repository.publish import NOTEBOOK_LIMIT, RESULTS_OF
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import read_stage, write_stage
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import run_report
 from rover_lib.workshop.run.copy_run import copy_run
@@ -41,7 +39,7 @@ def test_parameters_are_literals_with_a_reason_and_those_of_params_yml(path):
 def test_committed_outputs_are_clean(path):
     text, notebook = path.read_text(), nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
-    assert len(text) < NOTEBOOK_LIMIT
+    assert len(text) < 1_000_000
     assert not re.search(r"(/home/|/root/|/tmp/|/Users/|/work/|[A-Z]:\\\\)", text)
     assert "papermill" not in notebook.metadata and "Warning" not in text
     for cell in notebook.cells:
@@ -86,7 +84,7 @@ def written(folder, name, *cells):
 
 @pytest.fixture
 def one_notebook(monkeypatch, tmp_path):
-    for module in (runs, publish):
+    for module in (runs,):
         monkeypatch.setattr(module, "NAMES", ("01_load",))
     return tmp_path / "notebooks"
 
@@ -203,59 +201,6 @@ def test_root_learns_at_once_that_it_may_load_no_artifact(one_notebook, old_run,
     monkeypatch.setattr("os.geteuid", lambda: 0)
     with pytest.raises(runs.RoverError, match="root does not load artifacts"):
         run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began"))
-
-
-# --- publishing ---
-
-
-def stream(text, name="stdout"):
-    return nbformat.v4.new_output("stream", name=name, text=text)
-
-
-def test_publishing_takes_outputs_without_counts_and_noise(one_notebook, tmp_path):
-    written(one_notebook, "01_load", ("parameters", "a = 1  # one"), ("work", "print(a)\na"))
-    shown = nbformat.v4.new_output("execute_result", data={"text/plain": "1"}, execution_count=3)
-    ran = ("work", "print(a)\na", [stream("1\n"), stream("noise", "stderr"), shown])
-    written(tmp_path / "run", "01_load", ("parameters", "a = 2  # one"), ran)
-    (path,) = publish.publish(tmp_path / "run", one_notebook)
-    parameters, work = nbformat.read(path, as_version=4).cells
-    assert parameters.source == "a = 1  # one"
-    assert [o.output_type for o in work.outputs] == ["stream", "execute_result"]
-    assert work.outputs[1].execution_count is None
-
-
-def test_publishing_refuses_paths_and_changed_cells(one_notebook, tmp_path):
-    written(one_notebook, "01_load", ("work", "print(1)"))
-    before = (one_notebook / "01_load.ipynb").read_text()
-    written(tmp_path / "run", "01_load", ("work", "print(1)", [stream(f"{tmp_path}/run/x")]))
-    with pytest.raises(runs.NotebookError, match="print names"):
-        publish.publish(tmp_path / "run", one_notebook)
-    written(tmp_path / "run", "01_load", ("work", "print(2)", [stream("2")]))
-    with pytest.raises(runs.NotebookError, match="not what was executed"):
-        publish.publish(tmp_path / "run", one_notebook)
-    assert (one_notebook / "01_load.ipynb").read_text() == before
-
-
-def test_publishing_leaves_the_json_behind_the_outputs(one_notebook, tmp_path):
-    written(one_notebook, "01_load", ("work", "print(1)"))
-    written(tmp_path / "mine", "01_load", ("work", "print(1)", [stream("1\n")]))
-    given, inputs = {"checkpoint": tmp_path / "mine" / "best_model.pth"}, {f"{i}.jpg": "0" * 64 for i in range(1000)}
-    write_stage(tmp_path / "mine" / "load.json", "load", params=given, metrics={"mae": [1 / 3]}, inputs=inputs)
-    _, path = publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
-    content = read_stage(path, "load")
-    assert content["params"] == {"checkpoint": "best_model.pth"} and content["metrics"] == {"mae": [0.333333]}
-    assert list(content["inputs"]) == ["1000 files"]
-    write_stage(tmp_path / "mine" / "load.json", "load", params={}, metrics={"note": f"see {tmp_path}/x"})
-    with pytest.raises(runs.NotebookError, match="shows a path of this machine"):
-        publish.publish(tmp_path / "mine", one_notebook, ("01_load",))
-    assert read_stage(path, "load") == content
-
-
-def test_committed_results_are_small_and_show_no_path():
-    assert set(RESULTS_OF) == {*NAMES, *AFTERWARDS}
-    texts = [p.read_text() for p in (NOTEBOOKS.parent / "results").rglob("*.json")]
-    assert not [t for t in texts if publish.ABSOLUTE.search(t)]
-    assert sum(len(t) for t in texts) < 1_000_000
 
 
 # --- turning parameters ---
