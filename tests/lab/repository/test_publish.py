@@ -11,7 +11,8 @@ from rover_lib.workshop.run.run import NOTEBOOKS
 
 def cell(source, *outputs, tags=()):
     made = nbformat.v4.new_code_cell(source, outputs=list(outputs), metadata={"tags": list(tags)})
-    return made | {"id": tags[0] if tags else "work"}
+    made.id = tags[0] if tags else "work"
+    return made
 
 
 def notebook(*cells):
@@ -30,7 +31,7 @@ def test_outputs_come_without_counts_and_noise():
     assert parameters.source == "a = 1"
     assert [output.output_type for output in work.outputs] == ["stream", "execute_result"]
     assert work.outputs[1].execution_count is None
-    with pytest.raises(RoverError, match="work"):
+    with pytest.raises(RoverError, match="not what was executed"):
         publish.with_outputs(stored, notebook(cell("b")), "01")
 
 
