@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
-PACKAGES := rover_lib rover_exchange rover_look rover_hailo rover_learn balloon_world lab lerobot_robot_rover
+PACKAGES := rover_lib rover_exchange rover_learn balloon_world lab lerobot_robot_rover
 READY := $(VENV)/.ready
 # Each process runs whole test files or notebooks, and one waits while others compute. More than four processes would
 # cost more memory than they save time.
@@ -17,7 +17,7 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants kills pi-fast pi firmware flash notebooks tables docs clean
+.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants pi firmware flash notebooks tables docs clean
 
 help:
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
@@ -39,8 +39,7 @@ help:
 	@echo "make faults-cars                            the same on other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
-	@echo "make kills                                  kill what writes files at random moments, and fill its disk: root"
-	@echo "make pi-fast; make pi                       emulated Pis: every playbook in a container; a whole machine. Root, Debian 12"
+	@echo "make pi                                     the playbooks on an emulated Pi in a container: root, Debian 12"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
 	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
 	@echo "make tables                                 the pages' tables alone"
@@ -102,12 +101,12 @@ test: lint $(DEMO)
 test-fast: $(READY)
 	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
-# Tests in real time, of whole fleets and of whole machines. Run them on a quiet machine before each release.
+# Tests in real time and of whole fleets. Run them on a quiet machine before each release.
 check-release: lint $(DEMO)
 	$(MAKE) demo-more
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
-	$(MAKE) faults faults-cars random mutants kills pi-fast pi
+	$(MAKE) faults faults-cars random mutants pi
 
 coverage: $(DEMO)
 	$(VENV)/bin/pytest $(PACKAGES:%=--cov=%) --cov-report=term
@@ -131,18 +130,10 @@ random: $(READY)
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
 
-kills: $(READY)
-	$(LAB) kills runs/kills.json
-
-# This deploys the demo's artifacts.
-pi-fast: $(READY)
-	@test -f runs/demo/policy_mixed.pt || $(MAKE) demo
-	$(LAB) pi fast runs/pi-fast.json
-
-# This deploys the demo's artifact, and the emulated camera shows the demo's recordings.
+# This deploys the demo's artifact.
 pi: $(READY)
 	@test -f runs/demo/policy_static.pt || $(MAKE) demo
-	$(LAB) pi whole runs/pi.json
+	$(LAB) pi runs/pi.json
 
 firmware:
 	$(MAKE) -C firmware

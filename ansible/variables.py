@@ -13,11 +13,11 @@ BEGIN, END = "<!-- variables -->\n", "<!-- end of variables -->\n"
 def table() -> str:
     """Return the table: a row for each variable, in the order of the specs."""
     entries = yaml.safe_load(SPECS.read_text())["argument_specs"].values()
-    lines = ["| variable | default | means |", "|---|---|---|"]
+    lines = ["variable | default | means", "---|---|---"]
     for name, o in {name: o for spec in entries for name, o in spec["options"].items()}.items():
         default = "must be given" if o.get("required") else f"`{_shown(o['default'])}`"
         others = [choice for choice in o.get("choices", ()) if choice != o["default"]]
-        lines.append(f"| `{name}` | {default}{' or ' * bool(others)}{', '.join(others)} | {o['description']} |")
+        lines.append(f"`{name}` | {default}{' or ' * bool(others)}{', '.join(others)} | {o['description']}")
     return "\n".join(lines) + "\n"
 
 

@@ -1,14 +1,11 @@
 """The balloon world's commands."""
 
-import contextlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rover_learn.cli import train
 from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
 from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
@@ -28,9 +25,6 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     from balloon_world.record import record_episodes
 
     click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar())}")
-
-
-world.add_command(train)
 
 
 @world.command(short_help="Drive an artifact through unseen worlds; count hits.")
@@ -62,24 +56,9 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run.run import execute
 
-    with _anew(run_dir / "drive.json"):  # the present one may be of another version
-        execute("07_drive", run_dir, worlds=worlds)
+    execute("07_drive", run_dir, worlds=worlds)
     content = read_stage(run_dir / "drive.json", "drive")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
-
-
-@contextlib.contextmanager
-def _anew(file: Path) -> Iterator[None]:
-    """Move a file away, so that the block has to make it anew. If the block does not, the old file is put back."""
-    before = file.with_name(f".{file.name}.before")  # if it exists now, a process was killed here
-    if file.exists():
-        file.replace(before)
-    try:
-        yield
-    finally:
-        if before.exists() and not file.exists():
-            before.replace(file)
-        before.unlink(missing_ok=True)
 
 
 @world.command(short_help="Judge distilled policies beside their teacher.")
@@ -102,8 +81,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
     students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
     it is ended at any moment, the same command continues where it was.
     """
-    from balloon_world.frontier import sentences, table
-    from balloon_world.students import judge_students
+    from balloon_world.students import judge_students, sentences, table
     from rover_lib.workshop.run.run import execute
 
     content = judge_students(teacher_run, student_runs, progress=terminal_bar(), **options)

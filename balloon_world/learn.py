@@ -1,6 +1,6 @@
-"""Does a car drive better once it was corrected? Compare rounds of takeovers and learning with demonstrations.
+"""Notebook 09: does a car drive better once it was corrected? Compare takeovers and learning with demonstrations.
 
-    content = measured("runs/demo", "runs/demo-learn")
+    content = run_experiment("runs/demo", "runs/demo-learn")
 
 In each round the policy drives with late plans and is pushed. An expert takes over where a human would, and drives on
 to the end. Then the first checkpoint is trained further on everything recorded so far. The other arm learns the same
@@ -13,18 +13,24 @@ Every policy drives as its static INT8 artifact, which is what would drive the c
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from balloon_world.frontier import sign_test
-from balloon_world.latency import SEED, Condition, Plans, drive_in, drive_late
+from balloon_world.drives import (
+    SEED,
+    Driven,
+    Watch,
+    append_row,
+    count_hits,
+    drive_in,
+    drive_missing,
+    pair_worlds,
+    read_rows,
+)
 from balloon_world.record import WorldEpisode, episode_name
-from balloon_world.side_by_side import append_row, everywhere, load_for_cores, read_rows
-from balloon_world.trial import wilson_interval
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
@@ -57,6 +63,8 @@ HALF_A_TICK_S = 0.5 / RATE_HZ
 JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
+HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
+NOTHING = "Nothing is here yet: `rover world learn runs/demo` drives, corrects and learns."
 BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
 
 
@@ -83,44 +91,30 @@ class Human:
         return takes_over
 
 
-@dataclass(frozen=True)
-class Corrected:
-    """A drive that a human watched.
+def drive_corrected(policy: Policy, folder: Path, index: int, world: World, experiment: "Experiment") -> dict[str, Any]:
+    """Record drive number `index`: the policy drives until the human would take over, then the expert, to the end.
 
-    outcome: of the whole drive, as LateDrive's. taken_over_s: when the human took over, None if nobody had to.
-    human_s: for how long the human drove.
+    Returns {"outcome": of the whole drive, "taken_over_s": None if nobody had to, "human_s": for how long they drove}.
     """
-
-    seed: int
-    outcome: str
-    taken_over_s: float | None
-    human_s: float
-
-
-def drive_corrected(
-    policy: Plans, folder: Path, index: int, seed: int, condition: Condition, human: Human
-) -> Corrected:
-    """Record drive number `index`: the policy drives until `human` would take over, then the expert, to the end."""
-    world = World(seed, condition.pushes, condition.decoys)
-    takes_over = human.watching(world)
+    takes_over = experiment.human.watching(world)
     with WorldEpisode(folder, _start(index), world) as episode:
 
         def watch(order: Order) -> bool:
             episode.tick(order.steering, order.throttle, driver=POLICY)
             return takes_over(order)
 
-        driven = drive_in(policy, world, condition, watch)
+        driven = experiment.drive(policy, world, watch)
         taken_over_s = world.state.time_s if driven.outcome == "taken over" else None
         if taken_over_s is None:
-            return Corrected(seed, driven.outcome, None, 0.0)
+            return {"outcome": driven.outcome, "taken_over_s": None, "human_s": 0.0}
         while not world.done:
             world.step(*episode.tick(*expert(world), driver=HUMAN))
-        return Corrected(seed, str(world.outcome), taken_over_s, world.state.time_s - taken_over_s)
+        human_s = world.state.time_s - taken_over_s
+        return {"outcome": str(world.outcome), "taken_over_s": taken_over_s, "human_s": human_s}
 
 
-def demonstrate(folder: Path, index: int, seed: int, condition: Condition, most_s: float) -> float:
+def demonstrate(folder: Path, index: int, world: World, most_s: float) -> float:
     """Record a whole drive of the expert, or its first most_s seconds. Returns how many seconds were recorded."""
-    world = World(seed, condition.pushes, condition.decoys)
     with WorldEpisode(folder, _start(index), world) as episode:
         while not world.done and world.state.time_s < most_s - HALF_A_TICK_S:
             world.step(*episode.tick(*expert(world), driver=HUMAN))
@@ -154,16 +148,19 @@ class Experiment:
             found = f"{self.rounds}, {self.drives}, {self.worlds} and {self.other_worlds}"
             raise WorldError("learning needs at least one round, drive and world", found=found)
 
-    def settings(self) -> Settings:
-        return Settings.of(params()["drive"])
+    def drive(self, policy: Policy, world: World, watch: Watch | None = None) -> Driven:
+        return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch)
 
-    def learned_in(self, number: int) -> Condition:
-        """Return the condition of a round's drive by its number."""
-        return Condition(self.latency_ms / 1e3, self.settings(), self.pushes, self.decoys if number % 2 else 0)
+    def learned_in(self, number: int, seed: int) -> World:
+        """Return the world of a round's drive by its number."""
+        return World(seed, self.pushes, self.decoys if number % 2 else 0)
 
-    def judged_in(self) -> dict[str, Condition]:
-        alone = Condition(self.latency_ms / 1e3, self.settings())
-        return {PUSHED: replace(alone, pushes=self.pushes), ALONE: alone, DECOY: replace(alone, decoys=self.decoys)}
+    def judged_in(self, how: str, seed: int) -> World:
+        return World(seed, self.pushes if how == PUSHED else 0, self.decoys if how == DECOY else 0)
+
+    def seeds(self, how: str) -> range:
+        """Return the seeds of the worlds that judge a policy that is pushed, left alone or beside a decoy."""
+        return range(SEED, SEED + (self.worlds if how == PUSHED else self.other_worlds))
 
     def recipe(self) -> FinetuneRecipe:
         """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
@@ -194,11 +191,12 @@ def run_experiment(
     if there := find_stage(path, "learn", params=given, inputs=inputs):
         return there
     learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
-    _begin(out_dir, {"params": learned, "inputs": inputs})
+    _begin(out_dir, {"params": learned, "inputs": inputs, "format": 2})
     lab = _Lab(experiment, run_dir, out_dir, progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
-    lab.judge()
-    metrics = _metrics(lab, rounds)
+    rows = lab.judge(rounds)
+    content = {"rounds": rounds, "policies": rows, "pairs": _pairs(rows)}
+    metrics = content | {"gates": gates(rows), "said": sentences(content)}
     return write_stage(path, "learn", params=given, metrics=metrics, inputs=inputs)
 
 
@@ -211,17 +209,14 @@ def read_experiment(run_dir: Path | str) -> dict[str, Any] | None:
 def _begin(out_dir: Path, made_of: dict[str, Any]) -> None:
     """Note in out_dir which experiment it belongs to. Raises WorldError if it holds another one or something else."""
     path = out_dir / BEGUN
-    if path.is_file() and json.loads(path.read_text()) != made_of:
-        raise WorldError(
-            f"{out_dir}: holds another experiment, of another checkpoint or other parameters",
-            remedy="remove it, or name another folder with --out",
-        )
-    if not path.is_file() and out_dir.is_dir() and any(out_dir.iterdir()):
-        raise WorldError(f"{out_dir}: exists and is not of this", remedy="name another folder with --out")
+    if path.is_file() and json.loads(path.read_text()) == made_of:
+        return
+    if out_dir.is_dir() and any(out_dir.iterdir()):
+        remedy = "remove it, or name another folder with --out"
+        raise WorldError(f"{out_dir}: exists, and is not of this experiment", remedy=remedy)
     out_dir.mkdir(parents=True, exist_ok=True)
-    if not path.is_file():
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(made_of, indent=2) + "\n")
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(made_of, indent=2) + "\n")
 
 
 class _Lab:
@@ -231,11 +226,6 @@ class _Lab:
         self.experiment, self.run_dir = experiment, run_dir
         self.folder, self.progress = folder, progress
 
-    def policies(self) -> dict[str, Path]:
-        """Return the paths of all artifacts by the policies' names."""
-        learned = {_name(arm, n): self._learned(arm, n) for arm in ARMS for n in range(1, self.experiment.rounds + 1)}
-        return {BEFORE: self.run_dir / ARTIFACT, **learned}
-
     def _learned(self, arm: str, number: int) -> Path:
         return self.folder / "learned" / _name(arm, number) / ARTIFACT
 
@@ -244,21 +234,20 @@ class _Lab:
         before = self.run_dir / ARTIFACT if number == 1 else self._learned(CORRECTED, number - 1)
         drives = self._drive(before, number)
         human_s = sum(d["human_s"] for d in drives)
+        if not human_s and number == 1:
+            remedy = "drive more, later, or with more pushes"
+            raise WorldError(
+                "nobody had to take over: there is nothing to learn from", found=len(drives), remedy=remedy
+            )
         self._demonstrate(number, human_s)
         for arm in ARMS:
             if not self._learned(arm, number).is_file():
                 recorded = [self.folder / _name(arm, n) for n in range(1, number + 1)]
-                if not any(_drives_of(folder, "human_s") for folder in recorded):
-                    raise WorldError(
-                        f"nobody had to take over in {len(drives)} drives: there is nothing to learn from",
-                        remedy="drive more, later, or with more pushes",
-                    )
                 self._learn(arm, number, [folder for folder in recorded if any(folder.glob("episode_*"))])
-        taken_over = [d for d in drives if d["taken_over_s"] is not None]
         return {
             "round": number,
             "human_s": human_s,
-            "takeovers": len(taken_over),
+            "takeovers": sum(d["taken_over_s"] is not None for d in drives),
             "drives": len(drives),
             "missed": sum(d["outcome"] != "hit" for d in drives),
         }
@@ -281,85 +270,67 @@ class _Lab:
 
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
         """Return a round's drives with a human beside the track, and first record those that are missing."""
-        folder = self.folder / _name(CORRECTED, number)
-        done = _sweep_unfinished(folder)
-        missing = [i for i in range(self.experiment.drives) if i not in done]
-        if missing:
+        folder, first = self.folder / _name(CORRECTED, number), 1000 * number
+        _remove_unfinished(folder)
 
-            def one(driver: Policy, i: int) -> dict[str, Any]:
-                at, seed = 1000 * number + i, FIRST_LEARNED + 1000 * number + i
-                driven = drive_corrected(driver, folder, at, seed, self.experiment.learned_in(i), self.experiment.human)
-                return {"drive": i} | asdict(driven)
+        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
+            i = asked[1] - FIRST_LEARNED - first
+            return drive_corrected(policy, folder, first + i, self.experiment.learned_in(i, asked[1]), self.experiment)
 
-            every = everywhere(load_for_cores(artifact, len(missing)), missing, one)
-            for _, row in self.progress(every, desc=f"driving, round {number}", total=len(missing)):
-                append_row(folder / DRIVES_FILE, row)
-        rows = _drives_of(folder)
-        return [rows[i] for i in range(self.experiment.drives)]
+        asked = [(CORRECTED, FIRST_LEARNED + first + i) for i in range(self.experiment.drives)]
+        desc = f"driving, round {number}"
+        return list(drive_missing(artifact, asked, one, folder / DRIVES_FILE, self.progress, desc).values())
 
     def _demonstrate(self, number: int, most_s: float) -> None:
         """Record most_s seconds of whole drives by the expert; the last drive is cut."""
-        folder = self.folder / _name(DEMONSTRATED, number)
-        _sweep_unfinished(folder)
+        folder, first = self.folder / _name(DEMONSTRATED, number), 1000 * number
+        _remove_unfinished(folder)
+        done = {row["seed"]: row["human_s"] for row in read_rows(folder / DRIVES_FILE)}
         i, left_s = 0, most_s
         while left_s > HALF_A_TICK_S:
-            rows = _drives_of(folder)
-            if i not in rows:
-                seed = FIRST_DEMONSTRATED + 1000 * number + i
-                driven_s = demonstrate(folder, 1000 * number + i, seed, self.experiment.learned_in(i), left_s)
-                append_row(folder / DRIVES_FILE, {"drive": i, "seed": seed, "human_s": driven_s})
-                rows = _drives_of(folder)
-            left_s -= rows[i]["human_s"]
+            seed = FIRST_DEMONSTRATED + first + i
+            if seed not in done:
+                done[seed] = demonstrate(folder, first + i, self.experiment.learned_in(i, seed), left_s)
+                append_row(folder / DRIVES_FILE, {"seed": seed, "human_s": done[seed]})
+            left_s -= done[seed]
             i += 1
 
-    def judge(self) -> None:
-        """Drive every policy through those of the judging worlds that it has not driven yet."""
-        conditions = self.experiment.judged_in()
+    def judge(self, rounds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Drive every policy through the worlds that judge, and return the rows of learn.json.
 
-        for name, artifact in self.policies().items():
-            done = self.outcomes(name)
-            missing = [(how, seed) for how in conditions for seed in self.seeds(how) if seed not in done[how]]
-            if not missing:
-                continue
-            every = everywhere(
-                load_for_cores(artifact, len(missing)),
-                missing,
-                lambda driver, asked: drive_late(driver, asked[1], conditions[asked[0]]).outcome,
-            )
-            for (how, seed), outcome in self.progress(every, desc=f"judging {name}", total=len(missing)):
-                append_row(self.folder / f"{name}.jsonl", {"how": how, "seed": seed, "outcome": outcome})
+        A policy's file keeps its drives, so that only those that are missing are driven.
+        """
 
-    def seeds(self, how: str) -> range:
-        """Return the seeds of the worlds that judge under a condition."""
-        return range(SEED, SEED + (self.experiment.worlds if how == PUSHED else self.experiment.other_worlds))
+        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
+            return {"outcome": self.experiment.drive(policy, self.experiment.judged_in(*asked)).outcome}
 
-    def outcomes(self, name: str) -> dict[str, dict[int, str]]:
-        """Return a policy's outcomes by condition and seed, only for the worlds that judge: its file may have more."""
-        found: dict[str, dict[int, str]] = {how: {} for how in self.experiment.judged_in()}
-        for row in read_rows(self.folder / f"{name}.jsonl"):
-            if row["seed"] in self.seeds(row["how"]):
-                found[row["how"]][row["seed"]] = row["outcome"]
-        return found
+        asked = [(how, seed) for how in HOW for seed in self.experiment.seeds(how)]
+        learned = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
+        rows = []
+        for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *learned]:
+            name = _name(arm, number) if number else BEFORE
+            file, desc = self.folder / f"{name}.jsonl", f"judging {name}"
+            found = drive_missing(artifact, asked, one, file, self.progress, desc)
+            human_s = float(sum(r["human_s"] for r in rounds[:number]))
+            row: dict[str, Any] = {"name": name, "arm": arm, "round": number, "human_s": human_s}
+            for how in HOW:
+                row[how] = count_hits({seed: each["outcome"] for (of, seed), each in found.items() if of == how})
+                missed = row[how]["missed"]
+                row[how]["hits_of_40"] = sum(s not in missed for s in range(SEED, SEED + GATED_WORLDS))
+            rows.append(row)
+        return rows
 
 
 def _name(arm: str, number: int) -> str:
     return f"{arm}-{number}"
 
 
-def _drives_of(folder: Path, wanted: str = "drive") -> dict[int, dict[str, Any]]:
-    """Return a folder's drives by number: all, or only those whose value of the key `wanted` is not 0."""
-    return {r["drive"]: r for r in read_rows(folder / DRIVES_FILE) if wanted == "drive" or r[wanted]}
-
-
-def _sweep_unfinished(folder: Path) -> dict[int, dict[str, Any]]:
-    """Return the drives that are complete, and remove what a killed process left of others."""
-    done = _drives_of(folder)
-    number = int(folder.name.rpartition("-")[2])
-    kept = {episode_name(_start(1000 * number + i)) for i in done}
+def _remove_unfinished(folder: Path) -> None:
+    """Remove recordings that a killed process left of drives that are not in the folder's file."""
+    kept = {episode_name(_start(row["seed"] % 1_000_000)) for row in read_rows(folder / DRIVES_FILE)}
     for path in folder.glob("*") if folder.is_dir() else ():
         if path.is_dir() and path.name not in kept:
             shutil.rmtree(path)
-    return done
 
 
 def _start(index: int) -> datetime:
@@ -370,49 +341,16 @@ def _start(index: int) -> datetime:
 # --- the results ------------------------------------------------------------------------------------------------------
 
 
-def _metrics(lab: _Lab, rounds: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    experiment = lab.experiment
-    spent = np.cumsum([r["human_s"] for r in rounds]).tolist()
-    rows = []
-    for name in lab.policies():
-        arm, _, number = name.partition("-")
-        row: dict[str, Any] = {"name": name, "arm": arm, "round": int(number or 0)}
-        row["human_s"] = spent[int(number) - 1] if number else 0.0
-        for how, outcomes in lab.outcomes(name).items():
-            missed = [seed for seed, outcome in sorted(outcomes.items()) if outcome != "hit"]
-            trials = len(lab.seeds(how))
-            hits = trials - len(missed)
-            low, high = wilson_interval(hits, trials)
-            row[how] = {
-                "hits": hits,
-                "trials": trials,
-                "wilson_low": low,
-                "wilson_high": high,
-                "hits_of_40": sum(s not in missed for s in range(SEED, SEED + GATED_WORLDS)),
-                "missed": missed,
-            }
-        rows.append(row)
-    pairs = []
-    by_name = {row["name"]: row for row in rows}
+def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Compare each learned policy with the first, and each corrected one with the demonstrated one of its round."""
+    pairs, by_name = [], {row["name"]: row for row in rows}
     for row in rows[1:]:
         others = [BEFORE] if row["arm"] == DEMONSTRATED else [BEFORE, _name(DEMONSTRATED, row["round"])]
-        pairs += [_pair(row, by_name[other], how) for other in others for how in experiment.judged_in()]
-    content = {"rounds": list(rounds), "policies": rows, "pairs": pairs}
-    return content | {"gates": gates(rows), "said": sentences(content)}
-
-
-def _pair(row: Mapping[str, Any], other: Mapping[str, Any], how: str) -> dict[str, Any]:
-    """Compare two policies in the same worlds: count the worlds that only one of them hit."""
-    own, others = set(row[how]["missed"]), set(other[how]["missed"])
-    only, only_other = len(others - own), len(own - others)
-    return {
-        "name": row["name"],
-        "other": other["name"],
-        "how": how,
-        "only_hits": only,
-        "only_other_hits": only_other,
-        "sign_test_p": sign_test(only, only_other),
-    }
+        for other, how in product(others, HOW):
+            only, only_other, p = pair_worlds(row[how]["missed"], by_name[other][how]["missed"])
+            hits = {"only_hits": only, "only_other_hits": only_other, "sign_test_p": p}
+            pairs.append({"name": row["name"], "other": other, "how": how, **hits})
+    return pairs
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -420,11 +358,11 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     rows: of learn.json. Hits are judged only if all of those 40 worlds were driven.
     """
-    last = [row for row in rows if row["arm"] == CORRECTED][-1]
+    last, other = ([row for row in rows if row["arm"] == arm][-1] for arm in ARMS)
     hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
     lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]
-    other = [row for row in rows if row["arm"] == DEMONSTRATED][-1]
-    by_chance = _pair(last, other, PUSHED)["sign_test_p"] if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
+    _, _, p = pair_worlds(last[PUSHED]["missed"], other[PUSHED]["missed"])
+    by_chance = p if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
     return [
         gate(f"hits of {GATED_WORLDS} when pushed, corrected", hits[PUSHED], ">=", params()["gates"]["corrected_hits"]),
         gate(f"hits of {GATED_WORLDS} lost when left alone", lost, "<=", 0),
@@ -432,30 +370,22 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-NOTHING = "Nothing is here yet: `rover world learn runs/demo` drives, corrects and learns."
-HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
-
-
 def sentences(metrics: Mapping[str, Any]) -> list[str]:
     """Say in plain English what the experiment showed, whatever it was. metrics: of learn.json."""
-    rows = metrics["policies"]
-    last = max(row["round"] for row in rows)
-    seconds = next(row["human_s"] for row in rows if row["round"] == last)
-    lines = [f"{last} rounds cost {seconds:.0f} human seconds, as many for the other arm."]
-    for how, words in HOW.items():
-        for other, name in ((BEFORE, "before"), (_name(DEMONSTRATED, last), "after demonstrations")):
-            pair = next(
-                p for p in metrics["pairs"] if (p["name"], p["other"], p["how"]) == (_name(CORRECTED, last), other, how)
-            )
-            own, others = (next(r for r in rows if r["name"] == pair[k])[how] for k in ("name", "other"))
-            told = "better" if own["hits"] > others["hits"] else "worse"
-            if pair["sign_test_p"] >= CHANCE:
-                told = "neither better nor worse, as far as these worlds tell,"
-            lines.append(
-                f"{words[:1].upper()}{words[1:]}, the corrected policy is {told} than {name}: {own['hits']} of "
-                f"{own['trials']} worlds, not {others['hits']}; {pair['only_hits']} only it hit, "
-                f"{pair['only_other_hits']} only the other (sign test, p = {pair['sign_test_p']:.2g})."
-            )
+    rows = {row["name"]: row for row in metrics["policies"]}
+    last = max(row["round"] for row in rows.values())
+    name = _name(CORRECTED, last)
+    lines = [f"{last} rounds cost {rows[name]['human_s']:.0f} human seconds, as many for the other arm."]
+    for pair in (pair for pair in metrics["pairs"] if pair["name"] == name):
+        how, other = pair["how"], pair["other"]
+        own, others = rows[name][how], rows[other][how]["hits"]
+        told = "better" if own["hits"] > others else "worse"
+        told = told if pair["sign_test_p"] < CHANCE else "neither better nor worse, within chance,"
+        lines.append(
+            f"{HOW[how].capitalize()}, the corrected policy is {told} than {other}: {own['hits']} of {own['trials']} "
+            f"worlds, not {others}; {pair['only_hits']} only it hit, {pair['only_other_hits']} only the other "
+            f"(sign test, p = {pair['sign_test_p']:.2g})."
+        )
     return lines
 
 

@@ -2,7 +2,7 @@
 
     open_view(..., shown=Simulation("runs/demo/policy_static.pt"))
 
-The car's own loop drives, on a virtual clock, as in `latency`. On a busy machine the simulation's time goes slower, and
+The car's own loop drives, on a virtual clock, as in `drives`. On a busy machine the simulation's time goes slower, and
 the page says so. A real car would have to be stopped there.
 """
 
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from balloon_world.latency import NoLog, TimedCar, WorldPilot
+from balloon_world.drives import NoLog, TimedCar, WorldPilot
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.pwm import NEUTRAL

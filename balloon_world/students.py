@@ -1,26 +1,24 @@
-"""Can a smaller policy drive the same? Judge a teacher and its students on recordings, and drive them side by side.
+"""Notebook 08: can a smaller policy drive the same? Judge a teacher and its students on recordings and in worlds.
 
-    content = measured("runs/full", ["runs/fast", "runs/faster"])
+    content = judge_students("runs/full", ["runs/fast", "runs/faster"])
 
 All results concern the artifact that would drive the car, a run's policy_static.pt. Every drive and plan stays in the
 cache, keyed by the artifact's content. So a process that was ended goes on where it was, and a further student costs
-only its own drives and plans.
+only its own drives and plans. A rule holds the rows to limits from params.yml, and recommends a student or the teacher.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from balloon_world import latency, trial, world
-from balloon_world.frontier import DRIVES, NOBODY_DROVE, recommendation
-from balloon_world.latency import SEED, Condition, drive_late
-from balloon_world.side_by_side import append_row, everywhere, load_for_cores, read_rows
-from balloon_world.trial import run_trials, wilson_interval
+from balloon_world import drives, trial, world
+from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere, load_for_cores, pair_worlds
+from balloon_world.trial import run_trials
+from balloon_world.world import World
 from rover_learn.distill import errors_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
@@ -32,8 +30,9 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
-from rover_lib.workshop.judge.compare import GATED
-from rover_lib.workshop.judge.recorded_range import not_judged
+from rover_lib.workshop.judge.compare import GATED, gate
+from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, worst
+from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Recordings, Sample, Source, pick_evenly
@@ -42,10 +41,12 @@ WORLDS, PUSHES = 200, 4
 HELD_OUT_FRAMES = 300
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
+HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
 COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = (
     "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates, as the teacher's instructions are not counted."
 )
+NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def judge_students(
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
     `run_trials`, and pushed at the latency computed for it. With 0 nobody drives, as there is no world for a real
     car's policy. held_out_frames: how many to judge with at most.
-    Sets torch to one thread. Raises DistillError for runs that do not belong together or lack a file, and
+    Raises DistillError for runs that do not belong together or lack a file, and
     whatever reading them raises.
     """
     folder, p = Path(run_dir).resolve(), params()
@@ -145,7 +146,7 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
         if own_manifest["checkpoint"]["sha256"] not in content["metrics"]["files_sha256"].values():
             raise DistillError(
                 f"{student / ARTIFACT}: is not made of the student that was distilled there",
-                remedy="'rover quantize' or 'rover run' makes it anew",
+                remedy="'rover run' makes it anew",
             )
         runs.append(
             _Run(student.name, student / ARTIFACT, own_manifest, content["metrics"]["students"][1], _counts(student))
@@ -163,7 +164,7 @@ def _read_distilled(student: Path) -> dict[str, Any]:
 
 def _artifact_of(run_dir: Path) -> Path:
     if not (path := run_dir / ARTIFACT).is_file():
-        raise DistillError(f"{path}: not there", remedy="'rover quantize' or 'rover run' makes it")
+        raise DistillError(f"{path}: not there", remedy="'rover run' makes it")
     return path
 
 
@@ -211,7 +212,7 @@ def _errors(
     """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
-        remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
+        remedy = "'rover run CHECKPOINT EPISODES' makes it"
         raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy=remedy)
     taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
@@ -226,74 +227,131 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
     path = cache_root() / f"plans-{key}.npy"
     if not path.exists():
         policies = load_for_cores(artifact, len(samples))
-        every = everywhere(policies, range(len(samples)), lambda policy, i: _plan(policy, samples[i]))
+        every = everywhere(
+            policies, range(len(samples)), lambda p, i: p.predict_chunk(samples[i].frame_bgr(), samples[i].state)
+        )
         planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
     return np.load(path)
 
 
-def _plan(policy: Policy, sample: Sample) -> np.ndarray:
-    return policy.predict_chunk(sample.frame_bgr(), sample.state)
-
-
 # --- in worlds --------------------------------------------------------------------------------------------------------
-
-Drive = Callable[[Policy, int], str]  # drives a policy through the world of a seed and returns the outcome
-
-
-def _left_alone(policy: Policy, seed: int) -> str:
-    return run_trials(policy, worlds=1, seed=seed, keep_frames=0).per_world[0].outcome
-
-
-def _pushed(policy: Policy, seed: int, *, condition: Condition) -> str:
-    return drive_late(policy, seed, condition).outcome
 
 
 def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress) -> dict[str, Any]:
     """Return a row's hits, left alone and pushed; all None if nobody drove. pushed_ms: None if it is not known."""
     how = params()["drive"]
-    asked: dict[str, Drive] = {}
-    if worlds:
-        asked[""] = _left_alone
-        if pushed_ms is not None:
-            condition = Condition(pushed_ms / 1e3, Settings.of(how), PUSHES)
-            asked["pushed_"] = partial(_pushed, condition=condition)
-    sources = [world, trial, latency, loop, pilot, plan, preprocess]
+    late_ms = {"": None, "pushed_": pushed_ms}
+
+    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
+        return {"outcome": drive_once(policy, asked[1], late_ms[asked[0]], Settings.of(how))}
+
     driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
-    alike = driven_by | {"drive": how, "pushes": PUSHES}
-    files = {}
-    for name in asked:
-        key = key_of(alike | {"how": name, "latency_ms": pushed_ms if name else None}, *sources)
-        files[name] = cache_root() / f"drives-{key}.jsonl"
-    found = _drive(run, asked, files, range(SEED, SEED + worlds), progress)
+    key = key_of(
+        driven_by | {"drive": how, "pushes": PUSHES, "late": pushed_ms}, world, trial, drives, loop, pilot, plan
+    )
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
-    for name in DRIVES:
-        missed = [seed for seed, outcome in found[name].items() if outcome != "hit"] if name in found else None
-        hits = None if missed is None else worlds - len(missed)
-        low, high = (None, None) if hits is None else wilson_interval(hits, worlds)
-        row |= {
-            f"{name}hits": hits,
-            f"{name}trials": None if hits is None else worlds,
-            f"{name}hits_wilson_low": low,
-            f"{name}hits_wilson_high": high,
-            f"{name}missed": missed,
-        }
+    kinds = [kind for kind in HOW if worlds and not (kind and pushed_ms is None)]
+    asked = [(kind, seed) for kind in kinds for seed in range(SEED, SEED + worlds)]
+    found = drive_missing(
+        run.artifact, asked, one, cache_root() / f"drives-{key}.jsonl", progress, f"driving {run.name}"
+    )
+    for kind in HOW:
+        outcomes = {seed: each["outcome"] for (of, seed), each in found.items() if of == kind}
+        keys = "hits", "trials", "hits_wilson_low", "hits_wilson_high", "missed"
+        counted = count_hits(outcomes, "hits_wilson") if outcomes else dict.fromkeys(keys)
+        row |= {f"{kind}{name}": value for name, value in counted.items()}
     return row
 
 
-def _drive(
-    run: _Run, asked: Mapping[str, Drive], files: Mapping[str, Path], seeds: range, progress: Progress
-) -> dict[str, dict[int, str]]:
-    """Return the outcomes by seed of each kind of drive.
+def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Settings) -> str:
+    """Drive through the world of a seed and return the outcome: left alone, or pushed if plans are late_ms late."""
+    if late_ms is None:
+        return run_trials(policy, worlds=1, seed=seed, keep_frames=0).per_world[0].outcome
+    return drive_in(policy, World(seed, PUSHES), late_ms / 1e3, settings).outcome
 
-    Drives that are in the files are not repeated, and each new one is written to its file as soon as it has ended.
+
+# --- the rule ---------------------------------------------------------------------------------------------------------
+
+
+def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Hold a student to the rule; return rows of `compare.gate`. limits: params.yml's section `students`.
+
+    Drives are judged only if the teacher drove. Then a kind of drive that is missing neither passes nor fails.
     """
-    kept = {name: {row["seed"]: row["outcome"] for row in read_rows(path)} for name, path in files.items()}
-    missing = [(name, seed) for name in asked for seed in seeds if seed not in kept[name]]
-    policies = load_for_cores(run.artifact, len(missing))
-    driven = everywhere(policies, missing, lambda policy, drive: asked[drive[0]](policy, drive[1]))
-    for (name, seed), outcome in progress(driven, desc=f"driving {run.name}", total=len(missing)) if missing else ():
-        kept[name][seed] = outcome
-        append_row(files[name], {"seed": seed, "outcome": outcome})
-    return {name: {seed: kept[name][seed] for seed in seeds} for name in asked}
+    rows = []
+    for kind, how in HOW.items() if teacher["trials"] else ():
+        lost = None
+        if row[f"{kind}trials"] and teacher[f"{kind}trials"]:
+            lost = 100 * (teacher[f"{kind}hits"] - row[f"{kind}hits"]) / teacher[f"{kind}trials"]
+        rows.append(gate(f"{row['name']} worlds lost, {how}, %", lost, "<=", limits[f"{kind}worlds_lost_pct"]))
+    keys = [key for key in row if key.startswith("recorded_") and None not in (row[key], teacher[key])]
+    above = worst(row[key] - teacher[key] for key in keys)
+    return [*rows, gate(f"{row['name']} error to the recordings, points above", above, "<=", limits["recorded_points"])]
+
+
+def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
+    """Choose the fastest student that passes every gate, or the teacher if none does.
+
+    rows: of students.json, the teacher first. Fastest is what has fewest instructions if all are counted, else fewest
+    multiply-accumulates. Returns {"name", "fastest_by", "gates": of all students}.
+    """
+    teacher, *students = rows
+    gates = {row["name"]: gates_of(row, teacher, limits) for row in students}
+    key = "gmac" if any(row["instructions_g"] is None for row in rows) else "instructions_g"
+    passed = [row for row in students if all(g["passed"] for g in gates[row["name"]])]
+    fastest = min(passed, key=lambda row: row[key], default=teacher)
+    return {"name": fastest["name"], "fastest_by": key, "gates": [g for its_gates in gates.values() for g in its_gates]}
+
+
+def table(metrics: Mapping[str, Any]) -> Table:
+    """Show a teacher and its students as a table, a row each. metrics: of students.json."""
+    teacher = metrics["students"][0]
+    actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in teacher if key.startswith("teacher_")]
+    rows = []
+    for row in metrics["students"]:
+        counted = "-" if row["instructions_g"] is None else f"{row['instructions_g']:.3g}"
+        span = "not counted" if row["computed_ms"] is None else "{:.3g} to {:.3g}".format(*row["computed_ms"])
+        pushed = _hits(row, "pushed_") + (f" at {row['pushed_latency_ms']:.0f} ms" if row["pushed_trials"] else "")
+        errors = (
+            " / ".join(format_pct(row[f"{to}_{action}_pct"]).strip().removesuffix(" %") for action in actions)
+            for to in ("teacher", "recorded")
+        )
+        work = (f"{row['size_mb']:.1f}", f"{row['gmac']:.3g}", counted, span)
+        rows.append((f"{row['name']}: {shape_of(row)}", *work, _hits(row, ""), pushed, *errors))
+    what = f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range"
+    header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
+    notes = (what, *metrics["notes"], *metrics["warnings"])
+    return Table((*header, "to the teacher, %", "to the recordings, %"), rows, notes=notes)
+
+
+def shape_of(row: Mapping[str, Any]) -> str:
+    layers = f"{row['decoder_layers']} decoder layer{'s' if row['decoder_layers'] != 1 else ''}"
+    share = f", {row['backbone_channels']:.0%} of the channels" if row.get("backbone_channels") else ""
+    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}{', QAT' if row['qat'] else ''}"
+
+
+def _hits(row: Mapping[str, Any], kind: str) -> str:
+    return f"{row[f'{kind}hits']} of {row[f'{kind}trials']}" if row[f"{kind}trials"] else "-"
+
+
+def sentences(metrics: Mapping[str, Any]) -> list[str]:
+    """Say the recommendation in plain English, a sentence to a line. metrics: of students.json."""
+    teacher, *students = metrics["students"]
+    verdict = metrics["recommendation"]
+    chosen = next((row for row in students if row["name"] == verdict["name"]), None)
+    if chosen is None:
+        lines = ["No student keeps to the limits of params.yml: stay with the teacher."]
+    else:
+        by = {"instructions_g": "fewest instructions", "gmac": "fewest multiply-accumulates"}[verdict["fastest_by"]]
+        lines = [f"Recommended: {chosen['name']} ({shape_of(chosen)}), which has the {by} of those within the limits."]
+    for row in students:
+        for kind, how in HOW.items():
+            if row[f"{kind}trials"] and teacher[f"{kind}trials"]:
+                only, only_teacher, p = pair_worlds(row[f"{kind}missed"], teacher[f"{kind}missed"])
+                lines.append(
+                    f"{row['name']}, {how}: {_hits(row, kind)} worlds, its teacher {_hits(teacher, kind)}; {only} only "
+                    f"the student hit, {only_teacher} only the teacher (sign test, p = {p:.2g})."
+                )
+    return lines if teacher["trials"] else [*lines, NOBODY_DROVE]

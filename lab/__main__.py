@@ -68,24 +68,18 @@ def doctor(ctx: click.Context, artifact: Path | None) -> None:
 )
 @click.option("--jobs", type=click.IntRange(min=1), help="Artifacts at a time [default: all cores].")
 @click.option("--peers", is_flag=True, help="Count ONNX Runtime, ExecuTorch and others beside them.")
-@click.option("--pi4", is_flag=True, help="Count FP32 and static alone, on a Pi 4's core beside a Pi 5's.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as_json: bool) -> None:
+def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, as_json: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     The result is a count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates
-    of lab/params.yml hold. With --pi4 it leaves only arm-cortex-a72.json. Needs Debian 12 with qemu-user and gcc, which
-    it installs if you are root.
+    of lab/params.yml hold. Needs Debian 12 with qemu-user and gcc, which it installs if you are root.
     """
-    from lab.a76.core import A72
-    from lab.a76.count_run import count_other_core, count_run
-    from lab.a76.report import other_core_table, table
+    from lab.a76.count_run import count_run
+    from lab.a76.report import table
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run.run import execute
 
-    if pi4:
-        content = count_other_core(run_dir, A72, progress=terminal_bar())
-        return click.echo(json.dumps(content, indent=2) if as_json else other_core_table(content))
     count_run(run_dir, frames=frames, jobs=jobs, progress=terminal_bar())
     if peers:
         from lab.a76.peers import count_peers
@@ -94,25 +88,6 @@ def arm(run_dir: Path, frames: int, jobs: int | None, peers: bool, pi4: bool, as
     execute("06_arm", run_dir)
     content = read_stage(run_dir / "arm.json", "arm")
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
-
-
-@main.command()
-@click.argument("output", type=FILE, required=False)
-@click.option("--ncnn", "graphs", type=FILE, help="benchmark in a copy of ncnn (tag 20240102), to count.")
-@click.pass_context
-def clock(ctx: click.Context, output: Path | None, graphs: Path | None) -> None:
-    """Predict what networks and our policies take on a Raspberry Pi 5, and hold it against published times.
-
-    OUTPUT [default: results/clock/clock.json] keeps the counts, so that only what it lacks is counted, in the emulated
-    Cortex-A76: how long all of it takes has not been measured. The exit code is 1 if a gate of lab/params.yml does
-    not hold.
-    """
-    from lab.a76.clock import OUTPUT, table, tell_time
-    from lab.params import lab_params
-
-    content = tell_time(output or OUTPUT, graphs=graphs, limits=lab_params()["clock"], progress=terminal_bar())
-    click.echo(table(content))
-    ctx.exit(0 if all(row["passed"] for row in content["metrics"]["gates"]) else 1)
 
 
 @main.command()
@@ -131,28 +106,6 @@ def full(run_dir: Path, steps: int, learned: bool, **options: Any) -> None:
 
     made = full_run(run_dir, steps=None if learned else steps, progress=terminal_bar(), **options)
     click.echo(f"made: {made} ({LEARNED_NOTE if learned else NOTE})")
-
-
-@main.command()
-@click.argument("episodes", type=FILE)
-@click.argument("folder", type=FILE)
-@click.option("--trainings", type=click.IntRange(min=1), default=6, show_default=True, help="Each with all statistics.")
-@click.pass_context
-def statistics(ctx: click.Context, episodes: Path, folder: Path, trainings: int) -> None:
-    """Train small policies on EPISODES whose statistics come from elsewhere, and judge their static INT8.
-
-    Leaves statistics.json in FOLDER, and goes on there if it was ended. Each policy takes some minutes. Exit code 1 if
-    fewer than 28 of 30 keep the gate.
-    """
-    from lab.int8.statistics import judge_statistics
-
-    metrics = judge_statistics(episodes, folder, trainings, progress=terminal_bar())["metrics"]
-    for row in metrics["policies"]:
-        errors = f"{row['steering_mae_pct']:.2f} / {row['throttle_mae_pct']:.2f} %"
-        odd = f"{row['odd']['share_pct']:.0f} % odd, {row['odd']['times']:.0f} times" if row["odd"] else "no odd frames"
-        kept = "holds" if row["passed"] else "MISSES"
-        click.echo(f"training {row['training']}, {row['statistics']}: {errors} ({row['observer']}; {odd}) {kept}")
-    ctx.exit(0 if all(g["passed"] for g in metrics["gates"]) else 1)
 
 
 @main.command()
@@ -207,56 +160,6 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
     ctx.exit(1 if survived else 0)
 
 
-@main.command("real")
-@click.argument("recordings", type=FILE)
-@click.argument("output", type=FILE, required=False)
-@click.option("--run", "runs", type=FILE, multiple=True, help="What `rover run` left on them; several times for more.")
-@click.option("--elsewhere", type=FILE, help="A run of the same policy on other recordings, for its calibration.")
-def real(recordings: Path, output: Path | None, runs: tuple[Path, ...], elsewhere: Path | None) -> None:
-    """Tell what real RECORDINGS say, how far off guesses are on each, and policies on them. Nobody drives."""
-    from lab.repository.real_recordings import tell_of
-    from rover_lib.onboard.stage import write_stage
-
-    metrics = tell_of(recordings, {path.name: path for path in runs}, elsewhere, terminal_bar())
-    if output:
-        write_stage(output, "recordings", params={}, metrics=metrics, inputs={})
-    show(metrics, False)
-
-
-@main.command("kills")
-@click.argument("output", type=FILE, required=False)
-@click.option("--each", type=click.IntRange(min=1), default=50, show_default=True, help="Kills of each.")
-@click.option("--only", multiple=True, metavar="NAME", help="Only this work, such as train; several times for more.")
-@click.pass_context
-def kill_commands(ctx: click.Context, output: Path | None, each: int, only: tuple[str, ...]) -> None:
-    """Kill what writes files at random moments, do it twice at once, and fill its disk (as root).
-
-    With --only, what OUTPUT says of other work stays. The exit code is 1 if anything is lost or half-written.
-    """
-    import tempfile
-
-    from lab.repository import kills
-    from rover_lib.onboard.stage import read_stage, write_stage
-
-    metrics: dict[str, Any] = {}
-    if only and output and output.exists():
-        metrics = read_stage(output, "kills")["metrics"]
-    with tempfile.TemporaryDirectory() as folder:
-        inputs = kills.make_inputs(Path(folder))
-        for work in (work for work in kills.WORKS if not only or work.name in only):
-            tries = {"killed": (kills.kill_randomly, each)}
-            if work.name != "record":  # two recordings have two names
-                tries["twice"] = kills.do_twice, max(1, each // 10)
-            if os.geteuid() == 0:
-                tries["disk_full"] = kills.fill_randomly, max(1, each // 5)
-            for what, (try_it, times) in tries.items():
-                metrics[f"{work.name}_{what}"] = try_it(work, inputs, times)
-                if output:  # after each, as all of them take an hour
-                    write_stage(output, "kills", params={"each": each}, metrics=metrics)
-    show(metrics, False)
-    ctx.exit(1 if any(found["wrong"] for found in metrics.values()) else 0)
-
-
 @main.command("random")
 @click.argument("output", type=FILE, required=False)
 @click.option("--drives", type=click.IntRange(min=1), default=10_000, show_default=True, help="How many.")
@@ -279,65 +182,20 @@ def random_drives(ctx: click.Context, output: Path | None, drives: int, first: i
     _end(ctx, failures)
 
 
-@main.group()
-def pi() -> None:
-    """Test playbooks, the service and its faults on emulated Pis: real Debian arm64 systems. Needs root and Debian."""
-
-
-def _end_pi(ctx: click.Context, wrong: list[str], output: Path) -> None:
-    click.echo(f"{'not as expected' if wrong else 'as expected'}: {output}")
-    _end(ctx, wrong)
-
-
-@pi.command("fast")
-@click.argument("output", type=FILE, default="runs/pi-fast.json")
-@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifacts are deployed.")
-@click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", help="Of the Pi.")
-@click.option("--short", is_flag=True, help="Only provision, deploy, meet one fault of a deployment, and drive.")
-@click.option("--view", is_flag=True, help="With --short: the view's service beside a drive too.")
-@click.option(
-    "--faults/--no-faults",
-    default=True,
-    help="Leave out a deployment's faults, which are met with torch only.",
-)
-@click.option(
-    "--pieces",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Only provision, cut off after each Nth task that changes something.",
-)
-@click.pass_context
-def pi_fast(ctx: click.Context, output: Path, demo: Path, **options: Any) -> None:
-    """Run every playbook on an emulated Pi in a container, and prove from within what they promise.
-
-    The container has real systemd and sshd, aarch64 programs, and the real firmware on an emulated Arduino. Writes
-    OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1 if anything is not as expected.
-    """
-    from lab.pi.container_run import run_container
-
-    outcome = run_container(output, demo, **options, say=click.echo)
-    for gate in outcome.metrics.get("gates", []):
-        click.echo(f"{'ok  ' if gate['holds'] else 'FAIL'}  {gate['gate']}: {gate['wanted']}")
-    _end_pi(ctx, outcome.wrong, output)
-
-
-@pi.command("whole")
+@main.command()
 @click.argument("output", type=FILE, default="runs/pi.json")
-@click.option("--artifact", type=FILE, default="runs/demo/policy_static.pt", show_default=True, help="To deploy.")
-@click.option("--recordings", type=FILE, default="runs/demo/episodes", show_default=True, help="What the camera shows.")
-@click.option("--fresh", is_flag=True, help="Provision anew, even if the cache has a card that was provisioned so.")
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose artifact is deployed.")
 @click.pass_context
-def pi_whole(ctx: click.Context, output: Path, **options: Any) -> None:
-    """Provision, deploy and drive a whole emulated Pi, and check each servo pulse against its command.
+def pi(ctx: click.Context, output: Path, demo: Path) -> None:
+    """Provision an emulated Pi in a container, deploy to it, drive it and roll back, by the playbooks.
 
-    The machine is QEMU's Cortex-A76 with kernel, camera and USB, and the real firmware on an emulated Arduino. Cables
-    are pulled while it drives. Writes OUTPUT as JSON. The exit code is 1 if anything is not as expected; the machine's
-    console is beside OUTPUT then.
+    The container has real systemd and sshd, aarch64 programs, and the real firmware on an emulated Arduino. Needs root
+    and Debian 12 or 13. Writes OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1 if anything
+    is not as expected.
     """
-    from lab.pi.machine_run import run_machine
+    from lab.pi.deployment import deploy_and_drive
 
-    outcome = run_machine(output, **options, say=click.echo)
-    _end_pi(ctx, outcome.wrong, output)
+    _end(ctx, deploy_and_drive(output, demo, click.echo).wrong)
 
 
 if __name__ == "__main__":

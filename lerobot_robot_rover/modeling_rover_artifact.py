@@ -18,8 +18,8 @@ from lerobot_robot_rover.line import count_ended_drives, wait_for_humans
 from lerobot_robot_rover.rollout import find_rollout
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime
-from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.params import params

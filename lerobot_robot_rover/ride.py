@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive.drive import arm_capped
+from rover_lib.onboard.drive.arming import arm_capped
 from rover_lib.onboard.drive.loop import Hooks, Log, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, Sight
 from rover_lib.onboard.drive.plan import Settings
@@ -119,7 +119,7 @@ class Ride:
 
     def _arm(self) -> Telemetry:
         limit = self._settings.throttle_limit
-        telemetry = arm_capped(self._link, limit, limit, self._log.event)
+        telemetry = arm_capped(self._link, limit, self._log.event)
         self._given_s = self._clock()
         self._settled.set()
         return telemetry

@@ -1,1 +1,1 @@
-"""Recordings to and from other projects: LeRobotDatasets out, donkeycar's tubs in."""
+"""What other programs read and write: LeRobotDatasets, donkeycar tubs, MCAP, films and figures of drives, Hailo."""

@@ -1,23 +1,29 @@
-"""The commands that exchange recordings. `rover` has them by entry points of pyproject.toml."""
+"""The commands of this package. `rover` has them by entry points of pyproject.toml."""
 
+import os
+import webbrowser
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rover_lib.cli.prepare import EPISODES, size_option
-from rover_lib.onboard.cli import AS_JSON, FILE, show
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.cli import AS_JSON, FILE, LOG_DRIVE, open_view, show, sum_up, view_options
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import Output, PathTo, check_kind
 from rover_lib.workshop.progress import terminal_bar
+
+SIZE = click.option(
+    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
+)
 
 
 @click.command("export-dataset", short_help="Write recordings as a LeRobotDataset v3.")
 @click.argument("episodes", type=EPISODES)
 @click.argument("out", type=FILE)
 @click.option("--video", is_flag=True, help="Write AV1 video: far smaller than images, but lossy [default: images].")
-@click.option(
-    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
-)
+@SIZE
 @AS_JSON
 def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
     """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
@@ -29,32 +35,13 @@ def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> 
     from rover_exchange.export_dataset import export_dataset as write
 
     report = write(episodes, out, progress=terminal_bar(), **options)
-    _say_export(report, out, "exported", as_json)
-
-
-def _say_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
-    from rover_exchange.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
-    from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
-
-    for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, OUTCOMES):
-        del report[name]  # too long to print; the file has them
-    show({done: report | {"report": str(out / REPORT)}}, as_json)
-    if not as_json:
-        from rover_lib.onboard.care.release import Expected
-
-        if (frames := report["frames_in_a_usual_episode"]) < Expected.chunk:
-            click.echo(
-                f"half of its episodes have at most {frames} frames, a plan {Expected.chunk}: its drives have holes"
-            )
-        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+    _print_export(report, out, "exported", as_json)
 
 
 @click.command("import", short_help="Write a donkeycar tub as a LeRobotDataset v3.")
 @click.argument("tub", type=PathTo("tub"))
 @click.argument("out", type=FILE)
-@click.option(
-    "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="Size of the pictures [default: as recorded]."
-)
+@SIZE
 @click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a car that drives forward by < 0.")
 @AS_JSON
 def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, throttle: str | None, as_json: bool) -> None:
@@ -69,4 +56,106 @@ def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, throttle: str
     from rover_lib.onboard.car.car import this_car
 
     report = write(read_tub(tub, this_car(), terminal_bar(), throttle), out, size=size, progress=terminal_bar())
-    _say_export(report, out, "imported", as_json)
+    _print_export(report, out, "imported", as_json)
+
+
+def _print_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
+    from rover_exchange.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
+    from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
+
+    for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, OUTCOMES):
+        del report[name]  # too long to print; the file has them
+    show({done: report | {"report": str(out / REPORT)}}, as_json)
+    if not as_json:
+        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+
+
+@click.command(short_help="Show a drive in the browser, with a stop button.")
+@click.argument("file", type=click.Path(path_type=Path, exists=True), required=False)
+@view_options
+def view(file: Path | None, **options: Any) -> None:
+    """Show a drive in a browser: its picture, its plan, what the pins do. The page can stop the car and nothing else.
+
+    Without FILE it shows the `rover drive` of this machine, which may come and go. If FILE is an artifact, it drives
+    through the balloon world.
+
+    Whoever has the page's URL may look and stop; without --interface, only from this machine.
+    """
+    if file is None:
+        return open_view(**options, opened=open_browser)
+    check_kind(file, "artifact")
+    (simulated,) = entry_points(group="rover.cars", name="world")
+    open_view(**options, opened=open_browser, shown=simulated.load().shown(file))
+
+
+def open_browser(url: str) -> None:
+    """Open a browser if there is a screen; without one, a browser would take over the terminal."""
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)
+
+
+@click.command(short_help="Summarize a flight log, and draw it.")
+@click.argument("file", type=PathTo("flight log"))
+@click.option("-o", "--output", type=Output(), help="The figure to write [default: FILE.png].")
+@LOG_DRIVE
+@click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
+@click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures if it was recorded.")
+@click.option(
+    "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
+def log(
+    file: Path,
+    output: Path | None,
+    drive: int,
+    video: Path | None,
+    mcap: Path | None,
+    pictures: Path | None,
+    as_json: bool,
+) -> None:
+    """Summarize the flight log FILE of `rover drive`, and draw it.
+
+    The summary has missed ticks, jitter, ages and latencies of plans, who drove, temperature and events. Older parts
+    of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
+
+    --video makes a film of the drive instead: its pictures with the planned path, the commands and the servo pulses.
+    It needs the pictures that `rover drive --record` has kept. --mcap writes the log, with the pictures if there are
+    any, for viewers of MCAP files.
+    """
+    flight = sum_up(file, drive, as_json)
+    if video:
+        from rover_exchange.film import write_film
+
+        count = write_film(video, flight, pictures, terminal_bar())
+        click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
+    if mcap:
+        from rover_exchange.mcap_log import write_mcap
+
+        counts = ", ".join(f"{count} of {topic}" for topic, count in write_mcap(mcap, flight, pictures).items())
+        click.echo(f"written: {mcap}, {counts}, {mcap.stat().st_size / 1e6:.2f} MB", err=as_json)
+    if output or not (as_json or video or mcap):
+        output = output or file.with_name(f"{file.name}.png")
+        _draw(flight, output)
+        click.echo(f"drawn: {output}", err=as_json)
+
+
+def _draw(flight: Any, output: Path) -> None:
+    """Write the figure of a drive. Raises RoverError for an ending that names no kind of figure."""
+    from rover_exchange.flight import flight_figure
+    from rover_lib.onboard.stage import atomic_path
+
+    figure = flight_figure(flight)
+    if output.suffix.lower()[1:] not in figure.canvas.get_supported_filetypes():
+        found = output.suffix or "no ending"
+        raise RoverError(f"{output}: no figure has that ending", found=found, remedy="say .png, .pdf or .svg")
+    with atomic_path(output) as temporary:
+        figure.savefig(temporary)
+
+
+def export_kit(run_dir: Path, out: Path, samples: int) -> None:
+    """Write the Hailo kit of a run, for `rover export --hailo`. Raises RoverError as write_kit does."""
+    from rover_exchange.hailo.kit import write_kit
+    from rover_lib.workshop.run.session import open_run
+
+    write_kit(open_run(run_dir, terminal_bar()), run_dir, out, samples=samples, progress=terminal_bar())
+    click.echo(f"{out}: KIT.md says what is in it; next, where Hailo's compiler is: python3 compile.py hailo8 backbone")

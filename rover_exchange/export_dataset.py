@@ -18,9 +18,9 @@ ended, in LeRobot's `next.success`, `next.reward` and `next.done`.
 import json
 import os
 import warnings
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from itertools import pairwise
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -87,10 +87,9 @@ def export_dataset(
     out = Path(out)
     if out.exists() or out.is_symlink():
         raise EpisodeError(f"{out}: is there already", remedy="give a new folder, or remove it")
-    if size and not SIDES_PX[0] <= min(size) <= max(size) <= SIDES_PX[1]:
-        raise EpisodeError(
-            f"pictures must have {SIDES_PX[0]} to {SIDES_PX[1]} pixels a side", found=f"{size[1]}x{size[0]}"
-        )
+    least, most = SIDES_PX
+    if size and not least <= min(size) <= max(size) <= most:
+        raise EpisodeError(f"pictures must have {least} to {most} pixels a side", found=f"{size[1]}x{size[0]}")
     if isinstance(episodes, Recordings):
         recordings = episodes
     else:
@@ -125,22 +124,36 @@ def usual_rate_hz(recordings: Recordings) -> int:
     return max(round(usual_hz), 1)
 
 
-def _runs(samples: tuple[Sample, ...]) -> Iterator[list[Sample]]:
-    """Yield runs of samples at which somebody drove, with no frame left out between two of them.
+def _parts(
+    episode: Episode, size: tuple[int, int] | None, recorded: tuple[int, ...], left_out: Counter[str]
+) -> Iterator[list[tuple[Sample, np.ndarray]]]:
+    """Yield the parts of an episode that have no hole, as samples with their RGB frames; a part may be empty.
 
-    A run also ends where a sample's chunk does not reach into the next frame.
+    A hole is where a frame is missing, where nobody drove, and where a picture cannot be decoded. A part also ends
+    where a sample's chunk does not reach into the next frame. left_out: counts what is no part's. Raises EpisodeError
+    for a picture of another size than `recorded` if there is no `size`, (height, width), to which all are resized.
     """
-    driven = [sample for sample in samples if sample.driver != NOBODY]
-    if not driven:
-        return
-    run = driven[:1]
-    for before, after in pairwise(driven):
-        if after.row == before.row + 1 and not before.is_pad[1]:
-            run.append(after)
-        else:
-            yield run
-            run = [after]
-    yield run
+    rows: list[tuple[Sample, np.ndarray]] = []
+    for sample in episode.samples:
+        if rows and (sample.row != rows[-1][0].row + 1 or rows[-1][0].is_pad[1]):
+            yield rows
+            rows = []
+        if sample.driver == NOBODY:
+            left_out["nobody_drove"] += 1
+            continue
+        try:
+            frame = sample.frame_bgr()
+        except EpisodeError:
+            left_out["pictures_not_whole"] += 1
+            continue
+        if size is None and frame.shape != recorded:
+            raise EpisodeError(
+                f"{sample.frame_path}: a picture of {frame.shape[1]}x{frame.shape[0]} among those of "
+                f"{recorded[1]}x{recorded[0]}",
+                remedy="export the episodes of each size by themselves, or all at one: --size",
+            )
+        rows.append((sample, prepare_frame(frame, *(size or recorded[:2]))))
+    yield rows
 
 
 def _write(
@@ -150,130 +163,83 @@ def _write(
     # Imported here, because it takes seconds that no other command should wait for.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    episodes = recordings.episodes
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
-    numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
-    extra = _ExtraColumns.of(recordings)
-    picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
+    by_policy, labelled = any(e.by_policy for e in episodes), all(e.outcome for e in episodes)
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=rate_hz,
-        features={f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers, **extra.features},
+        features=_features(shape, video, by_policy, labelled),
         root=root,
         robot_type="rover",
         use_videos=video,
         video_backend=BACKEND,
     )
-    short, broken = 0, 0
-    lengths: list[int] = []
-    origins: list[str] = []
-    driven_by: list[str] = []
-    outcomes: list[str | None] = []
+    left_out: Counter[str] = Counter(pictures_not_whole=0, too_short=0, nobody_drove=0)
+    written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
     with no_progress_bars(), warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", "Converting input from bool"
-        )  # numpy warns when LeRobot computes statistics of yes and no
-        for episode in progress(recordings.episodes, desc="exporting", total=len(recordings.episodes)):
-            for run in _runs(episode.samples):
-                for rows, unread in _readable(run, size, recorded):
-                    broken += unread
-                    if len(rows) < SHORTEST:
-                        short += len(rows)
-                        continue
-                    for sample, frame in rows:
-                        dataset.add_frame(
-                            {
-                                f"{CAMERA}{NAME}": frame,
-                                STATE: sample.state,
-                                ACTION: sample.chunk[0],
-                                "task": episode.label or "drive",
-                                **extra.of_frame(episode, sample, last=sample is rows[-1][0]),
-                            }
-                        )
-                    dataset.save_episode()
-                    lengths.append(len(rows))
-                    driven_by.append(POLICY if episode.by_policy else HUMAN)
-                    outcomes.append(episode.outcome)
-                    origins.append(f"{episode.id} from frame {rows[0][0].row}")
+        # numpy warns when LeRobot computes statistics of yes and no
+        warnings.filterwarnings("ignore", "Converting input from bool")
+        for episode in progress(episodes, desc="exporting", total=len(episodes)):
+            for rows in _parts(episode, size, recorded, left_out):
+                if len(rows) < SHORTEST:
+                    left_out["too_short"] += len(rows)
+                    continue
+                for sample, frame in rows:
+                    row = _row(episode, sample, frame, last=sample is rows[-1][0])
+                    dataset.add_frame({k: v for k, v in row.items() if k in dataset.features or k == "task"})
+                dataset.save_episode()
+                written.append((episode, rows[0][0].row, len(rows)))
         dataset.finalize()
-    if not lengths:
+    if not written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
+    lengths = [count for _, _, count in written]
     return {
         "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images"),
         "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
-        "episodes": len(origins),
+        "episodes": len(written),
         "frames": sum(lengths),
         "frames_in_a_usual_episode": int(np.median(lengths)),
         "frames_a_second": rate_hz,
-        "recorded_episodes": len(recordings.episodes),
-        "left_out_pictures_not_whole": broken,
-        "left_out_too_short": short,
-        "left_out_nobody_drove": sum(s.driver == NOBODY for s in recordings.samples),
+        "recorded_episodes": len(episodes),
+        **{f"left_out_{what}": count for what, count in left_out.items()},
         "recomputed": recordings.recomputed() or "no action",
         "steering": measure_sides(recordings, progress).words(),
         "faults": recordings.faults_by_kind(),
         "faults_while_reading": [asdict(fault) for fault in recordings.faults],
-        "episodes_are": origins,
-        DRIVEN_BY: driven_by,
-        OUTCOMES: outcomes,
+        "episodes_are": [f"{episode.id} from frame {first}" for episode, first, _ in written],
+        DRIVEN_BY: [POLICY if episode.by_policy else HUMAN for episode, _, _ in written],
+        OUTCOMES: [episode.outcome for episode, _, _ in written],
     }
 
 
-@dataclass(frozen=True)
-class _ExtraColumns:
-    """Which extra columns the dataset has.
+def _features(shape: tuple[int, ...], video: bool, by_policy: bool, labelled: bool) -> dict[str, Any]:
+    """Return the dataset's columns, as LeRobot's own commands declare them.
 
-    intervention: there because a policy drove in some recording. outcome: there because every recording was labelled.
+    by_policy: whether a policy drove in some recording. labelled: whether the outcome of every recording is known.
     """
-
-    intervention: bool
-    outcome: bool
-
-    @classmethod
-    def of(cls, recordings: Recordings) -> "_ExtraColumns":
-        return cls(any(e.by_policy for e in recordings.episodes), all(e.outcome for e in recordings.episodes))
-
-    @property
-    def features(self) -> dict[str, Any]:
-        """Return the features that declare these columns, as LeRobot's own commands declare them."""
-
-        def one(dtype: str) -> dict[str, Any]:
-            return {"dtype": dtype, "shape": (1,), "names": None}
-
-        features = {INTERVENTION: one("bool")} if self.intervention else {}
-        return features | ({REWARD: one("float32"), DONE: one("bool"), SUCCESS: one("bool")} if self.outcome else {})
-
-    def of_frame(self, episode: Episode, sample: Sample, last: bool) -> dict[str, Any]:
-        """Return one frame's values of these columns. last: whether its episode in the dataset ends with it."""
-        row: dict[str, Any] = {}
-        if self.intervention:
-            row[INTERVENTION] = np.array([sample.driver == HUMAN and episode.by_policy])
-        if self.outcome:
-            hit = last and episode.outcome == HIT
-            row |= {REWARD: np.array([hit], np.float32), DONE: np.array([last]), SUCCESS: np.array([hit])}
-        return row
+    picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
+    numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
+    yes_or_no = {"dtype": "bool", "shape": (1,), "names": None}
+    features = {f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers}
+    if by_policy:
+        features[INTERVENTION] = yes_or_no
+    if labelled:
+        features |= {REWARD: yes_or_no | {"dtype": "float32"}, DONE: yes_or_no, SUCCESS: yes_or_no}
+    return features
 
 
-def _readable(
-    run: list[Sample], size: tuple[int, int] | None, recorded: tuple[int, ...]
-) -> Iterator[tuple[list[tuple[Sample, np.ndarray]], int]]:
-    """Yield the parts of a run between pictures that cannot be decoded, each as samples with their RGB frames.
-
-    The number beside each part is 1 if such a picture ends it, and 0 for the last.
-    """
-    rows: list[tuple[Sample, np.ndarray]] = []
-    for sample in run:
-        try:
-            frame = sample.frame_bgr()
-        except EpisodeError:
-            yield rows, 1
-            rows = []
-            continue
-        if size is None and frame.shape != recorded:
-            raise EpisodeError(
-                f"{sample.frame_path}: a picture of {frame.shape[1]}x{frame.shape[0]} among those of "
-                f"{recorded[1]}x{recorded[0]}",
-                remedy="export the episodes of each size by themselves, or all at one: --size",
-            )
-        rows.append((sample, prepare_frame(frame, *(size or recorded[:2]))))
-    yield rows, 0
+def _row(episode: Episode, sample: Sample, frame: np.ndarray, last: bool) -> dict[str, Any]:
+    """Return one frame's values of all columns that a dataset can have. last: whether its episode ends with it."""
+    hit = last and episode.outcome == HIT
+    return {
+        f"{CAMERA}{NAME}": frame,
+        STATE: sample.state,
+        ACTION: sample.chunk[0],
+        INTERVENTION: np.array([sample.driver == HUMAN and episode.by_policy]),
+        REWARD: np.array([hit], np.float32),
+        DONE: np.array([last]),
+        SUCCESS: np.array([hit]),
+        "task": episode.label or "drive",
+    }

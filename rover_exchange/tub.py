@@ -13,7 +13,7 @@ without another one, neutral; the first record of any other episode gives the ne
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -42,20 +42,20 @@ from rover_lib.workshop.recordings.samples import (
 from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
-MOST_HZ = 250.0  # no car's camera is faster
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
 
 
 @dataclass(frozen=True)
 class _Record:
-    """One picture and what the driver did. time_s: None if the tub does not say it."""
+    """One picture and what the driver did. driver: "user", or a pilot."""
 
     index: int
     session: str
-    time_s: float | None
+    time_s: float
     picture: str
     angle: float
     throttle: float
+    driver: Any
 
 
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
@@ -66,11 +66,38 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     """
     tub = Path(tub)
     faults = Faults(tub)
-    records: dict[int, _Record] = {}
-    for record in _read_records(tub, faults):
-        if records.setdefault(record.index, record) is not record:
+    records = _in_order(_read_records(tub, faults), throttle, tub, faults)
+    steps_s = np.diff([r.time_s for r in records])
+    usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
+    runs: list[list[_Record]] = []
+    for record in records:
+        if not runs or _ends(runs[-1][-1], record, min(HOLE_INTERVALS * usual_s, HOLE_S), tub, faults):
+            runs.append([])
+        runs[-1].append(record)
+    episodes, sessions = [], set()
+    for run in progress(runs, desc="reading the tub", total=len(runs)):
+        first = run[0]
+        samples = _samples(run, tub, car, first.session not in sessions, faults)
+        sessions.add(first.session)
+        found_hz = frame_rate_hz(samples)
+        if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
+            faults.add(tub, "another_rate", f"{found_hz:.1f} Hz from record {first.index} on", len(samples))
+        elif samples:
+            length_s = samples[-1].time_s - samples[0].time_s
+            name = f"{first.session or 'session'} from {first.index}"
+            episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))
+    if not episodes:
+        raise nothing_usable(f"{tub}: no usable record in it", faults.listed(), "copy the whole tub, images included")
+    return Recordings(tub, tuple(episodes), faults.listed(), Source(tub))
+
+
+def _in_order(records: Iterable[_Record], throttle: str | None, tub: Path, faults: Faults) -> list[_Record]:
+    """Return the records by their index, each once, with throttles that are positive forward."""
+    by_index: dict[int, _Record] = {}
+    for record in records:
+        if by_index.setdefault(record.index, record) is not record:
             faults.add(tub, "duplicate_record", f"record {record.index} is there again; the first one counts")
-    ordered = [records[index] for index in sorted(records)]
+    ordered = [by_index[index] for index in sorted(by_index)]
     negative, moving = sum(r.throttle < 0 for r in ordered), sum(r.throttle != 0 for r in ordered)
     if throttle is None and 4 * negative > 3 * moving:
         raise EpisodeError(
@@ -78,37 +105,7 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
             found=f"{negative} of {moving}",
             remedy="--throttle negated if its car drives forward by them, --throttle as-recorded if it drove backwards",
         )
-    if throttle == "negated":
-        ordered = [replace(r, throttle=-r.throttle) for r in ordered]
-    times_s = [r.time_s for r in ordered if r.time_s is not None]
-    steps_s = np.diff(times_s)
-    usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
-    if usual_s * MOST_HZ < 1:
-        raise EpisodeError(
-            f"{tub}: most records come {usual_s:.3g} s after another", remedy="write their times in milliseconds"
-        )
-    runs: list[list[_Record]] = []
-    for record in ordered:
-        if not runs or _ends(runs[-1][-1], record, min(HOLE_INTERVALS * usual_s, HOLE_S), tub, faults):
-            runs.append([])
-        runs[-1].append(record)
-    sessions = [run[0].session for run in runs]
-    first = {i: session not in sessions[:i] for i, session in enumerate(sessions)}
-    images = tub / "images" if (tub / "images").is_dir() else tub
-    episodes = []
-    for i, run in enumerate(progress(runs, desc="reading the tub", total=len(runs))):
-        if samples := _samples(run, tub, images, car, first[i], faults):
-            found_hz = frame_rate_hz(samples)
-            if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
-                faults.add(tub, "another_rate", f"{found_hz:.1f} Hz from record {run[0].index} on", len(samples))
-                continue
-            length_s = samples[-1].time_s - samples[0].time_s
-            name = f"{run[0].session or 'session'} from {run[0].index}"
-            episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))
-    if not episodes:
-        remedy = "copy the whole tub, images included"
-        raise nothing_usable(f"{tub}: no usable record in it", faults.listed(), remedy)
-    return Recordings(tub, tuple(episodes), faults.listed(), Source(tub))
+    return [replace(r, throttle=-r.throttle) for r in ordered] if throttle == "negated" else ordered
 
 
 def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults: Faults) -> bool:
@@ -118,14 +115,16 @@ def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults:
     if record.index != before.index + 1:
         faults.add(tub, "records_missing", f"none between {before.index} and {record.index}")
         return True
-    if record.time_s is None or before.time_s is None or 0 < record.time_s - before.time_s <= longest_s:
+    step_s = record.time_s - before.time_s
+    if 0 < step_s <= longest_s:
         return False
-    faults.add(tub, "hole_in_time", f"{record.time_s - before.time_s:.2f} s between {before.index} and {record.index}")
+    faults.add(tub, "hole_in_time", f"{step_s:.2f} s between {before.index} and {record.index}")
     return True
 
 
-def _samples(run: list[_Record], tub: Path, images: Path, car: Car, begins: bool, faults: Faults) -> tuple[Sample, ...]:
+def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faults) -> tuple[Sample, ...]:
     """begins: whether the run begins its session, so that the car stood before it."""
+    images = tub / "images" if (tub / "images").is_dir() else tub
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
@@ -135,13 +134,12 @@ def _samples(run: list[_Record], tub: Path, images: Path, car: Car, begins: bool
     for k, record in enumerate(run):
         if not check_picture(tub, images / record.picture, record.picture, tub, faults) or (k == 0 and not begins):
             continue
-        since_s = k / RATE_HZ if record.time_s is None or run[0].time_s is None else record.time_s - run[0].time_s
         after = min(k + 1, len(run) - 1)
         samples.append(
             Sample(
                 episode=f"{record.session} from {run[0].index}",
                 frame_path=images / record.picture,
-                time_s=since_s,
+                time_s=record.time_s - run[0].time_s,
                 state=actions[k - 1] if k else np.asarray(NEUTRAL, np.float32),
                 chunk=actions[[k, after]],
                 is_pad=np.array([False, after == k]),
@@ -154,18 +152,38 @@ def _samples(run: list[_Record], tub: Path, images: Path, car: Car, begins: bool
 
 def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
     """Yield the records that count, of either format."""
-    manifest = tub / "manifest.json"
+    manifest, deleted = tub / "manifest.json", set[int]()
     if manifest.is_file():
         paths, deleted = _read_manifest(manifest)
-        for other in sorted({p.name for p in tub.glob("*.catalog")} - set(paths)):
-            faults.add(tub, "catalog_not_listed", f"{quote(other)} is not in the manifest; not read")
-        for name in dict.fromkeys(paths):  # each once
-            if Path(name).name != name or not (tub / name).is_file():
-                faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
-                continue
-            for number, line in enumerate(_read(tub / name).splitlines()):
-                yield from _read_record(line, f"{name}, line {number + 1}", None, deleted, tub, faults)
-        return
+        texts = _of_catalogs(tub, paths, faults)
+    else:
+        texts = _of_files(tub)
+    for where, index, text in texts:
+        try:
+            record = _parse(text, index)
+        except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
+            faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")
+            continue
+        if record.index in deleted:
+            faults.add(tub, "deleted_record", f"{where}: its manifest calls record {record.index} deleted")
+        elif record.driver != "user":
+            faults.add(tub, "a_pilot_drove", f"{where}: {quote(record.driver)}")
+        else:
+            yield record
+
+
+def _of_catalogs(tub: Path, paths: list[str], faults: Faults) -> Iterator[tuple[str, int | None, str]]:
+    """Yield each record of a tub of today: where it stands, None, as its number is in it, and its text."""
+    for name in dict.fromkeys(paths):  # each once
+        if Path(name).name != name or not (tub / name).is_file():
+            faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
+            continue
+        for number, line in enumerate(_read(tub / name).splitlines(), 1):
+            yield f"{name}, line {number}", None, line
+
+
+def _of_files(tub: Path) -> Iterator[tuple[str, int | None, str]]:
+    """Yield each record of an older tub: its file's name, its number and its text."""
     files = [p for p in tub.glob("record_*.json") if p.stem.removeprefix("record_").isdecimal()]
     if not files:
         raise EpisodeError(
@@ -173,7 +191,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
             remedy="give the folder that holds them, such as data or tub_1",
         )
     for path in sorted(files):
-        yield from _read_record(_read(path), path.name, int(path.stem.removeprefix("record_")), set(), tub, faults)
+        yield path.name, int(path.stem.removeprefix("record_")), _read(path)
 
 
 def _read(path: Path) -> str:
@@ -183,21 +201,30 @@ def _read(path: Path) -> str:
         raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy="copy it again") from None
 
 
-def _read_manifest(path: Path) -> tuple[list[str], set[Any]]:
-    """Return the names of the catalogs and the deleted records, from the manifest's last line."""
-    for line in reversed(_read(path).splitlines()):
-        try:
-            last = json.loads(line)
-        except (ValueError, RecursionError):
-            break
-        if isinstance(last, dict) and isinstance(last.get("paths"), list):
-            deleted = last.get("deleted_indexes") or []
-            try:
-                return list(map(str, last["paths"])), set(map(int, deleted))
-            except (ValueError, TypeError):
-                found = quote_all(deleted) if isinstance(deleted, list) else quote(deleted)
-                raise EpisodeError(f"{path}: its deleted_indexes are no numbers of records", found=found) from None
-    raise EpisodeError(f"{path}: does not say which catalogs there are", remedy="is it a tub of donkeycar 4 or later?")
+def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
+    """Return the names of the catalogs and the numbers of the deleted records, from the manifest's last line."""
+    try:
+        last = json.loads(_read(path).splitlines()[-1])
+        return list(map(str, last["paths"])), set(map(int, last.get("deleted_indexes") or []))
+    except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
+        raise EpisodeError(
+            f"{path}: does not say which catalogs there are, or which records are deleted",
+            remedy="is it a tub of donkeycar 4 or later?",
+        ) from None
+
+
+def _parse(text: str, index: int | None) -> _Record:
+    """Return the record in a text. index: its number; None: it has its own. Raises ValueError, also of other kinds."""
+    row = json.loads(text)
+    number = row["_index"] if index is None else index
+    ms = row.get("_timestamp_ms", row.get("milliseconds", _as_ms(row.get("timestamp"))))
+    values = row[ANGLE], row[THROTTLE]
+    if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
+        raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")
+    if not is_whole(number) or not (ms is None or is_number(ms)):
+        raise ValueError(f"number {quote(number)}, time {quote(ms)}")
+    time_s = number / RATE_HZ if ms is None else ms / 1000
+    return _Record(number, str(row.get("_session_id", "")), time_s, row[PICTURE], *values, row.get(MODE, "user"))
 
 
 def _as_ms(date: Any) -> float | None:
@@ -205,27 +232,3 @@ def _as_ms(date: Any) -> float | None:
     with suppress(ValueError, TypeError):
         return datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp() * 1000
     return None
-
-
-def _read_record(
-    text: str, where: str, index: int | None, deleted: set[Any], tub: Path, faults: Faults
-) -> Iterator[_Record]:
-    """Yield the record in a text, nothing for one that does not count. index: None: it has its own."""
-    try:
-        row = json.loads(text)
-        number = row["_index"] if index is None else index
-        ms = row.get("_timestamp_ms", row.get("milliseconds", _as_ms(row.get("timestamp"))))
-        values = row[ANGLE], row[THROTTLE]
-        if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
-            raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")
-        if not is_whole(number) or not (ms is None or is_number(ms)):
-            raise ValueError(f"number {quote(number)}, time {quote(ms)}")
-    except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-        faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")
-        return
-    if number in deleted:
-        faults.add(tub, "deleted_record", f"{where}: its manifest calls record {number} deleted")
-    elif row.get(MODE, "user") != "user":
-        faults.add(tub, "a_pilot_drove", f"{where}: {quote(row[MODE])}")
-    else:
-        yield _Record(number, str(row.get("_session_id", "")), None if ms is None else ms / 1000, row[PICTURE], *values)

@@ -133,10 +133,9 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
 
     if workers and scheduler:
         raise click.UsageError("--workers are this machine's; a cluster has its own")
-    jobs, folder = sweeping.Sheet.read(sheet).jobs(), out or Path("runs") / sheet.stem
-    cluster = sweeping.on_cluster(scheduler) if scheduler else sweeping.on_this_machine(workers)
-    with cluster as client:
-        failed = sweeping.sweep(jobs, folder, client, together=bool(scheduler), progress=terminal_bar())
+    jobs, folder = sweeping.read_sheet(sheet), out or Path("runs") / sheet.stem
+    with sweeping.open_cluster(scheduler, workers) as client:
+        failed = sweeping.sweep(jobs, folder, client, progress=terminal_bar())
     content = sweeping.write_report(jobs, folder, failed)
     if as_json:
         click.echo(json.dumps(content, indent=2))

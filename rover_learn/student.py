@@ -21,9 +21,8 @@ from torch import Tensor, nn
 
 from rover_learn.refit import Gram, refit_layer
 from rover_lib.onboard.errors import DistillError
-from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
+from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, expected_shapes, multiply_accumulates
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.checkpoint.contents import expected_shapes
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote_all
 

@@ -193,7 +193,7 @@ def hailo_kit(made_once, request) -> Path:
     def make(folder: Path) -> None:
         from hailo_kit import make_kit, normalised
 
-        make_kit(normalised(request.getfixturevalue("tiny")), folder / "kit")
+        make_kit(normalised(request.getfixturevalue("tiny")), folder)
 
     return made_once("hailo", make) / "kit"
 

@@ -9,12 +9,12 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 # The lowest first:
-BESIDE = ("rover_exchange", "rover_look", "rover_hailo", "rover_learn", "balloon_world")
+BESIDE = ("rover_exchange", "rover_learn", "balloon_world")
 FLOORS = ("rover_lib.onboard", "rover_lib.workshop", "rover_lib.cli", *BESIDE, "lab")
 PLUGIN = "lerobot_robot_rover"  # for LeRobot's commands
 TOPS = ("rover_lib", *BESIDE, PLUGIN, "lab")
 ROOMS = {
-    "lab": ("debian", "arduino", "driving", "a76", "int8", "pi", "repository", "__main__"),
+    "lab": ("debian", "arduino", "driving", "a76", "pi", "repository", "__main__"),
     "rover_lib.onboard": ("car", "artifact", "policy", "recording", "drive", "view", "care", "cli"),
     "rover_lib.workshop": ("recordings", "checkpoint", "judge", "int8", "plots", "run"),
 }

@@ -12,8 +12,11 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
+from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.run.pipeline import Recipe, make_artifact
+from rover_lib.workshop.run.session import load
 
 TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_model=64", "--policy.n_heads=4",
         "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1")  # fmt: skip
@@ -60,7 +63,7 @@ def artifact(request, tmp_path_factory):
         assert last.resolve().name == "000002"
         words = json.loads(rover("inspect", folder / "train", "--json"))["checkpoint"]
         assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
-        rover("quantize", last, dataset, "-o", folder / "policy_static.pt", "--samples", 6)
+        make_artifact(load(last, dataset), folder / "policy_static.pt", Recipe.of(params(), samples=6))
     return folder / "policy_static.pt"
 
 

@@ -92,12 +92,6 @@ def test_pages_fit_a_phone_and_search_works_from_the_disk(site, demo_run, tmp_pa
     asyncio.run(scene())
 
 
-def test_tables_are_tables_and_outputs_are_shown(site):
-    start = (site / "index.html").read_text()
-    assert start.count("<table>") >= 1 and "| --- |" not in start
-    assert "<img" in (site / "notebooks" / "04_compare.html").read_text()
-
-
 def test_dead_links_end_the_build(tmp_path):
     gather(tmp_path)
     for notebook in (tmp_path / "notebooks").glob("*.ipynb"):  # they take most of the time

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
-from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import BLACK, BLUE, MIST, RED, SLATE, Note, claim, legend, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLACK, BLUE, MIST, RED, SLATE, Note, legend, legend_below, new_figure
 
 HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
 
@@ -74,7 +73,6 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
         ax.set(xlabel="an inference takes (ms)", xlim=(-0.6, len(places) - 0.4), ylim=(-4, 104))
     axes[0, 0].set_ylabel(f"worlds in which the balloon was hit\n(% of {rows[0]['trials']}), with the 95 % interval")
     legend_below(fig, axes[0, 0], 2)
-    claim(fig, claims.late_hits([r for r in _late(rows) if r["compensate"]]))
     return fig
 
 
@@ -100,8 +98,6 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
     ax.set(xlabel="an inference takes (ms)", ylabel=f"beside the path of\n{min(places, default=0):g} ms, at most (cm)")
     ax.set_title("bar and number: median of the worlds; line: 90 % of them", fontsize=11)
     legend(ax, loc="upper left")
-    medians = [{r["latency_ms"]: r["aside_p50_cm"] for r in drives if r["compensate"] == how} for how in HOW]
-    claim(fig, claims.beside(*medians))
     return fig
 
 

@@ -7,8 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import MIST, SLATE, Note, claim, legend_below, new_figure
+from rover_lib.workshop.plots.style import MIST, SLATE, Note, legend_below, new_figure
 
 # name, colour, marker, and to which side the marks are moved
 ARMS = (("corrected", SLATE, "o", -1.0), ("demonstrated", MIST, "s", 1.0))
@@ -29,7 +28,6 @@ def hits_by_round(policies: Sequence[Mapping[str, Any]]) -> Figure | Note:
         ax.set_xlabel("human seconds")
     axes[0, 0].set_ylabel("worlds hit (%)")
     legend_below(fig, axes[0, 0], 2)
-    claim(fig, claims.learned(policies))
     return fig
 
 

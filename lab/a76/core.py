@@ -1,4 +1,4 @@
-"""Count what a program executes on an emulated Cortex-A76, the core of a Raspberry Pi 5, or on a Pi 4's Cortex-A72.
+"""Count what a program executes on an emulated Cortex-A76, the core of a Raspberry Pi 5.
 
     core = prepare()
     emulation = emulate_script(core, Path("predict.py"), [], folder)
@@ -58,25 +58,15 @@ FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # optio
 CORES = 4  # as on the Pi: with fewer cores or others in /proc/cpuinfo, XNNPACK would choose other kernels
 CPUINFO = """processor\t: {core}
 BogoMIPS\t: 108.00
-Features\t: {features}
+Features\t: fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop asimddp
 CPU implementer\t: 0x41
 CPU architecture: 8
-CPU variant\t: {variant}
-CPU part\t: {part}
-CPU revision\t: {revision}
+CPU variant\t: 0x4
+CPU part\t: 0xd0b
+CPU revision\t: 1
 
 """
-A76, A72 = "cortex-a76", "cortex-a72"  # QEMU's names for the cores of a Raspberry Pi 5 and 4
-PROCESSORS = {  # what Linux says about each of these cores on a Pi
-    A76: {
-        "features": "fp asimd evtstrm aes pmull sha1 sha2 crc32 atomics fphp asimdhp cpuid asimdrdm lrcpc dcpop "
-        "asimddp",
-        "variant": "0x4",
-        "part": "0xd0b",
-        "revision": 1,
-    },
-    A72: {"features": "fp asimd evtstrm crc32 cpuid", "variant": "0x0", "part": "0xd08", "revision": 3},
-}
+A76 = "cortex-a76"  # QEMU's name for the core of a Raspberry Pi 5
 GUEST_BASE, GUEST_SIZE = 0x100000000000, 0x4000000000  # the guest's addresses, as the host sees them
 SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
 SILENCE_S = 1200  # of processor time: loading the full policy in FP32 prints nothing for five minutes
@@ -95,22 +85,21 @@ class CountError(RoverError):
 
 @dataclass(frozen=True)
 class Core:
-    """An emulated core: its file system with the Pi's wheels, the plugin that counts, and QEMU's name for the core."""
+    """An emulated core: its file system with the Pi's wheels, and the plugin that counts."""
 
     root: Path
     plugin: Path
-    cpu: str = A76
 
 
-def prepare(progress: Progress = silent, cpu: str = A76) -> Core:
+def prepare(progress: Progress = silent) -> Core:
     """Return everything that counting needs, from the cache or made now, which takes about half a minute.
 
     Missing Debian packages are installed if this runs as root. Raises CountError or DebianError if anything cannot be
     had.
     """
-    steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, partial(_userland, cpu))
-    _, plugin, root = [step() for step in progress(steps, desc=f"emulated {cpu}", total=len(steps))]
-    return Core(root, plugin, cpu)
+    steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, _userland)
+    _, plugin, root = [step() for step in progress(steps, desc=f"emulated {A76}", total=len(steps))]
+    return Core(root, plugin)
 
 
 def build_plugin() -> Path:
@@ -123,16 +112,9 @@ def build_plugin() -> Path:
     return cache_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
 
-def _userland(cpu: str) -> Path:
-    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, PROCESSORS[cpu], CORES, RECIPE]}
-
-    def of_another_core(root: Path) -> None:
-        """Make a root with the same files, except for what Linux says about the processor."""
-        shutil.copytree(_userland(A76), root, copy_function=os.link, symlinks=True, dirs_exist_ok=True)
-        (root / "proc" / "cpuinfo").unlink()
-        _write_cpuinfo(root, cpu)
-
-    return cache_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland if cpu == A76 else of_another_core)
+def _userland() -> Path:
+    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
+    return cache_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
 
 
 def _make_userland(root: Path) -> None:
@@ -141,7 +123,7 @@ def _make_userland(root: Path) -> None:
     fetch_wheels(_site(root), "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
-    _write_cpuinfo(root, A76)
+    (root / "proc" / "cpuinfo").write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
     cpus = root / "sys" / "devices" / "system" / "cpu"
     cpus.mkdir(parents=True)
     for name in ("possible", "present", "online"):
@@ -149,12 +131,7 @@ def _make_userland(root: Path) -> None:
     # This proves that the packages work, and leaves the bytecode of everything that they import. To compile that takes
     # a third of a minute in the emulator.
     imports = [_python(root), "-c", "import torch, cv2, serial"]
-    run(*_qemu(root, A76), *imports, error=CountError, env=_environment(root, root))
-
-
-def _write_cpuinfo(root: Path, cpu: str) -> None:
-    text = "".join(CPUINFO.format(core=i, **PROCESSORS[cpu]) for i in range(CORES))
-    (root / "proc" / "cpuinfo").write_text(text)
+    run(*_qemu(root), *imports, error=CountError, env=_environment(root, root))
 
 
 def fetch_wheels(folder: Path, *what: object) -> None:
@@ -171,10 +148,10 @@ def fetch_wheels(folder: Path, *what: object) -> None:
     run(uv, "pip", "install", *options, *what, error=CountError, remedy=remedy)
 
 
-def _qemu(root: Path, cpu: str) -> list[str]:
+def _qemu(root: Path) -> list[str]:
     place = ["-B", hex(GUEST_BASE), "-R", hex(GUEST_SIZE)]
     # setpriv ends the emulator if the process that started it is killed and cannot do so itself.
-    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", cpu, *place]
+    return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", A76, *place]
 
 
 def _python(root: Path) -> Path:
@@ -233,10 +210,6 @@ class Emulation:
         """
         return int(self.more[section][4] + 2 * self.more[section][3])
 
-    def by_thread(self, section: int) -> list[int]:
-        """Return the instructions of each thread that worked in a section; the first is the thread that marked it."""
-        return [int(count) for count in self.more[section][6:] if count]
-
 
 def emulate_script(
     core: Core,
@@ -245,18 +218,15 @@ def emulate_script(
     folder: Path,
     *,
     packages: Path | None = None,
-    threads: int = 1,
     **options: Any,
 ) -> Emulation:
     """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
 
-    packages: a folder of packages that come before the Pi's own on the path. threads: of OpenMP, which wait without
-    executing instructions. options: for `emulate`.
+    packages: a folder of packages that come before the Pi's own on the path. options: for `emulate`.
     """
     environment = _environment(core.root, folder)
     places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
     environment["PYTHONPATH"] = ":".join(map(str, places))
-    environment |= {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0"}
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
     return emulate(core, [_python(core.root), script, *arguments], folder, environment=environment, **options)
 
@@ -274,12 +244,12 @@ def emulate(
     """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 
     folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. stop: ends the
-    program when set. watch: "memory=SECTION" or "threads=1", see guest/count.c.
+    program when set. watch: "memory=SECTION", see guest/count.c.
     Raises CountError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
     Whatever ends this function also ends the emulator.
     """
     plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
-    qemu = [*_qemu(core.root, core.cpu), "-plugin", plugin, *command]
+    qemu = [*_qemu(core.root), "-plugin", plugin, *command]
     with (folder / "stderr").open("wb") as stderr:
         try:
             process = subprocess.Popen(

@@ -5,8 +5,6 @@ count_run("runs/demo")      # writes runs/demo/arm.json
 
 import os
 import re
-import tempfile
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,28 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from lab.a76.core import A76, Core, CountError, prepare
-from lab.a76.count import COUNTED, STEADY, Counted, Guest, count_artifact, guest_of, side_by_side
-from lab.a76.report import LABEL, STATIC, artifact_metrics, gates
+from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, guest_of, side_by_side
+from lab.a76.report import LABEL, artifact_metrics, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.judge.recorded_range import pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.pipeline import requantize
 from rover_lib.workshop.run.session import Opened, open_run
 from rover_lib.workshop.run_program import run
 
 REFERENCE = "policy_fp32"
 FRAMES = 50
 SLOW_GMAC = 1.0  # a larger FP32 takes a minute and a half for an emulated inference, so a few frames must be enough
-BIT_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,7 @@ def count_run(
     compared with what the FP32 artifact of its image size predicts on this machine; so is what it predicts on this
     machine. FP32 takes up to minutes for a frame in the emulated Pi. So it predicts only a few frames there, which must
     equal this machine's within the parity vectors' tolerance. An artifact without an FP32 of its image size is only
-    counted. For policy_static the bits that its INT8 backbone gives are compared too (see `cut_backbone`).
+    counted.
     jobs: how many artifacts are counted at a time, each in one thread and below 1 GB; this machine's cores if None.
     Raises CountError, or what reading the run raises.
     """
@@ -79,16 +72,11 @@ def count_run(
         raise CountError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
     core = prepare(progress)
     plans = plans_of(manifests, len(samples))
-    with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
-        guests = {stem: guest_of(path) for stem, path in artifacts.items()}
-        if STATIC in artifacts:
-            guests[STATIC] = cut_backbone(run_dir, again.checkpoint, pick_evenly(samples, BIT_FRAMES), Path(scratch))
-        counts = _count_all(core, artifacts, plans, guests, samples, jobs or os.cpu_count() or 1, progress)
-        bits = {"backbone_bits": compare_bits(Path(scratch))} if STATIC in artifacts else {}
+    counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
     rows = {stem: artifact_metrics(counts[stem], manifests[stem]) for stem in artifacts}
     for stem, judged in _judge(artifacts, plans, counts, samples, again, progress).items():
         rows[stem] |= judged
-    metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows, **bits}
+    metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
     if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
         metrics["note"] = note
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
@@ -96,33 +84,6 @@ def count_run(
     given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
     return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
-
-
-def count_other_core(run_dir: Path | str, cpu: str, progress: Progress = silent) -> dict[str, Any]:
-    """Count policy_fp32 and policy_static of a run on another core and on a Pi 5's; write and return arm-<cpu>.json.
-
-    metrics: for each artifact, the instructions of an inference on both cores, in 10**9, and their ratio. Predictions
-    are not judged here: parity vectors do that on the machine where the artifact is deployed. Raises as `count_run`.
-    """
-    run_dir = Path(run_dir)
-    artifacts = {stem: run_dir / f"{stem}.pt" for stem in (REFERENCE, STATIC)}
-    if missing := [path.name for path in artifacts.values() if not path.exists()]:
-        raise CountError(f"{run_dir}: no {missing[0]} in it", remedy="'rover run' makes a run")
-    samples = pick_evenly(open_run(run_dir).parts.held_out, STEADY)
-    cores = {core: prepare(progress, core) for core in (A76, cpu)}
-    counts = {
-        (stem, name): partial(count_artifact, core, path, samples, counted=STEADY)
-        for stem, path in artifacts.items()
-        for name, core in cores.items()
-    }
-    counted = side_by_side(counts, STEADY * len(counts), "emulated inferences", os.cpu_count() or 1, progress)
-    rows = {}
-    for stem in artifacts:
-        here, there = (counted[stem, name].steady / 1e9 for name in (A76, cpu))
-        rows[stem] = {f"{A76}_g": here, f"{cpu}_g": there, "ratio": there / here}
-    inputs = {p.name: sha256_of(p) for p in artifacts.values()}
-    given = {"cpu": cpu, "steady": STEADY, "threads": 1}
-    return write_stage(run_dir / f"arm-{cpu}.json", "arm", params=given, metrics={"artifacts": rows}, inputs=inputs)
 
 
 def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
@@ -153,15 +114,14 @@ def _count_all(
     core: Core,
     artifacts: Mapping[str, Path],
     plans: Mapping[str, Plan],
-    guests: Mapping[str, Guest],
     samples: Sequence[Any],
     jobs: int,
     progress: Progress,
 ) -> dict[str, Counted]:
     counts: dict[str, Callable[..., Counted]] = {}
     for stem, plan in plans.items():
-        chosen = [samples[i] for i in plan.frames]
-        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guests[stem], counted=plan.counted)
+        chosen, guest = [samples[i] for i in plan.frames], guest_of(artifacts[stem])
+        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guest, counted=plan.counted)
     inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
     return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
 
@@ -217,34 +177,3 @@ def errors_pct(
     """
     mean = np.abs(chunks.astype(np.float64) - reference).mean((0, 1))
     return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}
-
-
-def cut_backbone(run_dir: Path, checkpoint: Checkpoint, samples: Sequence[Any], folder: Path) -> Guest:
-    """Cut policy_static's INT8 backbone out of the same graph (see pipeline.requantize), and run it on this machine.
-
-    It goes up to the image projection's INT8 output. folder: takes it, the samples' prepared frames, and its bits.
-    Returns a guest that leaves the emulated Pi's bits beside them after its predictions: to import torch again would
-    take longer than they do. Raises QuantizeError if policy_static.pt was not made from the run's files.
-    """
-    backbone = q.backbone_of(requantize(run_dir, checkpoint)).eval()
-    inputs = [q.inputs_of(s, checkpoint.config) for s in samples]
-    with torch.inference_mode(), torch.jit.optimized_execution(False), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
-        traced = torch.jit.freeze(torch.jit.trace(backbone, inputs[0], check_trace=False).eval())
-        np.save(folder / "here.npy", torch.cat([traced(*x) for x in inputs]).numpy())
-    traced.save(folder / "backbone.pt")
-    frames: dict[str, Any] = {}
-    for i, (_, *seen) in enumerate(inputs):
-        for camera, frame in zip(checkpoint.config.cameras, seen, strict=True):
-            frames[f"frame_{i:04d}.{camera}"] = frame.numpy()
-    np.savez(folder / "inputs.npz", state=torch.cat([x[0] for x in inputs]).numpy(), **frames)
-    return Guest(arguments=(q.ENGINE, *(folder / name for name in ("backbone.pt", "inputs.npz", "there.npy"))))
-
-
-def compare_bits(folder: Path) -> dict[str, int]:
-    """Return how many frames there were, how many values were compared, and how many of them differ."""
-    here, there = (np.load(folder / f"{where}.npy") for where in ("here", "there"))
-    if (here.dtype, here.shape) != (there.dtype, there.shape):
-        expected, given = f"{here.dtype} {here.shape}", f"{there.dtype} {there.shape}"
-        raise CountError(f"the backbone gives {expected} on this machine, and not on the core", found=given)
-    return {"frames": len(here), "values": here.size, "differing": int((there != here).sum())}

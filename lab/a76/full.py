@@ -36,10 +36,8 @@ STEPS = 24
 DRIVES = 16  # two of them choose and two judge, with far more frames than the 50 that judge a count
 LEARNED_DRIVES = 80  # as many as the demo's, so that their recordings are in the cache already
 SAMPLES = 64  # how many frames calibrate
-CURVE_SAMPLES = 8  # how many calibrate what is only counted, as a count does not depend on the ranges
 CHECKED_FRAMES = 8  # how many frames check an export against its policy
 SIZES = ((180, 320),)  # image sizes that are judged, in addition to that of training
-CURVE = ((320, 576), (288, 512), (240, 432))  # image sizes that are only counted
 
 
 def full_run(
@@ -50,20 +48,18 @@ def full_run(
     drives: int | None = None,
     samples: int = SAMPLES,
     sizes: tuple[tuple[int, int], ...] = SIZES,
-    curve: tuple[tuple[int, int], ...] = CURVE,
     progress: Progress = silent,
 ) -> Path:
     """Record drives, train a policy for a few steps, and quantize it at several image sizes. Returns run_dir.
 
     size: 'full' (the user's policy, 360x640), or 'small' to try this out. steps: None for the whole recipe, as in
     `rover train`. drives: if None, 16, or the demo's 80 for the whole recipe. samples: how many frames calibrate
-    at most. sizes, curve: further image sizes (height, width) in pixels, with the same weights. progress: called like
-    tqdm.tqdm(iterable, desc=, total=).
+    at most. sizes: further image sizes (height, width) in pixels, with the same weights.
 
     Leaves what the notebooks leave, as far as counting needs it: episodes, best_model.pth, load.json, calibrate.json,
     calibration.pt, policy_fp32.pt, policy_static.pt, quantize.json and, last, these two policies for ONNX Runtime as
     policy_fp32.onnx.zip and policy_static.onnx.zip. For each of `sizes` it leaves calibration_<height>x<width>.pt,
-    policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt; for each of `curve` only the last of these.
+    policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt.
     load.json says whether the policy can drive. Recordings and checkpoint come from the cache if they were made before.
     Raises WorldError if run_dir holds another kind of run, and whatever the steps raise.
     """
@@ -81,13 +77,10 @@ def full_run(
     loaded = load(checkpoint, episodes)
     write_load(run_dir, loaded, note)
     recipe = replace(Recipe.of(params()), samples=samples)
-    few = replace(recipe, samples=min(samples, CURVE_SAMPLES))
     modes: dict[str, dict[str, Any]] = {}
-    for at in curve:
-        modes |= _quantize(run_dir, loaded, at, few, fp32=False, progress=progress)
     for at in sizes:
-        modes |= _quantize(run_dir, loaded, at, recipe, progress=progress)
-    modes |= _quantize(run_dir, loaded, None, recipe, progress=progress)
+        modes |= _quantize(run_dir, loaded, at, recipe, progress)
+    modes |= _quantize(run_dir, loaded, None, recipe, progress)
     write_quantize(run_dir, loaded.checkpoint, {"modes": modes})
     export_onnx(run_dir, progress)
     return run_dir
@@ -98,9 +91,7 @@ def _quantize(
     loaded: Opened,
     size: tuple[int, int] | None,
     recipe: Recipe,
-    *,
-    fp32: bool = True,
-    progress: Progress = silent,
+    progress: Progress,
 ) -> dict[str, dict[str, Any]]:
     """Calibrate at one image size (None: training's), write its artifacts, and return their part of quantize.json."""
     suffix = f"_{size[0]}x{size[1]}" if size else ""
@@ -108,9 +99,8 @@ def _quantize(
     chosen, note = recipe.choose(loaded.parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
     policies: dict[str, Any] = {f"static{suffix}": quantize(checkpoint, recipe.scheme, calibration)}
-    if fp32:
-        policies[f"fp32{suffix}"] = ACT(checkpoint.config, checkpoint.weights)
-        calibration.save(run_dir / f"calibration{suffix}.pt")
+    policies[f"fp32{suffix}"] = ACT(checkpoint.config, checkpoint.weights)
+    calibration.save(run_dir / f"calibration{suffix}.pt")
     if not suffix:
         write_calibrate(run_dir, checkpoint, calibration, chosen, recipe, note)
     samples = pick_evenly(loaded.parts.choosing, CHECKED_FRAMES)

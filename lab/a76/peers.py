@@ -21,29 +21,25 @@ import numpy as np
 from torch import nn
 
 from lab.a76.core import FOR_GUEST, GUEST, CountError, fetch_wheels, prepare
-from lab.a76.count import COUNTED, OURS, Counted, Guest, count_artifact, side_by_side
+from lab.a76.count import COUNTED, Counted, Guest, count_artifact, side_by_side
 from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
 from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest
-from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.stage import atomic_path, find_stage, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import quantize as q
-from rover_lib.workshop.int8.export import export
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.pipeline import Recipe
-from rover_lib.workshop.run.session import Opened, open_run
+from rover_lib.workshop.run.session import open_run
 from rover_lib.workshop.run_program import run
 
 FOLDER = GUEST / "peers"
-COMMON = (FOLDER / "float_policy.py", FOLDER / "planes.py")
 SHIM = FOLDER / "executorch.cpp"
 COMPILER = "aarch64-linux-gnu-g++"
 NEEDS = {COMPILER: "g++-aarch64-linux-gnu"}  # the Debian package of a command
@@ -145,7 +141,7 @@ def _compile(folder: Path) -> None:
 class Made:
     """An engine's form of the policy, and what the script that made it reported.
 
-    report: `int8_layers` (how many), `float_layers` (their names) and `versions`; empty for our own engine.
+    report: `int8_layers` (how many), `float_layers` (their names) and `versions`.
     """
 
     path: Path
@@ -153,19 +149,13 @@ class Made:
 
 
 def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
-    """Quantize the policy with an engine's own tools into `folder`, unless it is there and its inputs are unchanged.
+    """Quantize the policy with an engine's own tools into `folder`.
 
     samples: for calibration. Raises CountError if the tools fail, or if they leave a layer in float that is INT8 in our
     artifact.
     """
-    artifact, report = folder / f"{engine.name}{engine.suffix}", folder / f"{engine.name}.json"
-    frames = [sha256_of(s.frame_path) for s in samples]
-    states = [s.state.tolist() for s in samples]
-    goes_in = {"checkpoint": checkpoint.sha256, "frames": frames, "states": states, "packages": engine.packages}
-    key = key_of(goes_in, engine.maker, *COMMON, act)
-    made_of = {artifact.name: sha256_of(artifact)} if artifact.exists() else {}
-    if made_of and (before := find_stage(report, "peer", params={"key": key}, inputs=made_of)):
-        return Made(artifact, before["metrics"])
+    folder.mkdir(exist_ok=True)
+    artifact = folder / f"{engine.name}{engine.suffix}"
     height, width = checkpoint.config.image_sizes[0]
     with tempfile.TemporaryDirectory(prefix="rover-peer-") as scratch, atomic_path(artifact) as temporary:
         calibration = Path(scratch) / "calibration.npz"
@@ -177,7 +167,6 @@ def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Samp
         printed = run(*command, error=CountError, remedy=remedy, env=environment)
         made = json.loads(printed.splitlines()[-1])
         check_int8(engine.name, made, int8_layers(checkpoint))
-    write_stage(report, "peer", params={"key": key}, metrics=made, inputs={artifact.name: sha256_of(artifact)})
     return Made(artifact, made)
 
 
@@ -195,16 +184,6 @@ def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
         raise CountError(f"{what}; float are {made['float_layers'][:5]}")
 
 
-def affine(run_dir: Path, again: Opened) -> Made:
-    """Make our static artifact by the recipe of the tutorials (quint8 activations), with the run's own calibration."""
-    calibration = q.Calibration.load(run_dir / "calibration.pt")
-    path = run_dir / "peers" / f"{AFFINE}.pt"
-    policy = q.quantize(again.checkpoint, q.Scheme("static", kind="affine", smooth=calibration.smooth), calibration)
-    samples = pick_evenly(again.parts.choosing, 8)
-    export(policy, again.checkpoint, path, samples, calibration, Recipe.of(params()).parity)
-    return Made(path, {})
-
-
 # --- counting ---------------------------------------------------------------------------------------------------------
 
 
@@ -218,18 +197,15 @@ def count_peers(
 ) -> dict[str, Any]:
     """Count the peers of a run's static artifact, add them to its arm.json and return the content of that.
 
-    metrics.peers has rows like those of metrics.artifacts. `torch_fp32`, and `torch_affine` if the run has that
-    artifact, repeat a row whose name is in `artifact`; otherwise `torch_affine` is made and counted too. `onnxruntime`
-    and `executorch` also have `int8_layers` and `made_with`, the versions of their tools. All have `file_mb`. What the
-    engines make is kept in run_dir/peers. A peer's chunks come from the emulated Pi, the reference from this machine,
-    whose FP32 count_run has compared with the Pi's.
-    frames: how many held-out frames to judge with; `torch_affine`, which is several times slower, gets half of them.
-    jobs: how many machines are emulated at a time. Raises CountError if arm.json is missing or was counted from other
-    artifacts, or if a peer cannot be had, made or run.
+    metrics.peers has rows like those of metrics.artifacts, with `file_mb`. `torch_fp32` and, if the run has that
+    artifact, `torch_affine` repeat a row whose name is in `artifact`. The others also have `int8_layers` and
+    `made_with`, the versions of their tools. A peer's chunks come from the emulated Pi, the reference from this
+    machine, whose FP32 count_run has compared with the Pi's. What the engines make is kept in run_dir/peers.
+    frames: how many held-out frames to judge with. jobs: how many machines are emulated at a time. Raises CountError if
+    arm.json is missing or was counted from other artifacts, or if a peer cannot be had, made or run.
     """
     run_dir = Path(run_dir)
     content, reference = open_counted_run(run_dir)
-    artifacts = content["metrics"]["artifacts"]
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     core = prepare(progress)
@@ -243,32 +219,29 @@ def count_peers(
     made: dict[str, Made] = {}
     for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
         made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
-    judged = dict.fromkeys(made, samples)
-    if AFFINE not in artifacts:
-        made["torch_affine"], judged["torch_affine"] = affine(run_dir, again), samples[::2]
-
-    counts: dict[str, Callable[..., Counted]] = {}
-    for name, peer in made.items():
-        counts[name] = partial(count_artifact, core, peer.path, judged[name], guest=guests.get(name, OURS))
-    inferences = sum(max(len(judged[name]), COUNTED) for name in made)
+    counts: dict[str, Callable[..., Counted]] = {
+        name: partial(count_artifact, core, peer.path, samples, guest=guests[name]) for name, peer in made.items()
+    }
+    inferences = max(len(samples), COUNTED) * len(made)
     counted = side_by_side(counts, inferences, "peers, emulated", jobs or os.cpu_count() or 1, progress)
 
     here, manifest = chunks_here(reference, samples, progress), read_manifest(reference)
+    ranges = again.recordings.action_range()
     peers = {}
     for name, stem in (("torch_fp32", REFERENCE), ("torch_affine", AFFINE)):
-        if stem in artifacts:
-            peers[name] = {"artifact": stem, "file_mb": file_mb(run_dir / f"{stem}.pt")} | artifacts[stem]
-    ranges = again.recordings.action_range()
+        if found := content["metrics"]["artifacts"].get(stem):
+            peers[name] = {"artifact": stem, "file_mb": file_mb(run_dir / f"{stem}.pt")} | found
     for name, peer in made.items():
-        expected = here[::2] if name == "torch_affine" else here
-        peers[name] = peer_metrics(counted[name], manifest, expected, ranges) | {"file_mb": file_mb(peer.path)}
-        if peer.report:
-            peers[name] |= {"int8_layers": peer.report["int8_layers"], "made_with": peer.report["versions"]}
-    inputs = content["inputs"] | {
-        f"{peer.path.parent.name}/{peer.path.name}": sha256_of(peer.path) for peer in made.values()
-    }
+        peers[name] = peer_metrics(counted[name], manifest, here, ranges) | {
+            "file_mb": file_mb(peer.path),
+            "int8_layers": peer.report["int8_layers"],
+            "made_with": peer.report["versions"],
+        }
+    inputs = {f"peers/{peer.path.name}": sha256_of(peer.path) for peer in made.values()}
     metrics = content["metrics"] | {"peers": peers}
-    return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
+    return write_stage(
+        run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=content["inputs"] | inputs
+    )
 
 
 def file_mb(path: Path) -> float:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.counting import whole_size
 from rover_lib.workshop.plots.style import (
     BLUE,
@@ -20,7 +19,6 @@ from rover_lib.workshop.plots.style import (
     SLATE,
     action_colour,
     bar_values,
-    claim,
     judged_keys,
     legend,
     legend_below,
@@ -63,7 +61,6 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     right.set_title(f"computed on it, {over} frames", fontsize=11)
     legend(left, loc="lower right")
     legend(right, loc="upper right")
-    claim(fig, claims.instructions(rows))
     return fig
 
 
@@ -109,5 +106,4 @@ def draw_counts_by_size(metrics: Mapping[str, Any]) -> Figure:
     ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
     ax.set_xlim(0, None)
     legend(ax, loc="lower right")
-    claim(fig, claims.smaller_picture(rows))
     return fig

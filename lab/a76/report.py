@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from lab.a76.core import A76
 from lab.a76.count import Counted
 from rover_lib.onboard.care.pi5 import DRIVING, Work, predict_ms
 from rover_lib.onboard.columns import align
@@ -37,12 +36,16 @@ GROUPS = (
 # by one thread while the others wait.
 DIVIDED = re.compile(r"xnn|pthreadpool|sgemm|[Ss]leef|flash_attention|qmaxpool|onnxruntime|Mlas")
 
-COLUMNS = {  # the table's columns with their widths
-    **dict.fromkeys(("instructions_g", "simd_g", "x_floor", "first_g", "tenth_g", "load_instructions_g"), 7),
-    **{"peak_memory_mb": 6, "peak_memory_loading_mb": 7},
+COLUMNS = {  # the table's, each with the key of arm.json and how it is written
+    "steady": ("instructions_g", ".4g"),
+    "SIMD": ("simd_g", ".4g"),
+    "x floor": ("x_floor", ".2f"),
+    "first": ("first_g", ".4g"),
+    "tenth": ("tenth_g", ".4g"),
+    "load": ("load_instructions_g", ".4g"),
+    "MB": ("peak_memory_mb", ".0f"),
+    "loading": ("peak_memory_loading_mb", ".0f"),
 }
-FRAMES = "frames_on_the_core"
-WORST = "worst action"  # the table's only error for a policy with more than two actions
 
 
 def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
@@ -90,53 +93,31 @@ def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
     """Hold static artifacts to their gates; return `compare.gate` rows.
 
-    metrics: of arm.json. limits: arm.gates of lab/params.yml.
-    A gate is left out if this run has no artifact for it: those of instructions are for the user's policy, which is
-    known by its multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too, and the
-    worst action is judged.
+    metrics: of arm.json. limits: arm.gates of lab/params.yml. A gate is left out if this run has no artifact for it:
+    those of instructions are for the user's policy, which is known by its multiply-accumulates. Errors are divided by
+    this machine's, ONNX Runtime's by torch's too, and the worst action is judged.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():
         own = dict(limits["policies"].get(stem, {}))
-        if not own or abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
+        if own and abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
             own = {}
         rows += [gate(f"{stem} {key}", artifact[key], "<=", limit) for key, limit in own.items()]
         if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?(\.onnx)?", stem) or artifact.get("reference") is None:
             continue
         here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
-        rows += [
-            gate(
-                f"{stem} error on the emulated core, times the workstation's",
-                _times(artifact, here),
-                "<=",
-                limits["x_workstation_error"],
-            ),
-            gate(f"{stem} frames judged on the emulated core", artifact["frames_on_the_core"], ">=", limits["frames"]),
-            gate(f"{stem} cost of the tenth plan against the third, %", off_pct, "<=", limits["tenth_pct"]),
+        held = [
+            ("error on the emulated core, times the workstation's", _times(artifact, here), "x_workstation_error"),
+            ("cost of the tenth plan against the third, %", off_pct, "tenth_pct"),
         ]
-        for key in ("peak_memory_mb", "peak_memory_loading_mb"):
-            if key not in own:
-                rows.append(gate(f"{stem} {key}", artifact[key], "<=", limits[key]))
+        held += [(key, artifact[key], key) for key in ("peak_memory_mb", "peak_memory_loading_mb") if key not in own]
         if stem == STATIC_ONNX and (torchs := metrics["artifacts"].get(STATIC)):
-            errors = {key: torchs[key] for key in here}
-            rows.append(
-                gate(
-                    f"{stem} error on the emulated core, times torch's there",
-                    _times(artifact, errors),
-                    "<=",
-                    limits["x_torch_error"],
-                )
-            )
-    if bits := metrics.get("backbone_bits"):
-        rows.append(
-            gate(
-                f"{STATIC} backbone values that differ from the workstation's",
-                bits["differing"],
-                "<=",
-                limits["backbone_differing"],
-            )
-        )
+            there = {key: torchs[key] for key in here}
+            held.append(("error on the emulated core, times torch's there", _times(artifact, there), "x_torch_error"))
+        rows += [gate(f"{stem} {what}", found, "<=", limits[limit]) for what, found, limit in held]
+        frames = artifact["frames_on_the_core"]
+        rows.append(gate(f"{stem} frames judged on the emulated core", frames, ">=", limits["frames"]))
     return rows
 
 
@@ -166,49 +147,22 @@ def table(content: dict[str, Any]) -> str:
     """Show arm.json as text: the counts, fewest instructions first; then the computed times, the note and the gates."""
     metrics = content["metrics"]
     counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
-    rows = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
-    wide = max(24, *(len(stem) for stem in counted))
-    keys = {k: None for _, m in rows for k in m if k.endswith("_mae_pct") and not k.startswith("workstation_")}
-    errors = {k: k.removesuffix("_mae_pct") for k in keys} if len(keys) <= 2 else {WORST: WORST}
-    widths = COLUMNS | {key: max(8, len(name)) for key, name in errors.items()} | {FRAMES: 6}
-    named = " ".join(f"{name:>{widths[key]}}" for key, name in errors.items())
-    lines = [
-        f"{LABEL}, G instructions per inference; errors against FP32 in percent of the recorded range",
-        f"{'':{wide}} {'steady':>7} {'SIMD':>7} {'x floor':>7} {'first':>7} {'tenth':>7} {'load':>7}"
-        f" {'MB':>6} {'loading':>7} {named} {'frames':>6}",
-    ]
-    for stem, m in rows:
-        shown = m | {WORST: worst(m.get(key) for key in keys)}
-        cells = (_cell(shown.get(key), key, width) for key, width in widths.items())
-        lines.append(" ".join([f"{stem:{wide}}", *cells]))
-    lines += [
-        "",
-        f"computed from these counts for {DRIVING} cores of a Raspberry Pi 5, ms, never timed (docs/clock.md)",
-    ]
-    for stem, m in rows:
-        if times := m.get("computed_pi5_ms"):
-            lines.append(f"{stem:{wide}} {times['ms']:7.3g}, from {times['low']:.3g} to {times['high']:.3g}")
+    ordered = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
+    rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
+    for name, found in ordered:
+        cells = [_written(found.get(key), how) for key, how in COLUMNS.values()]
+        errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
+        times = found["computed_pi5_ms"]
+        span = f"{times['low']:.3g} to {times['high']:.3g}"
+        rows.append([name, *cells, _written(worst(errors), ".3f"), str(found.get("frames_on_the_core", "-")), span])
+    lines = [f"{LABEL}, 10^9 instructions of an inference; times are computed from them (docs/clock.md)", *align(rows)]
     if note := metrics.get("note"):
         lines += ["", f"note: {note}"]
-    if metrics.get("gates"):
-        lines += ["", "gates (lab/params.yml)"]
-        for row in metrics["gates"]:
-            verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
-            shown = "-" if row["found"] is None else f"{row['found']:.4g}"
-            lines.append(f"{row['gate']:56} {shown:>8} {row['relation']} {row['limit']:<6g} {verdict}")
+    for row in metrics["gates"]:
+        verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
+        lines.append(f"{verdict}: {row['gate']}, {_written(row['found'], '.4g')} {row['relation']} {row['limit']:g}")
     return "\n".join(lines)
 
 
-def other_core_table(content: dict[str, Any]) -> str:
-    """Show the JSON of `count_other_core` as a table."""
-    names = [f"{A76}_g", f"{content['params']['cpu']}_g"]
-    rows = [["", *(f"{name.removesuffix('_g')}, G instructions" for name in names), "ratio"]]
-    for stem, m in content["metrics"]["artifacts"].items():
-        rows.append([stem, *(f"{m[name]:.4g}" for name in names), f"{m['ratio']:.2f}"])
-    return "\n".join(align(rows))
-
-
-def _cell(value: float | None, key: str, width: int) -> str:
-    error = key.endswith("_pct") or key == WORST
-    form = ".3f" if error else ".0f" if key.endswith("_mb") else ".2f" if key == "x_floor" else ".4g"
-    return f"{'-' if value is None else format(value, form):>{width}}"
+def _written(value: float | None, how: str) -> str:
+    return "-" if value is None else format(value, how)

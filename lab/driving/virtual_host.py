@@ -22,7 +22,7 @@ from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive import watch
-from rover_lib.onboard.drive.drive import arm_capped, arm_when_ready, what_is_missing
+from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, what_is_missing
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
@@ -506,7 +506,7 @@ class Process:
             self.planner.renew(_settings().fade_s)
             pilot.check_sight()
             wanted = self._operators.check_request if self._service else lambda: None
-            self.armed = arm_capped(link, limit, limit, self.log.event, wanted)
+            self.armed = arm_capped(link, limit, self.log.event, wanted)
         except RoverError as error:
             world.phase("disarmed")
             self.log.event(f"not armed: {error}")

@@ -1,1 +1,1 @@
-"""Emulate Pis: the same Debian arm64 in a container (real systemd and sshd, up in seconds) and as a whole machine."""
+"""Emulate Pis: Debian arm64 in a container, with real systemd and sshd, up in seconds."""

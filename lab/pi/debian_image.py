@@ -39,8 +39,7 @@ for group in {GROUPS.replace(",", " ")}; do getent group $group > /dev/null || g
 useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
 """
 # These programs replace the real ones while the packages are configured. So no service is started, and no bundle of
-# certificates is made, which takes a minute under emulation: a container gets this machine's, and the whole machine has
-# no network.
+# certificates is made, which takes a minute under emulation: a container gets this machine's.
 STAND_INS = {"policy-rc.d": "exit 101", "update-ca-certificates": "exit 0"}
 
 

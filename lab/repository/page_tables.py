@@ -4,19 +4,17 @@
 
 A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
-A computed time in a sentence stands between `<!-- ms POLICY -->` and `<!-- end -->`; it is from the clock's JSON too.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
-from datetime import datetime
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import nbformat
 
-from rover_lib.onboard.care.pi5 import CORES, DRIVING
+from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.run.run import parameters_in
@@ -29,15 +27,9 @@ EXPLAINED = {  # the modes, in words that need no other page
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
 BEST = "static"
-GHZ, LINE = 2.4, 64  # of a Raspberry Pi 5; bytes of a cache line
 PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
-TIME = re.compile(r"(<!-- ms ([^>]+?) -->)(.*?)(<!-- end -->)")
 
 Row = tuple[str, ...]
-
-
-class TableError(RoverError):
-    """Pages, notebooks or results/ without what a table needs."""
 
 
 def pages(root: Path = ROOT) -> dict[Path, str]:
@@ -46,7 +38,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
 
 
 def update(root: Path = ROOT) -> list[Path]:
-    """Write the tables of the pages in `root` anew; returns the pages that changed. Raises TableError, and writes
+    """Write the tables of the pages in `root` anew; returns the pages that changed. Raises RoverError, and writes
     nothing then.
     """
     old = pages(root)
@@ -59,135 +51,28 @@ def update(root: Path = ROOT) -> list[Path]:
 
 
 def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
-    """The pages with their tables as results/ and notebooks/ in `root` have them. Raises TableError."""
+    """The pages with their tables as results/ and notebooks/ in `root` have them. Raises RoverError."""
     names = [match[2] for text in texts.values() for match in PLACE.finditer(text)]
     if sorted(names) != sorted(TABLES):
-        raise TableError("the pages must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
+        raise RoverError("the pages must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
 
     def place(match: re.Match[str]) -> str:
         header, *rows = TABLES[match[2]](root)
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
-    placed = {path: PLACE.sub(place, text) for path, text in texts.items()}
-    times = _clock(root)
-
-    def tell(match: re.Match[str]) -> str:
-        if match[2] not in times:
-            raise TableError(
-                f"no time of {match[2]!r} is computed",
-                found=sorted(times),
-                remedy="add it to lab/a76/network_counts.py",
-            )
-        return match[1] + times[match[2]] + match[4]
-
-    return {path: TIME.sub(tell, text) for path, text in placed.items()}
+    return {path: PLACE.sub(place, text) for path, text in texts.items()}
 
 
 def _clock(root: Path) -> dict[str, str]:
-    """What each policy takes on the cores that drive, as "low to high"; on others as "POLICY, 4 threads"."""
-    times = {}
-    for row in _metrics(root / "results" / "clock", "clock")["policies"]:
-        span = span_of(row)
-        times[f"{row['name']}, {row['threads']} threads"] = span
-        if row["threads"] == DRIVING:
-            times[row["name"]] = span
-            times[shape_of(row)] = span
-    return times
-
-
-def _policies(root: Path) -> list[Row]:
-    """What our policies take by threads."""
+    """What each shape of a policy takes on the cores that drive, as "low to high"; computed."""
     rows = _metrics(root / "results" / "clock", "clock")["policies"]
-    times = _clock(root)
-    table: list[Row] = [
-        ("a plan, ms, *computed*: policy", "10^9 instructions", *(f"{n} thread{'s' * (n > 1)}" for n in range(1, 5)))
-    ]
-    for row in rows[::CORES]:
-        what = f"{row['name']}: {row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}"
-        spans = (times[f"{row['name']}, {n} threads"] for n in range(1, CORES + 1))
-        table.append((what, f"{row['instructions_g']:.3g}", *spans))
-    return table
-
-
-def _fit(root: Path) -> list[Row]:
-    """What the fit found that one of each takes."""
-    cycle, near, far = _metrics(root / "results" / "clock", "clock")["fit"]["ns"]
-    return [
-        ("what", "ns", "that is"),
-        ("a cycle", f"{cycle:.3f}", f"{GHZ * cycle:.2f} of the clock's at {GHZ} GHz"),
-        ("a near line", f"{near:.2f}", f"{GHZ * near:.1f} cycles, most of its way hidden"),
-        ("a far line", f"{far:.2f}", f"{LINE / far:.1f} GB/s"),
-    ]
-
-
-def _judged(root: Path) -> list[Row]:
-    """How far off the computed times were."""
-    metrics = _metrics(root / "results" / "clock", "clock")
-    judged = {"architecture left out": metrics["judged"]}
-    judged["Arm's GoogLeNet not judged"] = {"4": metrics["judged_without_odd"]["4"]}
-    judged["form chosen without it too"] = {n: metrics["choice"][n] for n in ("1", "4")}
-    judged |= {f"all of {runtime} left out": {"4": found} for runtime, found in metrics["other_runtime"].items()}
-    rows: list[Row] = [("", "times", "median error, %", "worst error, %", "in the interval, %")]
-    for said, by_threads in judged.items():
-        for n, found in by_threads.items():
-            shown = (_of(found, key, ".3g") or "" for key in ("n", "median_pct", "worst_pct", "held_pct"))
-            rows.append((f"{n} thread{'s' * (n != '1')}, {said}", *shown))
-    return rows
-
-
-def _networks(root: Path) -> list[Row]:
-    """Published against computed, a row a network."""
-    rows: dict[tuple[str, ...], dict[int, Mapping[str, Any]]] = {}
-    for row in _metrics(root / "results" / "clock", "clock")["networks"]:
-        rows.setdefault((row["runtime"], row["name"], row["precision"]), {})[row["threads"]] = row
-    table: list[Row] = [("network", *(f"{n}: published / computed" for n in ("1 thread", "4 threads")))]
-    for (runtime, name, precision), by_threads in rows.items():
-        cells = (_against(by_threads[n]) if n in by_threads else "" for n in (1, CORES))
-        table.append((f"{runtime} {name}, {precision}", *cells))
-    return table
-
-
-def _guessed(root: Path) -> list[Row]:
-    """How far off guesses are on real recordings, each held out once."""
-    found = _metrics(root / "results" / "real", "recordings")["guesses_pct"]
-    rows: list[Row] = [("held out", *next(iter(found.values())))]
-    for episode, guesses in found.items():
-        when = datetime.strptime(episode, "episode_%Y%m%d_%H%M%S")
-        rows.append((f"{when:%-d %B, %H:%M}", *(_slashed(errors.values()) for errors in guesses.values())))
-    return rows
-
-
-def _real(root: Path) -> list[Row]:
-    """What policies plan on real recordings."""
-    header = "policy", "FP32 off the driver, %", "best guess, %", "static INT8, %", "of the plans' spread, %", "verdict"
-    rows: list[Row] = [header]
-    for name, found in _metrics(root / "results" / "real", "recordings")["policies"].items():
-        guesses = found["against_driver"]["guesses"].values()
-        best = min((g["errors_pct"] for g in guesses), key=lambda errors: sum(errors.values()))
-        lines = {name: found["static"]}
-        if "calibrated_elsewhere" in found:
-            lines[f"{name}, calibrated in the balloon world"] = found["calibrated_elsewhere"]
-        for said, errors in lines.items():
-            of = (_slashed(v for k, v in errors.items() if k.endswith(end)) for end in ("_mae_pct", "_of_spread_pct"))
-            off = _slashed(found["against_driver"]["errors_pct"].values(), ".1f")
-            rows.append((said, off, _slashed(best.values(), ".1f"), *of, found["verdict"].partition(";")[0]))
-    return rows
-
-
-def _slashed(values: Iterable[float], how: str = ".2f") -> str:
-    return " / ".join(format(value, how) for value in values)
+    return {shape_of(row): span_of(row) for row in rows if row["threads"] == DRIVING}
 
 
 def span_of(row: Mapping[str, Any]) -> str:
     """Return the ends of a computed time with two digits each."""
     return " to ".join(f"{float(f'{row[key]:.2g}'):g}" for key in ("predicted_low_ms", "predicted_high_ms"))
-
-
-def _against(row: Mapping[str, Any]) -> str:
-    computed, low, high = (row[f"predicted{end}_ms"] for end in ("", "_low", "_high"))
-    outside = "" if low <= row["published_ms"] <= high else " *"
-    return f"{row['published_ms']:.3g}/{computed:.3g}{outside}"
 
 
 def shape_of(row: Mapping[str, Any]) -> str:
@@ -237,33 +122,7 @@ def _faults(root: Path) -> list[Row]:
         ("faults that must not stop it: it drove on while its plan was young enough", right("continues")),
         ("faults that must keep it from being armed", right("refused")),
         ("from a moved stick to the human's pulses", f"at most {takeover:.0f} ms"),
-        *_replayed(report),
         ("random drives in virtual time that broke a safety rule", broken),
-        *_view(root),
-    ]
-
-
-def _replayed(report: Mapping[str, Any]) -> list[Row]:
-    """Pulses that were recorded and replayed, where a report still has them: until commit 545214c."""
-    if not report.get("bytes"):
-        return []
-    return [("pulses, recorded, replayed and measured again", f"within {report['bytes']['worst_us']:.0f} us")]
-
-
-def _view(root: Path) -> list[Row]:
-    """What a view does to a drive; its program left after commit 545214c."""
-    report = _metrics(root / "results" / "lab", "view")
-    stop, late = report["stop"], report["late_ms"]
-    cost = f"{late['with']['p99']:.2f} ms at p99; {late['without']['p99']:.2f} without"
-    picture = f"{report['pictures_hz']:.0f} a second, {report['delay_ms']['p95']:.0f} ms old at p95"
-    return [
-        (
-            "clicks on the view's stop button: throttle off",
-            f"{stop['stopped']} of {stop['stops']}, after at most {stop['stop_ms']['max']:.0f} ms",
-        ),
-        (f"commands are late, with {report['pages']} pages of the view", cost),
-        ("pictures in the view", picture),
-        ("the view's share of a core", f"{report['cpu_pct']:.1f} %"),
     ]
 
 
@@ -341,21 +200,15 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "faster": partial(_students, "faster"),
     "learning": _learning,
     "parameters": _parameters,
-    "policies": _policies,
-    "fit": _fit,
-    "judged": _judged,
-    "guessed": _guessed,
-    "real": _real,
-    "networks": _networks,
 }
 
 
 def _metrics(folder: Path, stage: str) -> dict[str, Any]:
-    """A stage's metrics. Raises TableError if it is not there."""
+    """A stage's metrics. Raises RoverError if it is not there."""
     paths = sorted(folder.glob(f"{stage}.json"))
     if len(paths) != 1:
         found = [path.name for path in paths] or "none"
-        raise TableError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
+        raise RoverError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
     return read_stage(paths[0], stage.removesuffix("-*"))["metrics"]
 
 

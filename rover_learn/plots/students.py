@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots import claims
 from rover_lib.workshop.plots.style import (
     MIST,
     OTHERS,
@@ -15,7 +14,6 @@ from rover_lib.workshop.plots.style import (
     Note,
     action_colour,
     bar_values,
-    claim,
     legend,
     new_figure,
 )
@@ -44,7 +42,6 @@ def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
     for label, row in zip(first.get_yticklabels(), rows, strict=True):
         if row["name"] == chosen:
             label.set(weight="bold")
-    claim(fig, claims.student(students, chosen))
     return fig
 
 

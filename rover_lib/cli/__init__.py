@@ -4,30 +4,23 @@ Other packages of the same install add commands by the entry points `rover.<sect
 """
 
 from importlib.metadata import entry_points
+from typing import cast
 
 import click
 
 from rover_lib.cli import drive, prepare
 from rover_lib.onboard import cli as onboard
-from rover_lib.onboard.cli import VERSION, Rover
+from rover_lib.onboard.command import VERSION, Rover
 
 ROVERS = onboard.main.commands
 # What most people need, by what they do; below it all others. inspect, drive, view and log can do more here than there.
 SECTIONS: dict[str, tuple[click.Command, ...]] = {
-    "Prepare a policy": (prepare.run, prepare.inspect, prepare.report),
+    "Prepare a policy": (prepare.run, prepare.inspect, prepare.report, ROVERS["benchmark"], prepare.export),
     "Drive": (ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive),
     "Look": (),
-    "Step by step": (
-        prepare.quantize,
-        prepare.notebook,
-        prepare.compare,
-        ROVERS["benchmark"],
-        prepare.export,
-        prepare.list_runs,
-    ),
     "Teach": (),
     "Recordings": (ROVERS["label"],),
-    "A rover's models, and arming it": (prepare.wheelhouse, ROVERS["release"], ROVERS["arm-car"], ROVERS["heartbeat"]),
+    "A rover's models, and arming it": (ROVERS["release"], ROVERS["arm-car"]),
 }
 # Sections, by the group of entry points that adds to them.
 MORE = {"rover.teach": "Teach", "rover.look": "Look", "rover.recordings": "Recordings"}
@@ -62,6 +55,7 @@ def main(debug: bool) -> None:
     """
 
 
+cast(click.Group, ROVERS["release"]).add_command(prepare.wheelhouse)
 for commands in sections().values():
     for command in commands:
         main.add_command(command)

@@ -25,9 +25,9 @@ from rover_lib.onboard.kinds import Number
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
     """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
 
-    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
-    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
-    --service, which waits disarmed after each drive, another request does.
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with --service, which
+    waits disarmed after each drive, another request does.
     """
     if latency_ms and not in_world:
         raise click.UsageError("--latency-ms belongs to --world")

@@ -4,17 +4,15 @@ import functools
 import json
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
-from rover_lib.onboard.columns import align
-from rover_lib.onboard.errors import printable
-from rover_lib.onboard.kinds import Output, PathTo
+from rover_lib.onboard.command import AS_JSON, FILE, show
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
@@ -54,8 +52,8 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @click.command(short_help="Turn a checkpoint into artifacts and a verdict.")
-@click.argument("checkpoint", type=CHECKPOINT)
-@click.argument("episodes", type=EPISODES)
+@click.argument("checkpoint", type=CHECKPOINT, required=False)
+@click.argument("episodes", type=EPISODES, required=False)
 @ACTION_NAMES
 @CAMERA
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
@@ -63,7 +61,17 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
 @click.option("--worlds", type=click.IntRange(min=0), default=0, show_default=True, help="Balloon worlds to drive in.")
 @click.option("--iterations", type=click.IntRange(min=1), help="Timed inferences per mode [default: params.yml].")
-def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
+@click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
+@click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
+def run(
+    checkpoint: Path | None,
+    episodes: Path | None,
+    name: str,
+    runs_dir: Path,
+    turned: tuple[tuple[str, str], ...],
+    only: str | None,
+    **options: Any,
+) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
     EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; give a dataset on the
@@ -71,33 +79,35 @@ def run(checkpoint: Path, episodes: Path, **options: Any) -> None:
     Executes five notebooks and leaves reports, artifacts, figures and the executed notebooks in the run's folder. Ends
     with a verdict, printed and written as report.html and run.json: which artifact to deploy, what failed, and what to
     do about it.
+
+    -p turns any of the notebooks' parameters; a value is YAML: 0.5, affine, [static, mixed].
+
+    --only 03 --name try1: execute one notebook on that run again. Its results replace those in the folder, so take a
+    copy of a run that you want to keep (`make notebooks-open NAME=demo AS=try1`), and judge it by `rover report`.
     """
+    from rover_lib.workshop.run.run import execute, find_notebook
     from rover_lib.workshop.run.run import run as run_notebooks
+    from rover_lib.workshop.run.run_folder import run_folder
 
-    chosen = {k: v for k, v in options.items() if v is not None}
-    folder = run_notebooks(checkpoint, episodes, progress=terminal_bar(), **chosen)
-    _judge(folder)
+    given = _values_of(turned)
+    if only:
+        if checkpoint or episodes:
+            raise click.UsageError("--only works on a run that is there: give its --name, no CHECKPOINT and EPISODES")
+        folder = run_folder(runs_dir, name, RoverError)
+        return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
+    if not (checkpoint and episodes):
+        raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
+    given = {k: v for k, v in options.items() if v is not None} | given
+    _judge(run_notebooks(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **given))
 
 
-@click.command(short_help="Execute one notebook of a run again.")
-@click.argument("name")
-@click.argument("run_dir", type=PathTo("run"))
-@click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
-def notebook(name: str, run_dir: Path, turned: tuple[tuple[str, str], ...]) -> None:
-    """Execute the notebook NAME, such as 03_quantize, on the run in RUN_DIR, with other parameters.
-
-    Its results replace those in RUN_DIR, so take a copy of a run that you want to keep (`make notebooks-open NAME=demo
-    AS=try1`). A value is YAML: 0.5, affine, [static, mixed]. A parameter that the notebook does not have is refused.
-    """
+def _values_of(turned: tuple[tuple[str, str], ...]) -> dict[str, Any]:
     import yaml
 
-    from rover_lib.workshop.run.run import execute
-
     try:
-        given = {key: yaml.safe_load(value) for key, value in turned}
+        return {key: yaml.safe_load(value) for key, value in turned}
     except yaml.YAMLError as error:
         raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
-    click.echo(f"executed: {execute(name.removesuffix('.ipynb'), run_dir, **given)}")
 
 
 @click.command(short_help="Judge an existing run again.")
@@ -120,115 +130,19 @@ def _judge(run_dir: Path, as_json: bool = False) -> None:
     click.echo(f"{text(content['metrics'])}\n\ndone: {run_dir / PAGE}")
 
 
-@click.command(short_help="Say what a file or folder is, and what is in it.")
-@click.argument("episodes", metavar="FILE", type=FILE)
+@click.command(short_help="Say what a file or folder is; list the runs.")
+@click.argument("episodes", metavar="[FILE]", type=FILE, default="runs")
 @AS_JSON
 @with_source
 def inspect(episodes: "Source", as_json: bool) -> None:
     """Say what FILE is and what is in it: everything that this project writes, and what it reads.
 
     A run, an artifact, a checkpoint (a trainer's or LeRobot's), an episode or a folder of them, a LeRobotDataset, a
-    flight log, a calibration, a stage's report.
+    flight log, a calibration, a stage's report. Of a folder of runs, or without FILE, each run's verdict.
     """
     from rover_lib.workshop.run.describe import describe
 
     show(describe(episodes, terminal_bar()), as_json)
-
-
-@click.command("list", short_help="List the runs with their verdicts.")
-@click.argument("runs_dir", type=FILE, default="runs")
-@AS_JSON
-def list_runs(runs_dir: Path, as_json: bool) -> None:
-    """List the runs in RUNS_DIR, one line each, with the verdict that each ended with."""
-    from rover_lib.workshop.run.describe import runs
-
-    found = runs(runs_dir)
-    if as_json:
-        return show(found, True)
-    for each in found:
-        click.echo(printable(f"{each['name']:<16} {each['verdict']}"))
-    if not found:
-        click.echo(f"no run in {runs_dir}: make demo, or rover run, makes the first")
-
-
-@click.command(short_help="Make one artifact from a checkpoint.")
-@click.argument("checkpoint", type=CHECKPOINT)
-@click.argument("episodes", type=EPISODES)
-@click.option("-o", "--output", type=Output("artifact"), required=True, help="The artifact to write.")
-@click.option("--mode", type=click.Choice(["fp32", "dynamic", "static"]), default="static", show_default=True)
-@click.option(
-    "--kind",
-    type=click.Choice(["symmetric", "affine"]),
-    default="symmetric",
-    show_default=True,
-    help="How activations become INT8; affine is the usual recipe, and slow on a Pi.",
-)
-@click.option(
-    "--observer", type=click.Choice(["histogram", "minmax", "percentile"]), default="histogram", show_default=True
-)
-@click.option(
-    "--float-block",
-    "float_blocks",
-    multiple=True,
-    help="A block to leave in float, which makes the mode mixed; may be repeated.",
-)
-@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
-@with_source
-def quantize(checkpoint: Path, episodes: "Source", output: Path, mode: str, samples: int | None, **how: Any) -> None:
-    """Quantize CHECKPOINT, calibrated on the recordings in EPISODES, to one artifact.
-
-    `rover run` does this for all modes, chooses the observer and the blocks by measurement, and compares.
-    """
-    from rover_lib.onboard.params import params
-    from rover_lib.workshop.run.pipeline import Recipe, make_artifact
-    from rover_lib.workshop.run.session import load
-
-    recipe = Recipe.of(params(), samples)
-    if mode != "fp32":
-        mode = "mixed" if mode == "static" and how["float_blocks"] else mode
-        recipe = replace(recipe, scheme=replace(recipe.scheme, mode=mode, **how))
-    loaded = load(checkpoint, episodes, terminal_bar())
-    digest, warnings = make_artifact(loaded, output, recipe, fp32=mode == "fp32", progress=terminal_bar())
-    for warning in warnings:
-        click.echo(f"rover: warning: {warning}", err=True)
-    click.echo(f"{output}: {mode}, {output.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
-
-
-@click.command(short_help="Compare artifacts with FP32, on recorded frames.")
-@click.argument("reference", type=ARTIFACT)
-@click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
-@click.option("--episodes", type=EPISODES, required=True, help="Recordings; their held-out part is used.")
-@AS_JSON
-@with_source
-def compare(reference: Path, artifacts: tuple[Path, ...], episodes: "Source", as_json: bool) -> None:
-    """Compare ARTIFACTS with REFERENCE (the FP32 artifact) on recorded frames.
-
-    Errors are in percent of the recorded range and in microseconds of servo pulse. Warns if REFERENCE copies its state
-    and ignores its camera.
-    """
-    from rover_lib.onboard.artifact.manifest import distinct_names
-    from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy.load import load_policy
-    from rover_lib.workshop.judge import compare as c
-    from rover_lib.workshop.judge.camera_use import look
-    from rover_lib.workshop.recordings.episodes import load_recordings, split
-
-    p = params()["calibration"]
-    fp32 = load_policy(reference)
-    if not episodes.cameras and len(fp32.cameras) > 1:
-        episodes = replace(episodes, cameras=fp32.cameras)
-    recordings = load_recordings(episodes, fp32.chunk, p["sync_s"], terminal_bar())
-    held_out = split(recordings, p["held_out_share"], p["seed"]).held_out
-    others = {name: load_policy(path) for name, path in distinct_names(artifacts, drop="policy_").items()}
-    report = c.fidelity(fp32, others, held_out, recordings.action_range(), terminal_bar())
-    for warning in report.warnings() + look(fp32, report, progress=terminal_bar()).warnings():
-        click.echo(f"rover: warning: {warning}", err=True)
-    found = {name: report.summary(name) for name in others}
-    if as_json:
-        return show(found, as_json)
-    sizes_mb = {name: policy.path.stat().st_size / 1e6 for name, policy in others.items()}
-    click.echo("\n".join(align(c.comparison_rows(found, sizes_mb, fp32.path.stat().st_size / 1e6))))
-    click.echo(f"errors on {len(held_out)} held-out frames, of the recorded range, and microseconds of pulse")
 
 
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")

@@ -4,173 +4,43 @@ It is thin: it parses arguments, calls the library and prints.
 """
 
 import contextlib
-import functools
 import json
 import os
 import platform
-import re
 import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any
 
 import click
 
 from rover_lib.onboard.columns import align, benchmark_rows, number
-from rover_lib.onboard.errors import RoverError, of_system, printable
+from rover_lib.onboard.command import (
+    ARTIFACT,
+    AS_JSON,
+    CAMERA,
+    FILE,
+    LOG_DRIVE,
+    MOST_THREADS,
+    PORT,
+    SECONDS,
+    VERSION,
+    Rover,
+    show,
+    with_options,
+)
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
-FILE = click.Path(path_type=Path)
-ARTIFACT = PathTo("artifact")
-MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
-LONG_LIST = 12  # longer lists are for programs, and not printed for people
 BUSY = 0.5  # load per core in the last minute; above it, times are only rough
-# Options that several commands share:
-CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder, FIFO or .mjpeg."
-)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
-LOG_DRIVE = click.option(
-    "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
-)
 
 
-SECONDS = Number(min=0, min_open=True)
-
-
-class Unread:
-    """Standard output whose reader may have gone, as with `| head`.
-
-    That changes neither what a command does nor its exit code.
-    """
-
-    def __init__(self, stream: Any):
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        try:
-            return self._stream.write(text)
-        except BrokenPipeError:
-            return self._closed(len(text))
-
-    def flush(self) -> None:
-        try:
-            self._stream.flush()
-        except BrokenPipeError:
-            self._closed(0)
-
-    def _closed(self, written: int) -> int:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self._stream.fileno())  # so that Python's own flush at the end finds a reader too
-        os.close(nowhere)
-        return written
-
-
-class Rover(click.Group):
-    """A group of commands in which a bad input ends in one sentence and exit code 1; --debug adds the traceback."""
-
-    def main(self, *args: Any, **options: Any) -> Any:
-        with contextlib.redirect_stdout(cast(TextIO, Unread(sys.stdout))):
-            return super().main(*args, **options)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except RoverError as e:
-            if ctx.params.get("debug"):
-                raise
-            click.echo(f"rover: {printable(str(e))}", err=True)
-        except ModuleNotFoundError as e:
-            if ctx.params.get("debug") or (e.name or "").startswith("rover_lib"):
-                raise
-            sentence = f"this command needs {e.name}, which only a workstation has: make demo sets one up"
-            if e.name == "aiohttp":
-                sentence = "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
-            click.echo(f"rover: {sentence}", err=True)
-        except OSError as e:
-            if ctx.params.get("debug"):
-                raise
-            click.echo(f"rover: {of_system(e)}", err=True)
-        except MemoryError:
-            if ctx.params.get("debug"):
-                raise
-            click.echo("rover: there is not enough memory; end other programs, or use fewer samples", err=True)
-        ctx.exit(1)
-
-
-class OnlyOnboard(Rover):
-    """The rover's commands alone. Any other ends in a sentence that says where there are more, and exit code 2."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if re.fullmatch("[a-z][a-z-]*", args[0]) and args[0] not in self.commands:
-            sentence = (
-                f"a rover has no `rover {args[0]}`: see `rover --help`, or type it on a workstation, which has more"
-            )
-            click.echo(f"rover: {sentence}", err=True)
-            ctx.exit(2)
-        return super().resolve_command(ctx, args)
-
-
-def show(value: Any, as_json: bool) -> None:
-    """Print a nested dict for people, or as JSON."""
-    from rover_lib.onboard.stage import plain
-
-    value = plain(value)
-    if as_json:
-        click.echo(json.dumps(value, indent=2))
-        return
-
-    def lines(v: Any, indent: str) -> None:
-        for key, inner in v.items() if isinstance(v, dict) else enumerate(v):
-            if isinstance(inner, list) and len(inner) > LONG_LIST:
-                click.echo(f"{indent}{key:<28} {len(inner)} values, see --json")
-            elif isinstance(inner, (dict, list)) and inner:
-                click.echo(f"{indent}{printable(key)}")
-                lines(inner, indent + "  ")
-            else:
-                text = f"{inner:.4g}" if isinstance(inner, float) else printable(inner)
-                click.echo(f"{indent}{printable(key):<28} {text}")
-
-    lines(value, "")
-
-
-def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
-    if asked and not ctx.resilient_parsing:
-        from rover_lib.onboard.versions import versions
-
-        click.echo("\n".join(versions()))
-        ctx.exit()
-
-
-VERSION = click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_versions,
-    help="Show the versions of this program, Python and the engines.",
-)
-
-
-@click.group(
-    "rover", cls=OnlyOnboard, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
-)
+@click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @VERSION
 def main(debug: bool) -> None:
     """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
-
-
-def with_options(*options: Callable) -> Callable[[Callable], Callable]:
-    """Make one decorator of several options that more than one command has."""
-    return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
 
 
 def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
@@ -181,7 +51,7 @@ def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
 
 
 drive_options = with_options(  # on the rover and in the balloon world
-    click.argument("artifact", type=ARTIFACT, required=False),
+    click.argument("artifact", type=ARTIFACT),
     CAMERA,
     PORT,
     click.option("--hz", type=Number(10, 100), default=30.0, show_default=True, help="Commands a second."),
@@ -190,9 +60,7 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
     click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
-    click.option(
-        "--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml; with --replay: none]."
-    ),
+    click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
     click.option(
         "--blend-ticks",
         type=click.IntRange(min=0),
@@ -215,7 +83,6 @@ drive_options = with_options(  # on the rover and in the balloon world
         callback=_check_json_file,
         help="Write a summary of the drive to this file; - prints it.",
     ),
-    click.option("--replay", type=PathTo("recordings"), help="Send this episode's pulses; no policy, no camera."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
     click.option(
         "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
@@ -230,25 +97,24 @@ drive_options = with_options(  # on the rover and in the balloon world
 def drive(ctx: click.Context, **options: Any) -> None:
     """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
 
-    Exit codes: 0 ended as asked (--ticks, --max-seconds, end of --replay, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could
-    not begin; 2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with
-    --service, which waits disarmed after each drive, another request does.
+    Exit codes: 0 ended as asked (--ticks, --max-seconds, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could not begin;
+    2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with --service, which
+    waits disarmed after each drive, another request does.
     """
     ctx.exit(run_drive(**options))
 
 
 def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
-    from rover_lib.onboard.drive.drive import DriveOptions, drive_car
+    from rover_lib.onboard.drive.drive import drive_car
     from rover_lib.onboard.drive.loop import Report
+    from rover_lib.onboard.drive.opening import DriveOptions
     from rover_lib.onboard.drive.service import NotArmed
     from rover_lib.onboard.errors import DriveFault, TakenOver
 
     o = DriveOptions(**options)
-    if bool(o.artifact) == bool(o.replay):
-        raise click.UsageError("give an ARTIFACT, or --replay EPISODE")
-    if o.service and (o.replay or o.dry_run):
-        raise click.UsageError("--service drives a car by an artifact: no --replay, no --dry-run")
+    if o.service and o.dry_run:
+        raise click.UsageError("--service drives a car: no --dry-run")
     if o.record_mb and not o.record:
         raise click.UsageError("--record-mb belongs to --record")
     report, code = Report(), 0
@@ -340,16 +206,7 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
-def doctor(
-    ctx: click.Context,
-    artifact: Path | None,
-    camera: str,
-    port: str,
-    hz: float,
-    receiver: bool,
-    recording: Path | None,
-    as_json: bool,
-) -> None:
+def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
     Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
@@ -361,10 +218,7 @@ def doctor(
     if receiver:
         found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
     else:
-        log_folder = default_log().parent
-        found = checking.examine(
-            artifact, camera=camera, port=port, rate_hz=hz, log_folder=log_folder, recording=recording
-        )
+        found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
     checks = []
     for check in found:
         checks.append(check)
@@ -467,31 +321,18 @@ def benchmark(
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
     what runs on the Pi.
     """
-    from rover_lib.onboard.artifact.manifest import Artifact, distinct_names
+    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
     from rover_lib.onboard.car.host import usable_cores
-    from rover_lib.onboard.care.benchmark import BenchmarkOptions
-    from rover_lib.onboard.care.benchmark import benchmark as measure
+    from rover_lib.onboard.care.benchmark import benchmark_artifacts
     from rover_lib.onboard.care.limits import check_gates
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.policy.load import load_policy
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
-    policies, contents, vectors = {}, {}, None
-    for name, path in files.items():
-        with Artifact(path) as artifact:
-            # In torch, XNNPACK's pool keeps the number that it begins with.
-            policies[name] = load_policy(artifact, threads=threads or usable_cores())
-            contents[f"{name}{path.suffix}"] = artifact.content_hash
-            vectors = artifact.parity if vectors is None else vectors
-    assert vectors is not None, "click asks for an artifact at least"
-    first = next(iter(policies.values()))
-    frames = [
-        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
-    ]  # stored as RGB; a camera gives BGR
+    contents = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
     options: dict[str, Any] = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
-    metrics = measure(policies, frames, vectors["state"][0], BenchmarkOptions(**options, memory_alone=True))
+    metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if busy > BUSY:
         click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
     if output:
@@ -517,7 +358,7 @@ def benchmark(
     "--model", default="", help="Content hash that the loaded model must have; otherwise the car is not armed."
 )
 @click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
-@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no `rover heartbeat` comes for this long.")
+@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no --heartbeat comes for this long.")
 @click.option(
     "--wait-s",
     type=Number(min=0),
@@ -525,14 +366,20 @@ def benchmark(
     show_default=True,
     help="How long to wait for the human's part of arming.",
 )
-def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float) -> None:
+@click.option("--heartbeat", is_flag=True, help="Only tell the drive that its operator is still there.")
+def arm_car(
+    yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float, heartbeat: bool
+) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
     Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
     steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
     """
-    from rover_lib.onboard.drive.service import Request
+    from rover_lib.onboard.drive.service import Request, ask_service
     from rover_lib.onboard.drive.service import arm_car as arm
+
+    if heartbeat:
+        return click.echo(ask_service(ask="heartbeat")["text"])
 
     def confirm(state: dict[str, Any]) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
@@ -541,14 +388,6 @@ def arm_car(yes: bool, model: str, max_seconds: float | None, heartbeat_s: float
     request = Request(max_seconds, heartbeat_s)
     ask = (lambda state: None) if yes else confirm
     click.echo(arm(request, model=model, confirm=ask, notify=click.echo, wait_s=wait_s))
-
-
-@main.command(short_help="Tell the drive that its operator is there.")
-def heartbeat() -> None:
-    """Tell the drive that its operator is there, and say what the car does. See `rover arm-car --heartbeat-s`."""
-    from rover_lib.onboard.drive.service import ask_service
-
-    click.echo(ask_service(ask="heartbeat")["text"])
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")
@@ -562,55 +401,34 @@ def heartbeat() -> None:
     show_default=True,
     help="Width of its pictures divided by their height.",
 )
-@click.option("--signers", type=FILE, help="Keys whose artifacts are accepted [default: /etc/rover/allowed_signers].")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
-def release(
-    ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, signers: Path | None, sandboxed: bool
-) -> None:
+def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
     """Manage the rover's models: stage them, verify them, use them. A switch happens completely or not at all.
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
     """
-    from rover_lib.onboard.care import release as r
+    from rover_lib.onboard.artifact.acceptance import Expected
+    from rover_lib.onboard.care.release import Releases, check_in_sandbox
 
-    expected = r.Expected(chunk=chunk, camera=camera, aspect=aspect)
-    ctx.obj = r.Releases(models, check=r.check_in_sandbox if sandboxed else None, expected=expected, signers=signers)
+    expected = Expected(chunk=chunk, camera=camera, aspect=aspect)
+    ctx.obj = Releases(models, check=check_in_sandbox if sandboxed else None, expected=expected)
 
 
-ALLOW = click.option(
+@release.command(short_help="Make a release of an artifact without using it.")
+@click.argument("source", type=ARTIFACT)
+@click.option("--sha256", help="The SHA-256 that the artifact must have.")
+@click.option("--origin", help="Where it came from, for `status` [default: this host and path].")
+@click.option(
     "--allow",
     multiple=True,
     type=click.Choice(["mode", "chunk", "camera", "aspect"]),
     help="Accept an artifact that differs in this.",
 )
-
-
-@release.command(short_help="Sign and describe an artifact for the transfer.")
-@click.argument("artifact", type=ARTIFACT)
-@click.argument("folder", type=FILE)
-@click.option("--sign-key", type=FILE, help="The ssh key that logs in to the rover, to sign with.")
-@ALLOW
 @click.pass_obj
-def pack(releases: Any, artifact: Path, folder: Path, sign_key: Path | None, allow: tuple[str, ...]) -> None:
-    """Put ARTIFACT into FOLDER for the transfer, signed and described. Refuses what the rover would refuse."""
-    from rover_lib.onboard.care.release import pack as pack_release
-
-    show(pack_release(artifact, folder, releases.expected, allow, sign_key), True)
-
-
-UNSIGNED = click.option("--unsigned", is_flag=True, help="Accept it without the signature of a known laptop.")
-
-
-@release.command(short_help="Make a release of an artifact without using it.")
-@click.argument("source", type=FILE)
-@click.option("--sha256", help="The SHA-256 that the artifact must have.")
-@UNSIGNED
-@ALLOW
-@click.pass_obj
-def stage(releases: Any, source: Path, sha256: str | None, unsigned: bool, allow: tuple[str, ...]) -> None:
-    """Make a release of SOURCE, an artifact or what `pack` wrote. The release in use stays in use."""
-    show(vars(releases.stage(source, sha256=sha256, allow=allow, unsigned=unsigned)), True)
+def stage(releases: Any, source: Path, **options: Any) -> None:
+    """Make a release of the artifact SOURCE. The release in use stays in use."""
+    show(vars(releases.stage(source, **options)), True)
 
 
 @release.command(short_help="Verify that a release computes what it should.")
@@ -631,16 +449,15 @@ def verify(releases: Any, name: str, confined: bool) -> None:
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
             click.echo(f"rover: not confined: {unconfined}", err=True)
     releases.check(name)
-    click.echo(f"{name}: whole, and computes what it should")
+    click.echo(f"{name}: verified")
 
 
 @release.command(short_help="Use a release from now on.")
 @click.argument("name")
-@UNSIGNED
 @click.pass_obj
-def switch(releases: Any, name: str, unsigned: bool) -> None:
+def switch(releases: Any, name: str) -> None:
     """Use the release NAME from now on. It is verified before and after; if that fails, the old one is used again."""
-    show({"name": name, "changed": releases.switch(name, unsigned=unsigned)}, True)
+    show({"name": name, "changed": releases.switch(name)}, True)
 
 
 @release.command(short_help="Go back to the release before the one in use.")
@@ -679,10 +496,8 @@ def status(releases: Any, as_json: bool) -> None:
         report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
         return show(report, True)
     for r in report["releases"]:
-        mark, unsigned = "*" if r["current"] else " ", "" if r["signed"] else ", not signed"
-        click.echo(
-            f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}{unsigned}"
-        )
+        mark = "*" if r["current"] else " "
+        click.echo(f"{mark} {r['name'][:12]}  {r['mode']:<7} {r['megabytes']:6.1f} MB  {r['wrong'] or r['origin']}")
     if not report["healthy"]:
         raise RoverError(report["trouble"])
 
@@ -724,8 +539,8 @@ def open_view(
 ) -> None:
     """Serve the view until SIGINT or SIGTERM.
 
-    opened: called with its URL. shown: what is shown instead of the drives that connect, a Replay of rover_look, or
-    balloon_world's Simulation, whose `ask` gets what is asked for on the page.
+    opened: called with its URL. shown: what is shown instead of the drives that connect: balloon_world's Simulation,
+    whose `ask` gets what is asked for on the page.
     """
     import asyncio
 
@@ -734,16 +549,8 @@ def open_view(
 
     token = read_token(token_file) if token_file else new_token()
     place = None if shown else feed or default_view()
-    ask = getattr(shown, "ask", None)
-    view = View(
-        Address(web_port, interface),
-        token,
-        place,
-        drive_user=drive_user,
-        replay=shown is not None and ask is None,
-        car=shown and shown.car,
-        ask=ask,
-    )
+    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
+    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.

@@ -1,9 +1,9 @@
 """ACT for inference only: LeRobot's Action Chunking Transformer without what only training needs.
 
-It computes the same function as `lerobot.policies.act` in eval mode (tests compare the two). Everything that does not
-depend on the observation is computed once: batch norm is folded into the convolutions; the VAE encoder is left out (its
-latent is zero when driving, so the latent's projection is its bias); positions are constants; and so are the first
-decoder layer's self-attention, which acts on zeros, and the query that follows from it.
+It computes the same function as `lerobot.policies.act` in eval mode. Everything that does not depend on the observation
+is computed once: batch norm is folded into the convolutions; the VAE encoder is left out (its latent is zero when
+driving, so its projection is a bias); positions are constants, as are the first decoder layer's self-attention, which
+acts on zeros, and the query that follows from it.
 
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
@@ -11,130 +11,25 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
+from rover_lib.onboard.policy.preprocess import prepare_frame
+from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
+from rover_lib.workshop.act_config import EMBEDDINGS as EMBEDDINGS
+from rover_lib.workshop.act_config import backbone_blocks as backbone_blocks  # the same names from here too
+from rover_lib.workshop.act_config import expected_shapes as expected_shapes
+from rover_lib.workshop.act_config import imagenet as imagenet
+from rover_lib.workshop.act_config import lerobot_act as lerobot_act
 from rover_lib.workshop.recordings.episodes import Sample
-
-if TYPE_CHECKING:
-    from lerobot.policies.act.modeling_act import ACTPolicy
 
 Projection = nn.Linear | nn.Conv2d
 Pair = tuple[Tensor, Tensor]  # weight and bias
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d, nn.LayerNorm)
-
-# (block, convolutions per block, blocks per stage, channels out of layer4), from torchvision.models.resnet
-BACKBONES = {
-    "resnet18": ("basic", (2, 2, 2, 2), 512),
-    "resnet34": ("basic", (3, 4, 6, 3), 512),
-    "resnet50": ("bottleneck", (3, 4, 6, 3), 2048),
-}
-ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
-EMBEDDINGS = {
-    "encoder_1d_feature_pos_embed": "one constant with the image's sinusoidal positions; never looked up by index",
-    "decoder_pos_embed": "a constant; with the first decoder layer's self-attention and query computed from it once",
-}
-
-
-def backbone_blocks(backbone: str) -> list[str]:
-    """Return LeRobot's names of a backbone's residual blocks, in the order in which data passes them."""
-    _, depths, _ = BACKBONES[backbone]
-    return [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
-
-
-@dataclass(frozen=True)
-class Affine:
-    """x * scale + shift, per channel. All of LeRobot's normalisation modes have this form."""
-
-    scale: tuple[float, ...]
-    shift: tuple[float, ...]
-
-
-def imagenet() -> Affine:
-    """Return the normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
-    return Affine(
-        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
-    )
-
-
-@dataclass(frozen=True)
-class ActConfig:
-    """The shape of one policy. `checkpoint` makes it, and checks it against the weights."""
-
-    cameras: tuple[str, ...] = ("cam_front",)
-    image_sizes: tuple[tuple[int, int], ...] = ((360, 640),)  # (height, width), one per camera
-    state_names: tuple[str, ...] = ("steering", "throttle")
-    action_names: tuple[str, ...] = ("steering", "throttle")
-    chunk: int = 32
-    dim: int = 512
-    heads: int = 8
-    feedforward: int = 3200
-    encoder_layers: int = 4
-    decoder_layers: int = 7
-    latent: int = 32
-    vae_layers: int = 4  # 0 if it was trained without a VAE
-    backbone: str = "resnet18"
-    dilation: bool = False
-    pre_norm: bool = False
-    activation: str = "relu"
-    rate_hz: float = 30.0  # steps of a plan in a second
-    image_norm: tuple[Affine, ...] = field(default_factory=lambda: (imagenet(),))  # of pixels in [0, 1]
-    state_norm: Affine | None = None
-    sees_state: bool = True  # False: it was trained without a state; what is given as one is not looked at
-    action_unnorm: Affine | None = None
-
-    def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Return (h, w) of the feature map for a picture of this size."""
-        stride = 16 if self.dilation else 32
-        return -(-height // stride), -(-width // stride)
-
-
-def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
-    """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
-
-    weights: all of them, by LeRobot's names without the leading `model.`; copied, as float32. None: random ones, which
-    take most of the time.
-    """
-    # Imported here, because it takes ten seconds, and code that only reads or quantizes a checkpoint does not need it.
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    cameras = zip(c.cameras, c.image_sizes, strict=True)
-    inputs = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size)) for name, size in cameras}
-    state = PolicyFeature(FeatureType.STATE, (len(c.state_names),))
-    config = ACTConfig(
-        input_features=inputs | ({"observation.state": state} if c.sees_state else {}),
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
-        device="cpu",
-        chunk_size=c.chunk,
-        n_action_steps=c.chunk,
-        vision_backbone=c.backbone,
-        pretrained_backbone_weights=None,
-        replace_final_stride_with_dilation=c.dilation,
-        pre_norm=c.pre_norm,
-        dim_model=c.dim,
-        n_heads=c.heads,
-        dim_feedforward=c.feedforward,
-        feedforward_activation=c.activation,
-        n_encoder_layers=c.encoder_layers,
-        n_decoder_layers=c.decoder_layers,
-        use_vae=c.vae_layers > 0,
-        latent_dim=c.latent,
-        n_vae_encoder_layers=max(c.vae_layers, 1),
-    )
-    if weights is None:
-        return ACTPolicy(config)
-    with torch.device("meta"):
-        policy = ACTPolicy(config)
-    policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
-    return policy
 
 
 def positions_2d(dim: int, h: int, w: int) -> Tensor:
@@ -176,8 +71,7 @@ def _load(module: Layer, weight: Tensor, bias: Tensor) -> Layer:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    out_features, in_features = weight.shape
-    return _load(nn.Linear(in_features, out_features, device="meta"), weight, bias)
+    return _load(nn.Linear(*weight.shape[::-1], device="meta"), weight, bias)
 
 
 def layer_norm(w: Weights) -> nn.LayerNorm:
@@ -200,7 +94,7 @@ def norm_gain(bn: Weights) -> Tensor:
 
 
 def fold(w: Weights, bn: Weights) -> Pair:
-    """Return the weight and bias of `folded_conv`."""
+    """Return the weight and bias of `fold_conv`."""
     gain = norm_gain(bn)
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
@@ -330,10 +224,8 @@ class Residual(nn.Module):
         for (weight, bias), geometry in zip(fold_block(w, kind), plans[kind], strict=True):
             layers += [conv(weight, bias, *geometry), nn.ReLU()]
         self.body = nn.Sequential(*layers[:-1])
-        has_shortcut = "downsample" in w
-        self.shortcut = (
-            fold_conv(w.at("downsample.0"), w.at("downsample.1"), stride, 0) if has_shortcut else nn.Identity()
-        )
+        down = w.at("downsample")
+        self.shortcut = fold_conv(down.at("0"), down.at("1"), stride, 0) if "downsample" in w else nn.Identity()
         self.relu = nn.ReLU()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -385,8 +277,7 @@ class Pointwise(nn.Module):
     def project(self, weight: Tensor, bias: Tensor) -> Projection:
         if not self.as_conv:
             return linear(weight, bias)
-        out_features, in_features = weight.shape
-        return _load(nn.Conv2d(in_features, out_features, 1, device="meta"), weight[:, :, None, None], bias)
+        return conv(weight[:, :, None, None], bias, 1, 0)
 
     def enter(self, x: Tensor) -> Tensor:
         return x.transpose(1, 2).unsqueeze(2) if self.as_conv else x
@@ -477,7 +368,7 @@ class FeedForward(Pointwise):
     def forward(self, residual: Tensor, x: Tensor) -> Tensor:
         h = self.act(self.up(self.enter(_times(x, self.up_in))))
         if self.down_in is not None:  # only if a scale cannot be moved through the activation, as it can through ReLU
-            h = self.enter(self.leave(h) * self.down_in)
+            h = self.enter(_times(self.leave(h), self.down_in))
         return _plus_scaled(residual, self.leave(self.down(h)), self.down_out)
 
 
@@ -586,9 +477,7 @@ class ACT(nn.Module):
         self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
         self.backbone = Backbone(w.at("backbone"), config, columns)
         project = w.at("encoder_img_feat_input_proj")
-        weight = project["weight"]
-        out_channels, in_channels, _, _ = weight.shape
-        self.image_project = _load(nn.Conv2d(in_channels, out_channels, 1, device="meta"), weight, project["bias"])
+        self.image_project = conv(project["weight"], project["bias"], 1, 0)
         self.sees_state = config.sees_state
         if config.sees_state:
             state = w.at("encoder_robot_state_input_proj")
@@ -686,8 +575,7 @@ def parameters_by_block(model: ACT) -> dict[str, int]:
     """Count weights and biases by block, with the names of `multiply_accumulates`."""
     counts: dict[str, int] = {}
     for name, tensor in model.named_parameters():
-        block = block_of(name)
-        counts[block] = counts.get(block, 0) + tensor.numel()
+        counts[block_of(name)] = counts.get(block_of(name), 0) + tensor.numel()
     return counts
 
 

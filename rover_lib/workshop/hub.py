@@ -1,6 +1,6 @@
 """Fetch checkpoints and datasets from the Hugging Face Hub, as user/name@revision: a branch, a tag or a commit.
 
-    folder = fetched("user/name@v1", "model", CheckpointError)
+    folder = fetch("user/name@v1", "model", CheckpointError)
 
 The revision must be given. So a mistyped path is never taken for an id, and nobody trains on an outdated version
 without noticing. Fetched files stay in the Hub's own cache, where later runs find them without a network.
@@ -50,8 +50,8 @@ def fetch(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequenc
         ) from None
     except GatedRepoError:
         raise error(
-            f"{hub_id}: its owner gives it only to whom he has granted access",
-            remedy="ask for it on its page, and log in with 'huggingface-cli login'",
+            f"{hub_id}: a gated repository",
+            remedy="request access on its page, and log in with 'huggingface-cli login'",
         ) from None
     except RevisionNotFoundError:
         raise error(f"{hub_id}: has no revision '{revision}'", remedy="give a branch, a tag or a commit") from None

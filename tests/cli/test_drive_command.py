@@ -19,7 +19,6 @@ from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import read_log
-from rover_lib.onboard.drive.pilot import SLACK_S
 from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.workshop.recordings.episodes import load_recordings
 
@@ -86,23 +85,6 @@ def test_a_recorded_drive_is_an_episode(world_drive):
     assert {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
     assert {row["driver"] for row in data["control_samples"]} == {s.driver for s in episode.samples} == {"policy"}
     assert "takeover" not in data["metadata"]
-
-
-@real_time
-def test_its_replay_sends_the_same_pulses(world_drive, tmp_path):
-    episode, folder = next((world_drive[0] / "episodes").iterdir()), fresh(tmp_path)
-    options = ["--replay", episode, "--world", "--log", folder / "flight.log", "--json", "-"]
-    done = subprocess.run([*ROVER, *map(str, options)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["ended"] == "done"
-    sent, recorded = read_log(folder / "flight.log").ticks, read_controls(episode)
-    # At each tick the newest control that is due: of two that a busy machine recorded within one tick, one is left out.
-    # The log's times have four decimals.
-    since_s = sent["t_s"] - sent["t_s"][0] + SLACK_S
-    early, late = (np.searchsorted(recorded.times_s, since_s + e, side="right") - 1 for e in (-1e-4, 1e-4))
-    assert (early[0], late[-1]) == (0, len(recorded.times_s) - 1)
-    for name, pulses in (("steering_us", recorded.steering_us), ("throttle_us", recorded.throttle_us)):
-        assert np.all((sent[name] == pulses[early]) | (sent[name] == pulses[late]))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -204,15 +186,13 @@ def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        ([], 2, "give an ARTIFACT, or --replay"),
-        (["policy.pt", "--replay", "episode"], 2, "give an ARTIFACT, or --replay"),
+        ([], 2, "ARTIFACT"),
         (["policy.pt", "--latency-ms", "50"], 2, "belongs to --world"),
         (["policy.pt", "--hz", "5"], 2, "--hz"),
         (["policy.pt", "--throttle-limit", "1.5"], 2, "--throttle-limit"),
         (["policy.pt", "--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
         (["nope.pt", "--port", "/dev/nothing"], 1, "nope.pt: not found"),
         (["policy.pt", "--dry-run", "--camera", "/dev/video77"], 1, "/dev/video77: no such camera"),
-        (["--replay", "nothing"], 1, "nothing"),
         (["policy.pt", "--camera", "."], 1, ".: recorded pictures know nothing of where the car is; give the camera's"),
     ],
 )

@@ -1,8 +1,6 @@
-"""Fake hosts, one that tells nothing and a Raspberry Pi; and the ssh keys of laptops."""
+"""Fake hosts, one that tells nothing and a Raspberry Pi."""
 
 import stat
-import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -39,13 +37,3 @@ def pi_host(tmp_path):
     command.write_text("#!/bin/sh\n[ $1 = get_throttled ] && echo throttled=0x50000\n")
     command.chmod(command.stat().st_mode | stat.S_IXUSR)
     return Host(sys_root=tmp_path / "sys", proc_root=tmp_path / "proc", vcgencmd=str(command))
-
-
-@pytest.fixture(scope="session")
-def keys(tmp_path_factory) -> Path:
-    """A folder with the ssh keys `ours` and `theirs`, and `signers`, the file of a rover that accepts only `ours`."""
-    folder = tmp_path_factory.mktemp("keys")
-    for name in ("ours", "theirs"):
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", folder / name], check=True)
-    (folder / "signers").write_text(f'rover namespaces="rover-policy" {(folder / "ours.pub").read_text()}')
-    return folder

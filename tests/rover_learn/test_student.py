@@ -8,8 +8,7 @@ from policies import memory_samples
 
 from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, DistillError
-from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.checkpoint.contents import expected_shapes
+from rover_lib.workshop.act import ACT, expected_shapes, inputs_of, predictions
 
 
 @pytest.fixture(scope="module")

@@ -3,16 +3,8 @@
 import json
 from pathlib import Path
 
-from rover_lib.workshop.cache import cache_folder, cache_root, key_of
+from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.recordings import episodes
-
-
-def test_the_cache_is_where_the_user_says(monkeypatch, tmp_path):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
-    assert cache_root() == tmp_path
-    monkeypatch.delenv("ROVER_CACHE")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_root() == tmp_path / ".cache" / "rover"
 
 
 def test_a_cached_folder_is_made_once(monkeypatch, tmp_path):

@@ -3,7 +3,6 @@
 import os
 import resource
 import signal
-import struct
 from pathlib import Path
 
 import pytest
@@ -13,37 +12,20 @@ from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.params import read_params
-from rover_lib.onboard.recording.episode import find_killed, finish_killed
 from rover_lib.onboard.recording.outcome import relabel
 from rover_lib.onboard.stage import read_stage
-from rover_lib.onboard.view.server import read_token
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_look.replay import pictures_of
 
 MOST_S, MOST_BYTES = 10, 500_000_000
-
-
-def finish(path):
-    for part in find_killed(path.parents[1]):
-        finish_killed(part)
-
-
 READERS = {
     "run.json": lambda path: read_stage(path, "run"),
-    "params.yml": read_params,
     "car.yml": read_car,
-    "view.token": read_token,
     "flight.log": read_log,
-    "frame_data.csv": lambda path: pictures_of(path.parent),
     "control_data.csv": lambda path: load_recordings(path.parent, 8),
     "episode_data.json": lambda path: relabel(path.parent, "hit"),
-    ".episode_1.part/control.rows": finish,
     "best_model.pth": load_checkpoint,
-    "config.json": lambda path: load_checkpoint(path.parent),
-    "model.safetensors": lambda path: (path.with_name("config.json").write_text("{}"), load_checkpoint(path.parent)),
     "calibration.pt": Calibration.load,
     "manifest.json": lambda path: read_tub(path.parent, Car()),
 }
@@ -54,12 +36,7 @@ def without_end(path: Path) -> None:
         file.truncate(1 << 40)
 
 
-THINGS = {
-    "a pipe": os.mkfifo,
-    "a device": lambda path: path.symlink_to("/dev/zero"),
-    "a terabyte of nothing": without_end,
-    "a folder": Path.mkdir,
-}
+THINGS = {"a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a terabyte": without_end}
 
 
 def outcome_of(read, path: Path) -> str:
@@ -89,33 +66,15 @@ def outcome_of(read, path: Path) -> str:
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_sentence_at_once(tmp_path, name):
-    wrong = []
     for thing, make in THINGS.items():
         path = tmp_path / thing / name
         path.parent.mkdir(parents=True)
         make(path)
         said = outcome_of(READERS[name], path)
-        if not said.startswith("said ") and not (name.endswith(".rows") and said.startswith("returned ")):
-            wrong.append(f"{thing} as {name}: {said}")
-    assert not wrong, "\n".join(wrong)
+        assert said.startswith("said "), f"{thing} as {name}: {said}"
 
 
-def test_a_car_that_refers_to_itself_again_and_again(tmp_path):
+def test_a_car_that_refers_to_itself_many_times(tmp_path):
     lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12))]
     (tmp_path / "car.yml").write_text("\n".join([*lines, "steering: *a11"]))
     assert outcome_of(read_car, tmp_path / "car.yml").startswith("said ")
-
-
-def test_a_tub_that_names_a_catalog_again_and_again(tmp_path):
-    (tmp_path / "catalog_0.catalog").write_text("{}\n" * 100_000)
-    (tmp_path / "manifest.json").write_text('{"paths": [' + ", ".join(['"catalog_0.catalog"'] * 10_000) + "]}")
-    assert outcome_of(lambda tub: read_tub(tub, Car()), tmp_path).startswith("said ")
-
-
-def test_a_checkpoint_whose_directory_is_as_large_as_the_file(tmp_path):
-    size = 3 << 30
-    with (tmp_path / "best_model.pth").open("wb") as file:
-        file.write(b"PK\x03\x04")
-        file.seek(size)
-        file.write(struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 1, 1, size, 0, 0))
-    assert outcome_of(load_checkpoint, tmp_path / "best_model.pth").startswith("said ")

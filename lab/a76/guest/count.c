@@ -11,10 +11,10 @@
  *
  * With memory=SECTION (0: every section) it also runs each load and store through a model of a Raspberry Pi 5's data
  * caches, 64 KB and 512 KB of a core and 2 MB that the cores share, and counts the lines of 64 bytes that each of them
- * lacks. With threads=1 it counts the instructions of each thread. Either leaves <folder>/<section>.more: uint64 of the
- * lines that loads and that stores found in no cache up to the first, the second, the third, then the threads' counts.
+ * lacks. It leaves <folder>/<section>.more: uint64 of the lines that loads and that stores found in no cache up to the
+ * first, the second, the third.
  *
- * Use: qemu-aarch64 -plugin count.so,folder=FOLDER[,memory=SECTION][,threads=1] program
+ * Use: qemu-aarch64 -plugin count.so,folder=FOLDER[,memory=SECTION] program
  * The declarations are our own because Debian 12 ships QEMU 7.2 without qemu-plugin.h. They are version 1 of the
  * plugin interface, which QEMU refuses from 9.0 on.
  */
@@ -42,16 +42,14 @@ extern size_t qemu_plugin_tb_n_insns(const struct qemu_plugin_tb *);
 extern uint64_t qemu_plugin_tb_vaddr(const struct qemu_plugin_tb *);
 extern struct qemu_plugin_insn *qemu_plugin_tb_get_insn(const struct qemu_plugin_tb *, size_t);
 extern const void *qemu_plugin_insn_data(const struct qemu_plugin_insn *);
-typedef void (*executed_cb)(unsigned cpu, void *block);
 typedef void (*memory_cb)(unsigned cpu, uint32_t what, uint64_t address, void *unused);
 extern int qemu_plugin_mem_is_store(uint32_t what);
-extern void qemu_plugin_register_vcpu_tb_exec_cb(struct qemu_plugin_tb *, executed_cb, int flags, void *block);
 extern void qemu_plugin_register_vcpu_mem_cb(struct qemu_plugin_insn *, memory_cb, int flags, int which, void *);
 
 EXPORT int qemu_plugin_version = 1;
 
 enum { GETPPID = 173, MARK = 0xC0FFEE, BLOCKS_PER_SLAB = 65536 };
-enum { NO_REGISTERS = 0, READS_AND_WRITES = 3, THREADS = 64 };
+enum { NO_REGISTERS = 0, READS_AND_WRITES = 3 };
 enum { LEVELS = 3, LINE_BITS = 6, MOST_SETS = 2048, MOST_WAYS = 16 };
 static const unsigned sets_of[LEVELS] = {256, 1024, 2048}, ways_of[LEVELS] = {4, 8, 16};
 
@@ -71,8 +69,8 @@ static struct slab *slabs;
 static const char *folder;
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static uint64_t lines[LEVELS][MOST_SETS][MOST_WAYS], last_line; /* the most recently used way first */
-static struct { uint64_t fetched[LEVELS][2], by_thread[THREADS]; } more;
-static int with_memory, with_threads, active;
+static struct { uint64_t fetched[LEVELS][2]; } more;
+static int with_memory, active;
 static uint64_t only_section; /* 0: all */
 
 static void fail(const char *what)
@@ -165,12 +163,6 @@ static void on_memory(unsigned cpu, uint32_t what, uint64_t address, void *unuse
     }
 }
 
-static void on_executed(unsigned cpu, void *block)
-{
-    if (active && cpu < THREADS)
-        more.by_thread[cpu] += ((struct block *)block)->instructions;
-}
-
 static void on_translated(qemu_plugin_id_t id, struct qemu_plugin_tb *tb)
 {
     pthread_mutex_lock(&lock);
@@ -197,8 +189,6 @@ static void on_translated(qemu_plugin_id_t id, struct qemu_plugin_tb *tb)
                                              NULL);
     }
     block->quarters = quarters_of(&ports);
-    if (with_threads)
-        qemu_plugin_register_vcpu_tb_exec_cb(tb, on_executed, NO_REGISTERS, block);
     qemu_plugin_register_vcpu_tb_exec_inline(tb, QEMU_PLUGIN_INLINE_ADD_U64, &block->entered, 1);
 }
 
@@ -228,7 +218,7 @@ static void on_syscall(qemu_plugin_id_t id, unsigned cpu, int64_t number, uint64
         if (fwrite(&more, sizeof more, 1, beside) != 1 || fclose(beside))
             fail("count: cannot write");
     }
-    active = starts && (with_memory || with_threads) && (!only_section || section == only_section);
+    active = starts && with_memory && (!only_section || section == only_section);
     for (struct slab *slab = slabs; slab; slab = slab->next)
         for (size_t i = 0; i < slab->used; i++) {
             struct block *b = &slab->blocks[i];
@@ -252,8 +242,7 @@ EXPORT int qemu_plugin_install(qemu_plugin_id_t id, const qemu_info_t *info, int
         } else if (!strncmp(argv[i], "memory=", 7)) {
             with_memory = 1;
             only_section = strtoull(argv[i] + 7, NULL, 10);
-        } else if (!strcmp(argv[i], "threads=1"))
-            with_threads = 1;
+        }
     if (!folder) {
         fprintf(stderr, "count: needs folder=FOLDER\n");
         return -1;

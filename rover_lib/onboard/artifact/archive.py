@@ -10,12 +10,10 @@ properties and tensors. A zip is better for two reasons: it has checksums of eve
 reader that needs neither onnx nor protobuf.
 """
 
-import contextlib
 import os
 import re
 import struct
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -76,26 +74,6 @@ def open_archive(path: Path | str) -> zipfile.ZipFile:
     return z
 
 
-class Unknown(Exception):
-    """Something that no program or model of an artifact contains; the text names it."""
-
-
-@contextlib.contextmanager
-def nothing_unknown(path: Path | str, what: str) -> Iterator[None]:
-    """While an archive's records are checked, turn Unknown and errors of reading into an ArtifactError.
-
-    what: one word for the part that is checked, such as "program".
-    """
-    try:
-        yield
-    except Unknown as e:
-        raise ArtifactError(
-            f"{path}: its {what} has what no artifact has", found=e, remedy="do not load it; quantize again"
-        ) from None
-    except (zipfile.BadZipFile, OSError, RuntimeError) as e:
-        raise ArtifactError(f"{path}: damaged ({e})", remedy="copy the file again") from None
-
-
 def read_record(z: zipfile.ZipFile, name: str) -> bytes:
     """Return a record's bytes, and never unpack more than its header announces. Raises like zipfile."""
     with z.open(name) as record:
@@ -143,7 +121,7 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
             name = "version"
         known = [limit for pattern, limit in KNOWN_RECORDS if pattern.fullmatch(name)]
         if not known or not record.filename.startswith("archive/"):
-            raise refused(path, "a record that no artifact has", repr(record.filename)[:80])
+            raise refused(path, "unknown record", repr(record.filename)[:80])
         if name.lower() in names:  # torch ignores case in names
             raise refused(path, f"'{name}' is in it twice")
         if known[0] is not None and record.file_size > known[0]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.pwm import Channel, PwmCalibration
-from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.checked import Rule, broken_rule, is_number, one_of, whole
 from rover_lib.onboard.errors import CarError, ParamsError, PwmError
 
 FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
@@ -63,29 +63,39 @@ class Car:
 
     def __post_init__(self):
         steering, throttle = self.pwm.steering, self.pwm.throttle
-        low, neutral, high = steering.ends_us[0], steering.neutral_us, steering.ends_us[1]
-        _must_be(steering.period_us, PERIOD_MIN_US, PERIOD_MAX_US, "steering's period_us")
-        _must_be(neutral, STEERING_NEUTRAL_MIN_US, NEUTRAL_MAX_US, "steering's neutral_us")
-        for end_us in (low, high):
-            _must_be(end_us, PULSE_MIN_US, PULSE_MAX_US, "an end of steering")
-            _must_be(abs(end_us - neutral), STEERING_THROW_US, PULSE_MAX_US, "from steering's neutral to an end, us,")
-        low, neutral, high = throttle.ends_us[0], throttle.neutral_us, throttle.ends_us[1]
-        forward_us = abs(throttle.pulse_us(throttle.high) - neutral)
+        ends, neutral = steering.ends_us, steering.neutral_us
+        limits: list[tuple[str, float, float, float]] = [
+            ("steering's period_us", steering.period_us, PERIOD_MIN_US, PERIOD_MAX_US),
+            ("steering's neutral_us", neutral, STEERING_NEUTRAL_MIN_US, NEUTRAL_MAX_US),
+            *(("an end of steering", end, PULSE_MIN_US, PULSE_MAX_US) for end in ends),
+            ("from steering's neutral to its nearer end, us,", min(abs(end - neutral) for end in ends),
+             STEERING_THROW_US, PULSE_MAX_US),
+        ]  # fmt: skip
+        ends, neutral = throttle.ends_us, throttle.neutral_us
         if throttle.period_us < PERIOD_MIN_US:
-            _must_be(throttle.period_us, FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US, "a fast throttle's period_us")
-            _must_be(neutral, FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US, "a fast throttle's neutral_us")
-            _must_be(high, neutral, FAST_PULSE_MAX_US, "a fast throttle's forward_us")
-            if low != neutral:
-                raise CarError("a throttle with a period below 3000 us must be forward only", found=f"an end of {low}")
+            limits += [
+                ("a fast throttle's period_us", throttle.period_us, FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US),
+                ("a fast throttle's neutral_us", neutral, FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US),
+                ("a fast throttle's forward_us", ends[1], neutral, FAST_PULSE_MAX_US),
+                ("a fast throttle's lower end (it goes forward only)", ends[0], neutral, neutral),
+            ]
         else:
-            _must_be(throttle.period_us, PERIOD_MIN_US, PERIOD_MAX_US, "throttle's period_us")
-            _must_be(neutral, THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US, "throttle's neutral_us")
-            for end_us in (low, high):
-                _must_be(end_us, PULSE_MIN_US, PULSE_MAX_US, "an end of throttle")
-        _must_be(forward_us, THROTTLE_THROW_US, PULSE_MAX_US, "from throttle's neutral to forward, us,")
-        _must_be(self.cap_us, 1, CAP_MAX_US, "the throttle's cap, us from neutral,")
-        _must_be(self.field_of_view_deg, 20, 160, "the camera's field_of_view_deg")
-        _must_be(self.wheelbase_m, 0.03, 3, "wheelbase_m")
+            limits += [
+                ("throttle's period_us", throttle.period_us, PERIOD_MIN_US, PERIOD_MAX_US),
+                ("throttle's neutral_us", neutral, THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US),
+                *(("an end of throttle", end, PULSE_MIN_US, PULSE_MAX_US) for end in ends),
+            ]
+        forward_us = abs(throttle.pulse_us(throttle.high) - neutral)
+        limits += [
+            ("from throttle's neutral to forward, us,", forward_us, THROTTLE_THROW_US, PULSE_MAX_US),
+            ("the throttle's cap, us from neutral,", self.cap_us, 1, CAP_MAX_US),
+            ("the camera's field_of_view_deg", self.field_of_view_deg, 20, 160),
+            ("wheelbase_m", self.wheelbase_m, 0.03, 3),
+        ]
+        for what, value, low, high in limits:
+            if not low <= value <= high:
+                remedy = "measure it with `rover calibrate`, or see docs/build.md"
+                raise CarError(f"{what} must be from {low:g} to {high:g}", found=f"{value:g}", remedy=remedy)
 
     @property
     def reverses(self) -> bool:
@@ -179,100 +189,75 @@ class Car:
     @classmethod
     def of(cls, content: object, where: str = "car.yml") -> "Car":
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
-        content = _section(content, where, {"steering", "throttle"}, {"name", "camera", "wheelbase_m", "human"})
-        steering = _section(
-            content["steering"], f"{where}: steering", {"period_us", "left_us", "neutral_us", "right_us"}, {"positive"}
+        top = _section(content, where, TOP)
+        steering, throttle = (
+            _section(top[name], f"{where}: {name}", SECTIONS[name]) for name in ("steering", "throttle")
         )
+        camera = _section(top.get("camera", {}), f"{where}: camera", SECTIONS["camera"])
         # In files that do not say it, +1 is what they call left; of the recorded car they did not know it (below).
         positive = steering.get("positive", "left")
-        if positive not in ("left", "right"):
-            raise CarError(f"{where}: steering: positive must be left or right", found=repr(positive)[:80])
-        throttle = _section(
-            content["throttle"],
-            f"{where}: throttle",
-            {"period_us", "neutral_us", "forward_us"},
-            {"reverse_us", "cap_us"},
-        )
-        camera = _section(content.get("camera", {}), f"{where}: camera", set(), {"field_of_view_deg"})
-        name = content.get("name", "no name")
-        if not isinstance(name, str) or not 0 < len(name) <= 60 or not name.isprintable():
-            raise CarError(f"{where}: name must be 1 to 60 characters", found=repr(name)[:80])
-        human = content.get("human", HUMANS[0])
-        if human not in HUMANS:
-            raise CarError(f"{where}: human must be {' or '.join(HUMANS)}", found=repr(human)[:80])
-        us = {
-            f"{channel}.{key}": _whole(value, f"{where}: {channel}: {key}")
-            for channel, section in (("steering", steering), ("throttle", throttle))
-            for key, value in section.items()
-            if key != "positive"
+        ends_us = steering["right_us"], steering["neutral_us"], steering["left_us"]
+        forward_us = abs(throttle["forward_us"] - throttle["neutral_us"])
+        given = {
+            "name": top.get("name", "no name"),
+            "cap_us": throttle.get("cap_us", min(round(CAP * forward_us), CAP_MAX_US)),
+            "human": top.get("human", HUMANS[0]),
+            **camera,
+            **{key: top[key] for key in ("wheelbase_m",) if key in top},
         }
-        ends_us = us["steering.right_us"], us["steering.neutral_us"], us["steering.left_us"]
-        forward_us = abs(us["throttle.forward_us"] - us["throttle.neutral_us"])
-        cap_us = us.get("throttle.cap_us", min(round(CAP * forward_us), CAP_MAX_US))
-        measures = {
-            key: _number(section[key], f"{where}: {key}")
-            for section, key in ((camera, "field_of_view_deg"), (content, "wheelbase_m"))
-            if key in section
-        }
+        pulses_us = throttle.get("reverse_us"), throttle["neutral_us"], throttle["forward_us"]
         try:
-            car = cls(
-                name=name,
-                pwm=PwmCalibration(
-                    steering=_channel(
-                        "steering", us["steering.period_us"], ends_us if positive == "left" else ends_us[::-1]
-                    ),
-                    throttle=_channel(
-                        "throttle",
-                        us["throttle.period_us"],
-                        (us.get("throttle.reverse_us"), us["throttle.neutral_us"], us["throttle.forward_us"]),
-                    ),
-                ),
-                cap_us=cap_us,
-                positive=positive,
-                human=human,
-                **measures,
+            pwm = PwmCalibration(
+                steering=_channel("steering", steering["period_us"], ends_us if positive == "left" else ends_us[::-1]),
+                throttle=_channel("throttle", throttle["period_us"], pulses_us),
             )
+            car = cls(pwm=pwm, positive=positive, **given)
         except (CarError, PwmError) as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
         if car.steering_us == _DEFAULT_CAR.steering_us and (
             {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}
         ):
             # The checked constants themselves, because whole microseconds are slightly less precise.
-            positive = steering.get("positive", _DEFAULT_CAR.positive)
-            car = cls(car.name, PwmCalibration(), cap_us, positive=positive, human=human, **measures)
+            car = cls(positive=steering.get("positive", _DEFAULT_CAR.positive), **given)
         return car
 
 
-def _must_be(value: float, low: float, high: float, what: str) -> None:
-    if not low <= value <= high:
-        raise CarError(
-            f"{what} must be from {low:g} to {high:g}",
-            found=f"{value:g}",
-            remedy="measure it with `rover calibrate`, or see docs/build.md",
-        )
+_US, _NUMBER = whole(0, 65535, " microseconds"), Rule(is_number, "a number")
+_MAPPING = Rule(lambda value: isinstance(value, Mapping), "a mapping")
+_NAME = Rule(
+    lambda value: isinstance(value, str) and 0 < len(value) <= 60 and value.isprintable(), "1 to 60 characters"
+)
+# What each section of a car.yml must have, and what it may have
+TOP = (
+    {"steering": _MAPPING, "throttle": _MAPPING},
+    {"name": _NAME, "camera": _MAPPING, "wheelbase_m": _NUMBER, "human": one_of(HUMANS)},
+)
+SECTIONS = {
+    "steering": (
+        dict.fromkeys(("period_us", "left_us", "neutral_us", "right_us"), _US),
+        {"positive": one_of(("left", "right"))},
+    ),
+    "throttle": (
+        dict.fromkeys(("period_us", "neutral_us", "forward_us"), _US),
+        dict.fromkeys(("reverse_us", "cap_us"), _US),
+    ),
+    "camera": ({}, {"field_of_view_deg": _NUMBER}),
+}
 
 
-def _section(value: object, where: str, needed: set[str], optional: set[str]) -> Mapping[str, Any]:
+def _section(value: object, where: str, known: tuple[Mapping[str, Rule], Mapping[str, Rule]]) -> Mapping[str, Any]:
+    """Return a section whose values keep the rules. known: those of what it must have, and of what it may have."""
+    needed, optional = known
     if not isinstance(value, Mapping):
         raise CarError(f"{where} must be a mapping", found=repr(value)[:80])
-    if missing := sorted(needed - set(value)):
+    if missing := sorted(needed.keys() - value.keys()):
         raise CarError(f"{where}: {', '.join(missing)} is missing", remedy="docs/build.md has a whole example")
-    if unknown := sorted(map(str, set(value) - needed - optional)):
-        raise CarError(
-            f"{where}: unknown {', '.join(unknown)}", remedy=f"known are {', '.join(sorted(needed | optional))}"
-        )
-    return value
-
-
-def _number(value: Any, what: str) -> float:
-    if not is_number(value):
-        raise CarError(f"{what} must be a number", found=repr(value)[:80])
-    return value
-
-
-def _whole(value: object, what: str) -> int:
-    if not is_whole(value, 0, 65535):
-        raise CarError(f"{what} must be whole microseconds", found=repr(value)[:80])
+    if unknown := sorted(map(str, value.keys() - needed.keys() - optional.keys())):
+        remedy = f"known are {', '.join(sorted({*needed, *optional}))}"
+        raise CarError(f"{where}: unknown {', '.join(unknown)}", remedy=remedy)
+    rules = {name: rule for name, rule in {**needed, **optional}.items() if name in value}
+    if broken := broken_rule(value, rules):
+        raise CarError(f"{where}: {broken[0]} must be {broken[1]}", found=broken[2])
     return value
 
 

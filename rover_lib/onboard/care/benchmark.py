@@ -7,13 +7,13 @@ machine that heats up or is shared slows all of them alike. A value that the hos
 vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
+import contextlib
 import itertools
 import math
-import os
-import subprocess
-import sys
+import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +23,14 @@ import numpy as np
 
 from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
 from rover_lib.onboard.care.lower_bound import floor_ms
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.checked import broken_rule, number, optional, whole
+from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.policy.confined import load_confined, run_confined
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
+MOST = 10**9  # rounds, threads or seconds: a limit that nobody meets
+THROTTLED_S = 1.0  # between two readings of the firmware's throttling
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
 
@@ -37,33 +41,81 @@ def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeou
     nothing about one of them. Returns None if the machine does not report it. Raises PolicyError if the artifact does
     not load or predict there.
     """
-    code = (
-        "import sys, numpy as np\n"
-        "from rover_lib.onboard import load_policy\n"
-        "from rover_lib.onboard.car.host import Host\n"
-        "policy = load_policy(sys.argv[1], threads=int(sys.argv[2]) or None)\n"
-        "cameras = policy.manifest['cameras']\n"
-        "frame = {c['name']: np.zeros((c['height'], c['width'], 3), np.uint8) for c in cameras}\n"
-        "for _ in range(3):\n"
-        "    policy.predict_chunk(frame, np.zeros(len(policy.state_names), np.float32))\n"
-        "print('peak', Host().process_peak_memory_mb())\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return run_confined(_predict_alone, timeout_s=timeout_s, path=str(path), threads=threads or usable_cores())
+
+
+def _predict_alone(path: str, threads: int) -> float | None:
+    policies, _ = load_confined({"policy": path}, threads=threads)
+    policy = policies["policy"]
+    frame = {c["name"]: np.zeros((c["height"], c["width"], 3), np.uint8) for c in policy.manifest["cameras"]}
+    for _ in range(3):
+        policy.predict_chunk(frame, np.zeros(len(policy.state_names), np.float32))
+    return Host().process_peak_memory_mb()
+
+
+def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Time artifacts from anywhere, on the frames of the first one's parity vectors, as benchmark() does.
+
+    Nothing of them runs in this process. paths: by name. threads: of the engines. options: of BenchmarkOptions. Each
+    artifact's memory is measured too. Raises PolicyError for an artifact that does not load.
+    """
+    host = Host()
+    with tempfile.TemporaryDirectory() as folder, _keep_throttled(Path(folder) / "throttled", host) as told:
+        metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options, throttled=told)
+    metrics["throttled_means"] = throttled_means(metrics["throttled"])
+    _add_memory(metrics, paths, threads)
+    return metrics
+
+
+@contextlib.contextmanager
+def _keep_throttled(path: Path, host: Host) -> Iterator[Path]:
+    """Keep what the firmware throttles in a file, for a confined process, which can start no program to ask."""
+    ended = threading.Event()
+
+    def keep() -> None:
+        while True:
+            path.write_text(host.throttled() or "")
+            if ended.wait(THROTTLED_S):
+                return
+
+    thread = threading.Thread(target=keep)
+    path.touch()
+    thread.start()
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, str(path), str(threads or 0)],
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            env=environment,
-        )
-    except subprocess.TimeoutExpired:
-        raise PolicyError(f"{path}: no prediction within {timeout_s:g} s in a process of its own") from None
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise PolicyError(f"{path}: does not run in a process of its own ({last})", remedy="load it here to see why")
-    word = done.stdout.split()[-1]
-    return None if word == "None" else float(word)
+        yield path
+    finally:
+        ended.set()
+        thread.join()
+
+
+@dataclass(frozen=True)
+class _ToldHost(Host):
+    """A host whose throttling another process keeps in the file `told`."""
+
+    told: Path = Path()
+
+    def throttled(self) -> str | None:
+        return self.told.read_text() or None
+
+
+def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any], throttled: str) -> dict[str, Any]:
+    policies, artifacts = load_confined(paths, threads=threads)
+    first, vectors = next(iter(policies.values())), next(iter(artifacts.values())).parity
+    frames = [
+        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
+    ]  # stored as RGB; a camera gives BGR
+    host = _ToldHost(told=Path(throttled))
+    return benchmark(policies, frames, vectors["state"][0], BenchmarkOptions(**options), host=host)
+
+
+def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
+    """Measure the memory of each artifact alone, and add it to the metrics."""
+    with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
+        peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
+        for name, peak_mb in zip(paths, peaks, strict=True):
+            metrics["artifacts"][name]["peak_memory_mb"] = peak_mb
+    if (peak_mb := metrics["artifacts"][metrics["main"]]["peak_memory_mb"]) is not None:
+        metrics["peak_memory_mb"] = peak_mb
 
 
 def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
@@ -73,17 +125,16 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     of the inferences end within their period (1000 / p95).
     """
     x = np.asarray(latencies_ms, float)
-    metrics: dict[str, float | int] = {
-        f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()
+    mean_ms, p95_ms = float(x.mean()), float(np.percentile(x, 95))
+    return {
+        **{f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()},
+        "latency_min_ms": float(x.min()),
+        "latency_mean_ms": mean_ms,
+        "latency_max_ms": float(x.max()),
+        "n": len(x),
+        "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
+        "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
     }
-    metrics["latency_min_ms"] = float(x.min())
-    metrics["latency_mean_ms"] = float(x.mean())
-    metrics["latency_max_ms"] = float(x.max())
-    metrics["n"] = len(x)
-    metrics["throughput_fps"] = float(1000 / x.mean()) if x.mean() > 0 else math.inf
-    p95_ms = metrics["latency_p95_ms"]
-    metrics["control_rate_hz"] = 1000 / p95_ms if p95_ms > 0 else math.inf
-    return metrics
 
 
 def _silent(items: Iterable, **_: object) -> Iterable:
@@ -96,8 +147,7 @@ class BenchmarkOptions:
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
     test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
-    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. rate_hz: at most that many
-    inferences per second, on absolute deadlines, as in a drive; None: as fast as possible. main: the policy whose
+    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. main: the policy whose
     figures are at the top level (None: the first). reference: the policy that the speed of the others is compared with.
     memory_alone: measure each artifact's memory in a process of its own, which takes seconds each.
     """
@@ -107,29 +157,28 @@ class BenchmarkOptions:
     threads: int | None = None
     duration_s: float | None = None
     at_most_s: float | None = None
-    rate_hz: float | None = None
     main: str | None = None
     reference: str | None = None
     memory_alone: bool = False
 
     def __post_init__(self) -> None:
-        if self.warmup < 0 or self.iterations < 1:
-            counts = f"{self.warmup} and {self.iterations}"
-            raise ParamsError("warmup must be from 0 and iterations from 1", found=counts)
-        for name, value in (("duration_s", self.duration_s), ("at_most_s", self.at_most_s), ("rate_hz", self.rate_hz)):
-            if value is not None and not 0 < value < math.inf:
-                raise ParamsError(f"{name} must be above 0", found=value)
-        if self.threads is not None and self.threads < 0:
-            raise ParamsError("threads must be from 0 (all cores)", found=self.threads)
+        rules = {
+            "warmup": whole(0, MOST),
+            "iterations": whole(1, MOST),
+            "threads": optional(whole(0, MOST)),
+            "duration_s": optional(number(0.001, MOST)),
+            "at_most_s": optional(number(0.001, MOST)),
+        }
+        if broken := broken_rule(vars(self), rules):
+            raise ParamsError(f"{broken[0]} of a benchmark must be {broken[1]}", found=broken[2])
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """The clocks of a benchmark, all in seconds: elapsed time, processor time, and a function that waits."""
+    """The clocks of a benchmark, both in seconds: elapsed time, and processor time."""
 
     wall: Callable[[], float] = time.perf_counter
     cpu: Callable[[], float] = time.process_time
-    sleep: Callable[[float], None] = time.sleep
 
 
 DEFAULTS = BenchmarkOptions()
@@ -184,18 +233,11 @@ def benchmark(
     if reference is not None:
         for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
-    if options.memory_alone:
-        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
-        with ThreadPoolExecutor(2) as pool:  # each process mostly imports, on one core
-            peaks = pool.map(lambda path: peak_memory_alone_mb(path, threads=threads), paths.values())
-            for name, peak_mb in zip(paths, peaks, strict=True):
-                artifacts[name]["peak_memory_mb"] = peak_mb
     top = {k: v for k, v in artifacts[main].items() if not k.startswith("speedup")}
     process_mb = host.process_peak_memory_mb()
-    if top["peak_memory_mb"] is None:
-        top["peak_memory_mb"] = process_mb
-    return {
+    metrics = {
         **top,
+        "peak_memory_mb": process_mb,
         "process_peak_memory_mb": process_mb,
         "cpu_pct": _share_pct(run.process_s, run.wall_s, cores),
         **run.host_metrics(),
@@ -206,11 +248,13 @@ def benchmark(
         "warmup": options.warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
-        "rate_hz": options.rate_hz,
-        "missed_deadlines": run.missed if options.rate_hz else None,
         "artifacts": artifacts,
         "series": run.series if options.duration_s is not None else None,
     }
+    if options.memory_alone:
+        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
+        _add_memory(metrics, paths, threads)
+    return metrics
 
 
 def _set_threads(policies: Mapping[str, Any], threads: Mapping[str, int]) -> None:
@@ -235,13 +279,12 @@ class _Run:
         self.cpu_s = dict.fromkeys(policies, 0.0)
         self.readings: list[dict[str, Any]] = []
         self.series: list[dict[str, Any]] = []
-        self.missed = 0
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
     def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
         """Time `iterations` rounds, or as many as begin within duration_s, and fill the lists."""
-        duration_s, rate_hz = options.duration_s, options.rate_hz
+        duration_s = options.duration_s
         if duration_s is None:
             rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
         else:
@@ -252,15 +295,13 @@ class _Run:
         self.readings.append(self.host.reading())
         before = self.host.core_ticks()
         cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
-        due_s, tick_s, seen = start_s, start_s + every_s, dict.fromkeys(names, 0)
+        tick_s, seen = start_s + every_s, dict.fromkeys(names, 0)
         for i in rounds:
             if duration_s is not None and self.clocks.wall() - start_s >= duration_s and i > 0:
                 break
             if options.at_most_s and i >= LEAST_ROUNDS and self.clocks.wall() - start_s >= options.at_most_s:
                 break
             for k in range(len(names)):
-                if rate_hz:
-                    due_s = self._wait(due_s, 1 / rate_hz)
                 self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
             if duration_s is not None and (now_s := self.clocks.wall()) >= tick_s:
                 self._note(now_s - start_s, seen)
@@ -319,15 +360,6 @@ class _Run:
         end_s, cpu_end_s = self.clocks.wall(), self.clocks.cpu()
         self.latencies_ms[name].append((end_s - start_s) * 1000)
         self.cpu_s[name] += cpu_end_s - cpu_start_s
-
-    def _wait(self, due_s: float, period_s: float) -> float:
-        """Wait for a deadline and return the next one. A deadline that has passed is counted and skipped."""
-        now_s = self.clocks.wall()
-        if now_s < due_s:
-            self.clocks.sleep(due_s - now_s)
-        behind = math.floor((now_s - due_s) / period_s) if now_s > due_s else 0
-        self.missed += behind
-        return due_s + (behind + 1) * period_s
 
     def _note(self, t_s: float, seen: dict[str, int]) -> None:
         """Add one point to the time series: the latencies since the last point, and the host's state."""

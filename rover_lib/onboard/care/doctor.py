@@ -8,13 +8,13 @@ checks are independent: one that breaks counts as failed, and the others go on.
 """
 
 import contextlib
-import fcntl
 import getpass
 import grp
 import os
+import re
 import shutil
 import statistics
-import struct
+import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -53,20 +53,10 @@ MEMORY_MB = 700  # the real policy needs 358 MB while predicting and 424 while l
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
 
-# From linux/videodev2.h. The kernel is asked these three questions directly: linuxpy, which can ask them too, would be
-# one more package to pin and hash on every rover, and v4l2-ctl one more to install.
-VIDIOC_QUERYCAP, CAPABILITY = 0x80685600, struct.Struct("<16s32s32sIII12x")
-VIDIOC_ENUM_FMT, FORMAT = 0xC0405602, struct.Struct("<III32sI16x")
-VIDIOC_ENUM_FRAMESIZES, FRAME_SIZE = 0xC02C564A, struct.Struct("<III6I8x")
-CAPTURE, CAPTURE_PLANES = 0x1, 0x1000
-BUFFER_CAPTURE, BUFFER_CAPTURE_PLANES = 1, 9
-DISCRETE = 1
-BIG_ENDIAN = 1 << 31  # the bit of a format's four characters that means big-endian
-MOST_SIZES = 64  # sizes and formats that a camera is asked for
+LIST_S = 5.0  # for v4l2-ctl
 MOST_FORMATS = 8  # named in a check's line; the kernel's test driver has 66
 
 Verdict = Literal["ok", "warning", "fail"]
-Ioctl = Callable[[int, int, bytearray], int]
 
 
 @dataclass(frozen=True)
@@ -81,6 +71,11 @@ class Check:
     def __str__(self) -> str:
         line = f"{self.verdict:<8} {self.name:<{NAME_WIDTH}} {self.found}"
         return f"{line}\n{'':{9 + NAME_WIDTH}} {self.remedy}" if self.remedy else line
+
+
+def warn_unless(fine: bool, name: str, found: str, remedy: str) -> Check:
+    """Return an "ok" if it is fine, and otherwise a "warning" with its remedy."""
+    return Check(name, "ok", found) if fine else Check(name, "warning", found, remedy)
 
 
 def examine(
@@ -107,9 +102,9 @@ def examine(
         checks["group video"] = lambda: access("group video", device, "video")
         checks["cameras"] = lambda: cameras(dev)
     checks |= {
-        "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz, proc_root=host.proc_root),
+        "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
         "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev)), "dialout"),
-        "Arduino": lambda: arduino(port or find_port(dev), dev=dev, proc_root=host.proc_root, boot_s=boot_s),
+        "Arduino": lambda: arduino(port or find_port(dev), dev=dev, boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "side": lambda: side(recording) if recording else (),
@@ -137,71 +132,41 @@ def _found(error: RoverError) -> str:
 
 
 def access(name: str, device: Path, group: str) -> Iterator[Check]:
-    """Check whether this user may use the device.
-
-    group: the usual one. It counts if the device is not there; otherwise the device's own permissions and group do.
-    """
+    """Check whether this user may use the device. group: the usual one; the device's own counts if it is there."""
     user = getpass.getuser()
     if device.exists():
-        if os.access(device, os.R_OK | os.W_OK):
-            yield Check(name, "ok", f"{user} may use {device}")
-            return
-        try:
-            group = grp.getgrgid(device.stat().st_gid).gr_name
-        except KeyError:
-            group = str(device.stat().st_gid)
-        what = f"{user} may not use {device}, which belongs to group {group}"
-        verdict: Verdict = "fail"
+        usable = os.access(device, os.R_OK | os.W_OK)
+        with contextlib.suppress(KeyError):
+            group = device.group()
     else:
-        if os.geteuid() == 0 or group in _groups():
-            yield Check(name, "ok", f"{user} is in it" if os.geteuid() else f"{user} needs no group")
-            return
-        what, verdict = f"{user} is not in it", "warning"  # another check reports the missing device as a fail
-    if _listed(group, user):
-        yield Check(name, verdict, f"{what}; {user} was added to it", "log in again (or restart the service)")
-    else:
-        yield Check(name, verdict, what, f"sudo usermod -aG {group} {user}, then log in again")
+        names = {g.gr_name for g in grp.getgrall() if g.gr_gid in (*os.getgroups(), os.getegid())}
+        usable = os.geteuid() == 0 or group in names
+    if usable:
+        yield Check(name, "ok", f"{user} may use {device}")
+        return
+    verdict: Verdict = "fail" if device.exists() else "warning"  # another check reports the missing device as a fail
+    remedy = f"sudo usermod -aG {group} {user}, then log in again (or restart the service)"
+    yield Check(name, verdict, f"{user} may not use {device}, which belongs to group {group}", remedy)
 
 
-def _groups() -> set[str]:
-    """Return the names of this process's groups."""
-    names = set()
-    for number in {*os.getgroups(), os.getegid()}:
-        try:
-            names.add(grp.getgrgid(number).gr_name)
-        except KeyError:
-            names.add(str(number))
-    return names
-
-
-def _listed(group: str, user: str) -> bool:
-    """Whether /etc/group lists the user in the group and this process is not in it yet: a new login would help."""
-    try:
-        return user in grp.getgrnam(group).gr_mem and group not in _groups()
-    except KeyError:
-        return False
-
-
-def cameras(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Check]:
-    """Report each V4L2 node that delivers pictures, with its driver, formats and sizes."""
+def cameras(dev: Path = Path("/dev"), program: str = "v4l2-ctl") -> Iterator[Check]:
+    """Report each V4L2 node that delivers pictures, with its driver, formats and sizes, as v4l2-ctl lists them."""
     nodes = sorted((n for n in dev.glob("video*") if n.name[5:].isdecimal()), key=lambda n: int(n.name[5:]))
     seen = 0
     for node in nodes:
+        command = [program, "--device", str(node), "--info", "--list-formats-ext"]
         try:
-            file = os.open(node, os.O_RDWR | os.O_NONBLOCK)
-        except OSError as error:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LIST_S)
+        except FileNotFoundError:
+            yield Check("cameras", "warning", f"no {program}, which lists them", "sudo apt-get install v4l-utils")
+            return
+        except (OSError, subprocess.TimeoutExpired) as error:
+            done = subprocess.CompletedProcess(command, 1, "", str(error))
+        if done.returncode:
             seen += 1
-            yield Check("cameras", "warning", f"{node}: cannot be opened ({error.strerror})", "see group video above")
-            continue
-        try:
-            found = _capture_node(file, ioctl)
-        except OSError as error:
-            seen += 1
-            yield Check("cameras", "warning", f"{node}: does not say what it is ({error.strerror})", "plug it in again")
-            continue
-        finally:
-            os.close(file)
-        if found:
+            said = " ".join((done.stderr + done.stdout).split())[:160]
+            yield Check("cameras", "warning", f"{node}: {said}", "see group video above, or plug it in again")
+        elif found := _describe_node(done.stdout):
             seen += 1
             yield Check("cameras", "ok", f"{node}: {found}")
     if not seen:
@@ -209,48 +174,21 @@ def cameras(dev: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Ch
         yield Check("cameras", "fail", there, "plug the camera in; dmesg | tail says whether the kernel saw it")
 
 
-def _capture_node(file: int, ioctl: Ioctl) -> str | None:
-    """Describe an open node: driver, card, formats, sizes. None if it gives no pictures (metadata, a decoder, ...)."""
-    data = bytearray(CAPABILITY.size)
-    ioctl(file, VIDIOC_QUERYCAP, data)
-    driver, card, _, _, capabilities, device_caps = CAPABILITY.unpack(data)
-    caps = device_caps or capabilities
-    if not caps & (CAPTURE | CAPTURE_PLANES):
+def _describe_node(listed: str) -> str | None:
+    """Describe what v4l2-ctl listed: driver, card, formats, sizes. None if it gives no pictures (metadata, ...)."""
+    capabilities = re.search(r"Device Caps\b.*?\n((?:\t\t.*\n)*)", listed)
+    if not capabilities or "Video Capture" not in capabilities[1]:
         return None
-    kind = BUFFER_CAPTURE if caps & CAPTURE else BUFFER_CAPTURE_PLANES
-    formats = []
-    for index in range(MOST_SIZES):
-        data = bytearray(FORMAT.pack(index, kind, 0, b"", 0))
-        try:
-            ioctl(file, VIDIOC_ENUM_FMT, data)
-        except OSError:  # the end of the list
-            break
-        pixels = FORMAT.unpack(data)[4]
-        big_endian = pixels & BIG_ENDIAN
-        name = (pixels ^ big_endian).to_bytes(4, "little").decode("ascii", "replace").strip()
-        formats.append(" ".join([name + ("-BE" if big_endian else ""), *_sizes(file, pixels, ioctl)]))
+    driver, card = (re.search(rf"{name}\s*: (.*)", listed) for name in ("Driver name", "Card type"))
+    formats: list[str] = []
+    for name, size in re.findall(r"\[\d+\]: '(.*?)'|Size: \w+ (.*)", listed):
+        if name:
+            formats.append(name.strip())
+        elif formats:
+            formats[-1] += f" {size.partition(' with')[0].replace(' - ', ' to ')}"
     if len(formats) > MOST_FORMATS:
         formats[MOST_FORMATS:] = [f"{len(formats) - MOST_FORMATS} more"]
-    return f"{_text(driver)}, {_text(card)}: {'; '.join(formats) or 'no formats'}"
-
-
-def _sizes(file: int, pixels: int, ioctl: Ioctl) -> list[str]:
-    sizes: list[str] = []
-    for index in range(MOST_SIZES):
-        data = bytearray(FRAME_SIZE.pack(index, pixels, 0, *[0] * 6))
-        try:
-            ioctl(file, VIDIOC_ENUM_FRAMESIZES, data)
-        except OSError:
-            break
-        _, _, kind, *numbers = FRAME_SIZE.unpack(data)
-        if kind != DISCRETE:
-            return [f"{numbers[0]}x{numbers[3]} to {numbers[1]}x{numbers[4]}"]
-        sizes.append(f"{numbers[0]}x{numbers[1]}")
-    return sizes
-
-
-def _text(data: bytes) -> str:
-    return data.partition(b"\0")[0].decode(errors="replace")
+    return f"{driver and driver[1]}, {card and card[1]}: {'; '.join(formats) or 'no formats'}"
 
 
 def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
@@ -265,7 +203,6 @@ def camera_rate(
     seen: tuple[int, int] | None = None,
     *,
     rate_hz: float = 30.0,
-    proc_root: Path = Path("/proc"),
     open_camera: Callable[..., Any] = Camera,
 ) -> Iterator[Check]:
     """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen.
@@ -275,7 +212,6 @@ def camera_rate(
     if not is_csi(str(source)) and not Path(source).exists():
         yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
         return
-    users = users_of(source, proc_root)
     try:
         with open_camera(source, rate_hz=rate_hz, **({"size": size_like(*seen)} if seen else {})) as camera:
             end = time.monotonic() + SETTLE_S
@@ -289,8 +225,7 @@ def camera_rate(
             if seen:
                 check_shape(str(source), last.image, seen)
     except RoverError as error:
-        used = f"; used by {', '.join(users)}" if users else ""
-        yield Check("camera", "fail", f"{_found(error)}{used}", f"end {users[0]}" if users else error.remedy)
+        yield Check("camera", "fail", _found(error), error.remedy)
         return
     number = last.number - first.number
     measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
@@ -304,39 +239,18 @@ def camera_rate(
         yield Check("camera", "warning", f"{found}, wanted {rate_hz:g}", light)
     elif fault := frozen(last, settings):
         yield Check("camera", "fail", f"{found}, but {fault.what}", fault.remedy)
-    elif fault := blank(last, settings):
-        yield Check("camera", "warning", f"{found}, but {fault.what}", fault.remedy)
     else:
-        yield Check("camera", "ok", found)
+        fault = blank(last, settings)
+        remedy = fault.remedy if fault else ""
+        yield warn_unless(not fault, "camera", f"{found}, but {fault.what}" if fault else found, remedy)
 
 
-def users_of(path: Path | str, proc_root: Path = Path("/proc")) -> list[str]:
-    """List other processes that have the file open, as "name (process id)"; without root, only this user's."""
-    target = Path(path).resolve()
-    found = []
-    for process in proc_root.glob("[0-9]*"):
-        if process.name == str(os.getpid()):
-            continue
-        try:
-            if any(fd.readlink() == target for fd in (process / "fd").iterdir()):
-                found.append(f"{(process / 'comm').read_text().strip()} ({process.name})")
-        except OSError:  # the process is another user's, or has just ended
-            continue
-    return found
-
-
-def arduino(
-    port: str, *, dev: Path = Path("/dev"), proc_root: Path = Path("/proc"), boot_s: float = BOOT_S
-) -> Iterator[Check]:
+def arduino(port: str, *, dev: Path = Path("/dev"), boot_s: float = BOOT_S) -> Iterator[Check]:
     """Check that the port is there and free, what answers on it and how fast, and whether the transmitter is on."""
     if not Path(port).exists():
         others = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in dev.glob(pattern))
         remedy = f"--port {others[0]}" if others else "plug it in; dmesg | tail says whether the kernel saw it"
         yield Check("Arduino", "fail", f"no {port}; there is {', '.join(others) or 'no other serial port'}", remedy)
-        return
-    if users := users_of(port, proc_root):
-        # Whatever we read would be missing for that program, which may be driving.
-        yield Check("Arduino", "fail", f"{port}: used by {', '.join(users)}", f"end {users[0]}")
         return
     with ServoLink(port, boot_s=boot_s) as link:
         firmware = link.hello.firmware if link.hello else "unknown"
@@ -345,13 +259,9 @@ def arduino(
         median_ms, most_ms = statistics.median(times_ms), max(times_ms)
         found = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
         if link.garbled:
-            yield Check(
-                "link", "warning", f"{found}; {link.garbled} lines were garbled", "a shorter or better USB cable"
-            )
-        elif median_ms > SLOW_MS:
-            yield Check("link", "warning", found, "plug it into the Pi itself, not a hub")
-        else:
-            yield Check("link", "ok", found)
+            found += f"; {link.garbled} lines were garbled"
+        remedy = "a shorter or better USB cable, plugged into the Pi itself, not a hub"
+        yield warn_unless(median_ms <= SLOW_MS and not link.garbled, "link", found, remedy)
         yield _transmitter(link)
 
 
@@ -367,14 +277,13 @@ def _transmitter(link: ServoLink) -> Check:
         return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
     if silent:
         found = f"no signal on {' and '.join(silent)}: arming will be refused"
-        return Check(
-            "transmitter", "fail", found, "switch it on, then look at the receiver's wires (firmware/README.md)"
-        )
-    found = f"steering {pulses['steering']} us, throttle {pulses['throttle']} us"
-    throttle_us = pulses["throttle"]
-    if throttle_us is not None and abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) > REST_US:
-        return Check("transmitter", "warning", f"{found}: arming will be refused", "let go of the throttle stick")
-    return Check("transmitter", "ok", found)
+        remedy = "switch it on, then look at the receiver's wires (firmware/README.md)"
+        return Check("transmitter", "fail", found, remedy)
+    found, throttle_us = f"steering {pulses['steering']} us, throttle {pulses['throttle']} us", pulses["throttle"]
+    rests = throttle_us is not None and abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
+    return warn_unless(
+        rests, "transmitter", found if rests else f"{found}: arming will be refused", "let go of the throttle stick"
+    )
 
 
 def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S) -> Iterator[Check]:
@@ -391,9 +300,8 @@ def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S)
             return
         ask("Move the steering stick far to both sides, and let go of it.")
         if (seen := _soon(link, lambda status: status.missing == "-", RITUAL_S)).missing != "-":
-            yield Check(
-                "arming", "fail", "the receiver's pulses did not show it", f"{link.remedy(seen.missing)}, and try again"
-            )
+            remedy = f"{link.remedy(seen.missing)}, and try again"
+            yield Check("arming", "fail", "the receiver's pulses did not show it", remedy)
             return
         yield Check("arming", "ok", "transmitter on, throttle at rest, stick wiggled: it could be armed for 30 s now")
         before = _pulses(seen)
@@ -465,13 +373,11 @@ def side(recording: Path) -> Iterator[Check]:
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     """Check whether ModemManager runs, because it writes to every new serial port."""
     for process in proc_root.glob("[0-9]*"):
-        try:
+        with contextlib.suppress(OSError):  # it has just ended
             if (process / "comm").read_text().strip() == "ModemManager":
                 remedy = "sudo systemctl disable --now ModemManager"
                 yield Check("ModemManager", "warning", "runs: it writes to serial ports that appear", remedy)
                 return
-        except OSError:
-            continue
     yield Check("ModemManager", "ok", "does not run")
 
 
@@ -480,21 +386,19 @@ def engines_here() -> Iterator[Check]:
     missing = []
     try:
         import torch
+
+        engines = ", ".join(torch.backends.quantized.supported_engines)
+        found = f"{torch.__version__}, engines {engines}, {torch.get_num_threads()} threads"
+        remedy = "INT8 artifacts need qnnpack: install PyPI's build of torch"
+        yield Check("torch", "ok", found) if "qnnpack" in engines else Check("torch", "fail", found, remedy)
     except ImportError as error:
         missing.append(f"torch ({error})")
-    else:
-        engines = [e for e in torch.backends.quantized.supported_engines if e != "none"]
-        found = f"{torch.__version__}, engines {', '.join(engines) or 'none'}, {torch.get_num_threads()} threads"
-        if "qnnpack" in engines:
-            yield Check("torch", "ok", found)
-        else:
-            yield Check("torch", "fail", found, "INT8 artifacts need qnnpack: install PyPI's build of torch")
     try:
         import onnxruntime
+
+        yield Check("onnxruntime", "ok", onnxruntime.__version__)
     except ImportError as error:
         missing.append(f"onnxruntime ({error})")
-    else:
-        yield Check("onnxruntime", "ok", onnxruntime.__version__)
     if len(missing) == 2:
         found = f"none can be imported: {', '.join(missing)}"
         yield Check("engines", "fail", found, "pip install -r requirements_pi.txt")
@@ -511,66 +415,52 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
         camera = loaded["cameras"][0]
         size = f"{camera['name']} {camera['width']}x{camera['height']}"
         about = f"{loaded['mode']}, {loaded['chunk']} actions at {loaded['rate_hz']:g} Hz, camera {size}"
-        yield Check("artifact", "ok", f"{artifact}: whole, computes what it should; {about}")
-        if process.unconfined:
-            remedy = "a kernel with seccomp, as Raspberry Pi OS has; until then drive only what you made"
-            yield Check("confinement", "warning", f"the policy's process is not confined: {process.unconfined}", remedy)
-        else:
-            yield Check("confinement", "ok", "the policy's process opens no file to write, no port and no socket")
+        yield Check("artifact", "ok", f"{artifact}: verified; {about}")
+        found = process.unconfined or "the policy's process opens no file to write, no port and no socket"
+        remedy = "a kernel with seccomp, as Raspberry Pi OS has; until then drive only what you made"
+        yield warn_unless(not process.unconfined, "confinement", found, remedy)
         frame = np.zeros((camera["height"], camera["width"], 3), np.uint8)
         for _ in range(3):
             start = time.perf_counter()
             process.predict(frame, np.zeros(2, np.float32))
             times_s.append(time.perf_counter() - start)
     median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
-    found = f"{1000 * median_s:.0f} ms"
-    if median_s < fade_s / 2:  # just before the next plan is ready, a plan is two inferences old
-        yield Check("inference", "ok", found)
-    else:
-        remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
-        yield Check("inference", "warning", f"{found}: the throttle fades from {1000 * fade_s:g} ms of age on", remedy)
+    # just before the next plan is ready, a plan is two inferences old
+    found = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
+    remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
+    yield warn_unless(median_s < fade_s / 2, "inference", found, remedy)
 
 
 def temperature(host: Host) -> Iterator[Check]:
     """Check the processor's temperature."""
     celsius = host.temperature_c()
-    if celsius is None:
-        yield Check("temperature", "ok", "this machine does not tell")
-    elif celsius < HOT_C:
-        yield Check("temperature", "ok", f"{celsius:.0f} C")
-    else:
-        yield Check("temperature", "warning", f"{celsius:.0f} C", "a fan, or air: a Raspberry Pi slows down from 80 C")
+    found = "not reported" if celsius is None else f"{celsius:.0f} C"
+    fine = celsius is None or celsius < HOT_C
+    yield warn_unless(fine, "temperature", found, "a fan, or air: a Raspberry Pi slows down from 80 C")
 
 
 def power(host: Host) -> Iterator[Check]:
     """Check what get_throttled reports about the supply and the clock, now and since the machine started."""
     value = host.throttled()
     means = throttled_means(value)
-    if means is None and (trouble := host.vcgencmd_trouble()):
+    if means is None:
+        trouble = host.vcgencmd_trouble()
+        found = f"cannot be read, so low voltage would not be seen: {trouble}" if trouble else "no vcgencmd here"
         remedy = "sudo usermod -aG video $USER, log in again; `vcgencmd get_throttled` shows the rest"
-        yield Check("power", "warning", f"cannot be read, so low voltage would not be seen: {trouble}", remedy)
-    elif means is None:
-        yield Check("power", "ok", "no vcgencmd here: not a Raspberry Pi, or not its system")
-    elif not means:
-        yield Check("power", "ok", f"get_throttled {value}: supply and clock were as they should be")
-    elif any("voltage" in m for m in means):
-        remedy = "a supply of 5 V and 5 A with a short thick cable; a battery that is charged"
-        yield Check("power", "warning", f"get_throttled {value}: {', '.join(means)}", remedy)
-    else:
-        yield Check("power", "warning", f"get_throttled {value}: {', '.join(means)}", "a fan, or air")
+        yield warn_unless(not trouble, "power", found, remedy)
+        return
+    supply = any("voltage" in m for m in means)
+    remedy = "a supply of 5 V and 5 A with a short thick cable; a charged battery" if supply else "a fan, or air"
+    yield warn_unless(not means, "power", f"get_throttled {value}: {', '.join(means) or 'nothing'}", remedy)
 
 
 def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
     """Check which frequency governor sets the cores' clock."""
     files = sorted(sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
     found = sorted({f.read_text().strip() for f in files})
-    if not found:
-        yield Check("governor", "ok", "this machine does not tell")
-    elif found == ["performance"]:
-        yield Check("governor", "ok", "performance")
-    else:
-        remedy = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
-        yield Check("governor", "warning", f"{', '.join(found)}: the clock rises only after the work has come", remedy)
+    remedy = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
+    fine = found in ([], ["performance"])
+    yield warn_unless(fine, "governor", ", ".join(found) or "not reported", remedy)
 
 
 def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shutil.disk_usage) -> Iterator[Check]:
@@ -580,35 +470,27 @@ def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shut
     for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
         there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         free_mb = usage(there).free / 1e6
-        found = f"{free_mb:.0f} MB free for {what} in {folder}"
         if not os.access(there, os.W_OK | os.X_OK):
-            yield Check(
-                "disk", "warning", f"{folder}: not writable, for {what}", f"sudo chown {getpass.getuser()} {there}"
-            )
-        elif free_mb < need_mb:
-            yield Check("disk", "warning", f"{found}, {need_mb:.0f} are wanted", "delete what is old")
-        else:
-            yield Check("disk", "ok", found)
+            remedy = f"sudo chown {getpass.getuser()} {there}"
+            yield Check("disk", "warning", f"{folder}: not writable, for {what}", remedy)
+            continue
+        found = f"{free_mb:.0f} MB free for {what} in {folder}, {need_mb:.0f} are wanted"
+        yield warn_unless(free_mb >= need_mb, "disk", found, "delete what is old")
 
 
 def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     """Check that enough memory is free for the policy."""
     rows = dict(line.split(":", 1) for line in (proc_root / "meminfo").read_text().splitlines() if ":" in line)
     free_mb = int(rows["MemAvailable"].split()[0]) * 1024 / 1e6
-    if free_mb >= MEMORY_MB:
-        yield Check("memory", "ok", f"{free_mb:.0f} MB free")
-    else:
-        remedy = "end other programs (a desktop needs 500 MB: sudo systemctl set-default multi-user.target)"
-        yield Check("memory", "warning", f"{free_mb:.0f} MB free, {MEMORY_MB} are wanted", remedy)
+    remedy = "end other programs (a desktop needs 500 MB: sudo systemctl set-default multi-user.target)"
+    yield warn_unless(free_mb >= MEMORY_MB, "memory", f"{free_mb:.0f} MB free, {MEMORY_MB} are wanted", remedy)
 
 
 def clock(now_s: float | None = None, built_s: float | None = None) -> Iterator[Check]:
     """Check that the date can be right, because recordings are named after it and flight logs contain it."""
     now_s = time.time() if now_s is None else now_s
     built_s = Path(__file__).stat().st_mtime if built_s is None else built_s
+    fine = now_s >= max(EARLIEST_S, built_s) - 86_400
     found = time.strftime("%Y-%m-%d %H:%M", time.localtime(now_s))
-    if now_s >= max(EARLIEST_S, built_s) - 86_400:
-        yield Check("clock", "ok", found)
-    else:
-        remedy = "connect it to a network (timedatectl shows the rest), or sudo date -s '...'"
-        yield Check("clock", "warning", f"{found}, which is before this program was installed", remedy)
+    remedy = "connect it to a network (timedatectl shows the rest), or sudo date -s '...'"
+    yield warn_unless(fine, "clock", found if fine else f"{found}, before this program was installed", remedy)

@@ -1,4 +1,4 @@
-"""What a Raspberry Pi 5 takes for counted work, by the fit that `python -m lab clock` made: computed, never measured.
+"""What a Raspberry Pi 5 takes for counted work, by a fit to published times: computed, never measured.
 
     predict_ms(Work(cycles_g=0.69, near_lines_g=0.03, far_lines_g=0.005), threads=3)
 
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from rover_lib.onboard.errors import ParamsError
 
-FITTED = Path(__file__).with_name("pi5.json")  # written by `python -m lab clock`
+FITTED = Path(__file__).with_name("pi5.json")  # its program: lab/a76/clock.py at commit 545214c
 CORES = 4
 OVERLAP = 2  # of what a core does and what the memory does: 1 if they took turns, more the more they overlap
 DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view

@@ -66,7 +66,6 @@ class Feed:
         self._socket: socket.socket | None = None
         self._look_s = self._due_s = self._tell_s = 0.0  # earliest times: look for a view, send, log a change
         self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
-        self.dropped = 0  # messages for which there was no room
 
     def close(self) -> None:
         """End the connection to the view."""
@@ -74,27 +73,28 @@ class Feed:
             self._socket.close()
             self._socket = None
 
-    def tick(self, report: Report, camera: Camera | None, pilot: PolicyPilot | None, tick: Tick) -> None:
-        """Call this after each command that went out. camera, pilot: None for a replay."""
+    def tick(self, report: Report, camera: Camera, pilot: PolicyPilot, tick: Tick) -> None:
+        """Call this after each command that went out."""
         self._ticks.append((tick.t_s, tick.late_ms))
         if self._due():
-            self._show(DRIVING, "", report, camera, pilot=pilot, tick=tick)
+            pins = {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state}
+            message = {"tick": tick._asdict(), **pins, "why": REASONS.get(tick.reason, "")}
+            if pilot.plan:
+                plan, rate_hz = pilot.plan
+                actions = plan.actions.round(3).tolist()
+                message["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": actions}
+            self._send(DRIVING, "", report, camera, message)
 
-    def waiting(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str = "") -> None:
-        """Call this while nobody has armed the car. said: how the previous drive ended."""
+    def show(self, phase: str, text: str, report: Report, camera: Camera, link: ServoLink | None) -> None:
+        """Call this while the car does not drive by commands. phase: WAITING or TAKEN. text: a sentence for people."""
         if self._due():
-            self._show(WAITING, said, report, camera, link=link)
+            self._send(phase, text, report, camera, self._pins(link) | ({"missing": ""} if phase == TAKEN else {}))
 
-    def taken_over(self, report: Report, camera: Camera | None, link: ServoLink | None, said: str) -> None:
-        """Call this while a human who took over is recorded. said: a sentence that says so."""
-        if self._due():
-            self._show(TAKEN, said, report, camera, link=link)
-
-    def ended(self, report: Report, camera: Camera | None, link: ServoLink | None) -> None:
+    def ended(self, report: Report, camera: Camera, link: ServoLink | None) -> None:
         """Call this once after a drive: it shows what the pins do now, and retries up to LAST_S if the view is busy."""
         end_s = self._clock() + LAST_S
         self._ticks.clear()
-        while self._connected() and not self._show(ENDED, report.ended, report, camera, link=link):
+        while self._connected() and not self._send(ENDED, report.ended, report, camera, self._pins(link)):
             if self._clock() > end_s:
                 return
             self._sleep(LAST_S / 10)
@@ -143,57 +143,43 @@ class Feed:
             self._tell_s = self._clock() + TOLD_S
             self._log.event(why)
 
-    def _show(
-        self,
-        phase: str,
-        text: str,
-        report: Report,
-        camera: Camera | None,
-        *,
-        pilot: PolicyPilot | None = None,
-        tick: Tick | None = None,
-        link: ServoLink | None = None,
-    ) -> bool:
-        """Send a message; return whether it was sent."""
+    def _pins(self, link: ServoLink | None) -> dict[str, Any]:
+        with contextlib.suppress(RoverError):  # whoever needs the link reports that it is gone
+            if link and (telemetry := link.latest()):
+                missing = "" if telemetry.missing == "-" else link.remedy(telemetry.missing)
+                pins = {"pins": [telemetry.steering_us, telemetry.throttle_us], "who": telemetry.state.value}
+                return {**pins, "why": REASONS.get(telemetry.reason, ""), "missing": missing}
+        return {"pins": None, "who": "", "why": ""}
+
+    def _send(self, phase: str, text: str, report: Report, camera: Camera, message: dict[str, Any]) -> bool:
+        """Send a message with the camera's newest picture; return whether it was sent."""
+        since_s = self._ticks[-1][0] - self._ticks[0][0] if self._ticks else 0.0
         try:
-            message: dict[str, Any] = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock()}
-            message |= {"tick": tick and tick._asdict(), "missed": report.missed, "machine": self._log.machine}
-            message["events"] = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
-            message |= self._pace() | self._pins(tick, link)
-            if phase == TAKEN:
-                message["missing"] = ""  # nobody is about to arm the car
-            if pilot and pilot.plan:
-                plan, rate_hz = pilot.plan
-                actions = plan.actions.round(3).tolist()
-                message["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": actions}
             shown, picture = self._picture(camera)
-            return self._send(message | shown, picture)
+            line = {
+                "phase": phase,
+                "text": text,
+                "title": self._title,
+                "sent_s": self._clock(),
+                "tick": None,
+                "missed": report.missed,
+                "machine": self._log.machine,
+                "events": [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)],
+                "hz": (len(self._ticks) - 1) / since_s if since_s > 0 else None,
+                "late_most_ms": max((late_ms for _, late_ms in self._ticks), default=None),
+                **message,
+                **shown,
+            }
+            return self._put(json.dumps(line).encode() + b"\n", picture)
         except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")
             self._look_s = float("inf")
             return False
 
-    def _pace(self) -> dict[str, float | None]:
-        since_s = self._ticks[-1][0] - self._ticks[0][0] if self._ticks else 0.0
-        most_ms = max((late_ms for _, late_ms in self._ticks), default=None)
-        return {"hz": (len(self._ticks) - 1) / since_s if since_s > 0 else None, "late_most_ms": most_ms}
-
-    def _pins(self, tick: Tick | None, link: ServoLink | None) -> dict[str, Any]:
-        if tick:
-            why = REASONS.get(tick.reason, "")
-            return {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state, "why": why}
-        with contextlib.suppress(RoverError):  # whoever needs the link reports that it is gone
-            if link and (telemetry := link.latest()):
-                missing = "" if telemetry.missing == "-" else link.remedy(telemetry.missing)
-                pins = [telemetry.steering_us, telemetry.throttle_us]
-                why = REASONS.get(telemetry.reason, "")
-                return {"pins": pins, "who": telemetry.state.value, "why": why, "missing": missing}
-        return {"pins": None, "who": "", "why": ""}
-
-    def _picture(self, camera: Camera | None) -> tuple[dict[str, Any], bytes]:
+    def _picture(self, camera: Camera) -> tuple[dict[str, Any], bytes]:
         frame: Frame | None = None
         with contextlib.suppress(RoverError):  # whoever needs the camera reports that it is gone
-            frame = camera.latest() if camera else None
+            frame = camera.latest()
         if frame is None:
             return {}, b""
         height, width = frame.image.shape[:2]
@@ -204,20 +190,14 @@ class Feed:
         image = frame.image[::every, ::every]
         return shown | {"shape": image.shape}, image.tobytes()
 
-    def _send(self, message: dict[str, Any], picture: bytes) -> bool:
-        wire = self._socket
-        if wire is None:
-            return False
-        line = json.dumps(message).encode() + b"\n"
+    def _put(self, line: bytes, picture: bytes) -> bool:
+        """Give the view a message unless it has not read the previous one. Never waits."""
         try:
-            (unread,) = struct.unpack("i", fcntl.ioctl(wire, termios.TIOCOUTQ, bytes(4)))
-            if unread:  # the view has not read the previous one
-                raise BlockingIOError
-            wire.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+            if self._socket and not struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]:
+                self._socket.send(line + picture if len(line) + len(picture) < MOST_BYTES else line)
+                return True
         except BlockingIOError:
-            self.dropped += 1
-            return False
+            pass
         except OSError:
             self._lost("the view is gone")
-            return False
-        return True
+        return False

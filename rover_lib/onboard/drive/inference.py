@@ -9,17 +9,15 @@ The policy has a process of its own, so that it cannot delay the control loop, a
 
 import contextlib
 import ctypes
-import json
+import multiprocessing
 import os
 import signal
-import struct
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing import Pipe
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +38,7 @@ END_S = 1.0
 NICE = 5  # the control loop goes first
 PR_SET_PDEATHSIG = 1
 ANSWER_BYTES = 100_000
-_REQUEST = struct.Struct("<IIff")  # height, width, state
+TERMINALS = {signal.SIGINT, signal.SIGHUP, signal.SIGQUIT}  # signals of a terminal to all its programs
 
 Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (2,) -> (chunk, 2)
 
@@ -50,7 +48,7 @@ class Planner:
 
     predict: returns (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: actions per
     second of a plan. rest_s: pause after each plan, except in without_rest(), so that a standing car does not get warm.
-    limits: of the actions, see Plan.
+    latency_s: the least time that a plan takes, for comparisons. limits: of the actions, see Plan.
     """
 
     def __init__(
@@ -61,12 +59,12 @@ class Planner:
         rate_hz: float,
         *,
         rest_s: float = 0.0,
+        latency_s: float = 0.0,
         limits: np.ndarray = LIMITS,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._limits = limits
         self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
-        self._rest_s, self._clock = rest_s, clock
+        self._rest_s, self._latency_s, self._limits, self._clock = rest_s, latency_s, limits, clock
         self._closing = threading.Event()
         self._no_rest = threading.Event()
         self._news = threading.Condition()
@@ -134,8 +132,9 @@ class Planner:
                     continue
                 frame_number = frame.number
                 state = self._commanded.state(frame.captured_s, self._rate_hz)
-                self._asked_s = self._clock()
+                asked_s = self._asked_s = self._clock()
                 actions = self._predict(frame.image, state)
+                time.sleep(max(0.0, asked_s + self._latency_s - self._clock()))
                 self._asked_s = None
                 number += 1
                 plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits)
@@ -158,15 +157,15 @@ class PolicyProcess:
     (measured on a workstation at commit 7343b87, which could do both).
 
     artifact: a file, or an open Artifact whose manifest need not be read again. threads: of the engine; None: all cores
-    but one, which is left for the loop. Raises PolicyError, with the sentence
-    of the ArtifactError, if the artifact cannot be used here.
+    but one, which is left for the loop. Raises PolicyError, with the sentence of the ArtifactError, if the artifact
+    cannot be used here.
 
-    The artifact is not trusted. So the process is confined (see confine.py), and its answers are accepted only if they
-    have the shape that the manifest gives, which is read in this process. unconfined: why the kernel cannot confine the
-    process, "" if it does.
+    The artifact is not trusted. So the process is confined (see confine.py), and nothing that it sends is unpickled:
+    its answers are accepted only if they have the shape that the manifest gives, which is read in this process.
+    unconfined: why the kernel cannot confine the process, "" if it does.
     """
 
-    program = __name__  # the module that the process runs
+    loaded: Callable[[Any], None] | None = None  # called with the loaded policy; the laboratory makes it misbehave
 
     def __init__(self, artifact: Path | str | Artifact, *, threads: int | None = None):
         self._source = artifact
@@ -174,7 +173,7 @@ class PolicyProcess:
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
         self.unconfined = ""
-        self._process: subprocess.Popen | None = None
+        self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
         self._closing = threading.Event()
 
@@ -184,15 +183,14 @@ class PolicyProcess:
             self.manifest = given.manifest if isinstance(given, Artifact) else read_manifest(given)
         except ArtifactError as error:
             raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
-        ours, theirs = Pipe()
-        command = [sys.executable, "-m", self.program, str(theirs.fileno()), str(self.artifact), str(self.threads)]
-        # A session of its own, so that the terminal's Ctrl-C comes to the loop alone, which stops the car first.
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True
-        )
-        theirs.close()
-        self._pipe = ours
+        spawn = multiprocessing.get_context("spawn")
+        self._pipe, theirs = spawn.Pipe()
+        arguments = theirs, str(self.artifact), self.threads, type(self).loaded
+        self._process = spawn.Process(target=serve, args=arguments, name="policy", daemon=True)
         try:
+            with _blocked(TERMINALS):  # it inherits this: Ctrl-C comes to the loop alone, which stops the car first
+                self._process.start()
+            theirs.close()
             self.unconfined = self._answer(LOAD_S).decode(errors="replace")
         except BaseException:
             self.close()
@@ -205,16 +203,13 @@ class PolicyProcess:
     def close(self) -> None:
         """End the process, whatever it is doing."""
         self._closing.set()
-        if self._process:
+        if self._process and self._process.pid:
             self._process.terminate()
-            try:
-                self._process.wait(END_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+            self._process.join(END_S)
+            self._process.kill()
+            self._process.join()
         if self._pipe:
-            with contextlib.suppress(OSError):
-                self._pipe.close()
+            self._pipe.close()
 
     @property
     def rate_hz(self) -> float:
@@ -229,127 +224,111 @@ class PolicyProcess:
     @property
     def pids(self) -> tuple[int, ...]:
         """The id of the policy's process; empty if none runs."""
-        return (self._process.pid,) if self._process else ()
+        return (self._process.pid,) if self._process and self._process.pid else ()
 
     def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Return (chunk, 2) float32 as Policy.predict_unclipped() does, for one camera. close() ends the wait for it.
 
         Raises PolicyError with the policy's own error, or if its process has ended.
         """
-        pipe, frame = self._open_pipe(), np.ascontiguousarray(frame_bgr)
+        if self._pipe is None:
+            raise PolicyError(f"{self.artifact}: its process was not started", remedy="use it in a `with` statement")
+        frame = np.ascontiguousarray(frame_bgr)
         try:
-            pipe.send_bytes(_REQUEST.pack(*frame.shape[:2], *map(float, state)))
-            pipe.send_bytes(frame.data.cast("B"))
+            self._pipe.send((frame.shape, [float(value) for value in state]))
+            self._pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
         answer = np.frombuffer(self._answer(None), np.uint8)
         if answer.size != 4 * 2 * self.chunk:
-            raise PolicyError(f"{self.artifact}: {answer.size} bytes are no plan of {self.chunk} actions")
+            raise PolicyError(f"{self.artifact}: unexpected size of a plan", found=f"{answer.size} bytes")
         return answer.view(np.float32).reshape(self.chunk, 2)
 
-    def _open_pipe(self) -> Connection:
-        if self._pipe is None:
-            raise PolicyError(
-                f"{self.artifact}: its process was not started", remedy="use it as `with PolicyProcess(...) as policy:`"
-            )
-        return self._pipe
-
     def _answer(self, timeout_s: float | None) -> bytes:
-        pipe = self._open_pipe()
+        assert self._pipe, "it is open"
         end = None if timeout_s is None else time.monotonic() + timeout_s
         try:
-            while not pipe.poll(POLL_S):
+            while not self._pipe.poll(POLL_S):
                 if self._closing.is_set():
                     raise PolicyError(f"{self.artifact}: the policy was closed")
                 if end and time.monotonic() > end:
-                    raise PolicyError(
-                        f"{self.artifact}: not loaded within {timeout_s:g} s", remedy="is the memory full?"
-                    )
-            answer = pipe.recv_bytes(ANSWER_BYTES)
+                    what = f"{self.artifact}: not loaded within {timeout_s:g} s"
+                    raise PolicyError(what, remedy="is the memory full?")
+            answer = self._pipe.recv_bytes(ANSWER_BYTES)
         except (EOFError, OSError) as error:
             raise self._ended() from error
         if answer[:1] == b"!":
-            raise PolicyError(**json.loads(answer[1:]))
+            raise PolicyError(answer[1:].decode(errors="replace"))
         return answer[1:]
 
     def _ended(self) -> PolicyError:
-        code = None
-        if self._process:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                code = self._process.wait(END_S)
+        assert self._process, "it was started"
+        self._process.join(END_S)
+        code = self._process.exitcode
         how = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
         return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
 
 
-def delay(predict: Predict, latency_s: float) -> Predict:
-    """Return a `predict` whose answers take at least latency_s each."""
-
-    def predict_delayed(frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        end = time.monotonic() + latency_s
-        try:
-            return predict(frame_bgr, state)
-        finally:
-            time.sleep(max(0.0, end - time.monotonic()))
-
-    return predict_delayed
-
-
-def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] = lambda policy: None) -> None:
+def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] | None) -> None:
     """Run the policy's process: answer each request until the other side closes the pipe.
 
-    An answer is "=" and bytes, or "!" and the fields of an error as JSON. The bytes of the first answer say why the
-    process is not confined, those of all others are chunks. loaded: called with the loaded policy; used by the
-    laboratory to make policies misbehave.
+    An answer is "=" and bytes, or "!" and an error's sentence. The bytes of the first answer say why the
+    process is not confined, those of all others are chunks.
     """
-    with contextlib.suppress(EOFError, OSError):
-        try:
-            # Here, because the process that drives must load no engine; and before the limits, which an engine exceeds.
-            from rover_lib.onboard.policy.load import import_engine, load_policy
-
-            with Artifact(artifact) as opened:
-                unconfined = UNCONFINED.get(import_engine(opened)) or confine(memory_mb(artifact, threads))
-                policy = load_policy(opened, threads=threads)
-            names = list(policy.state_names), list(policy.action_names)
-            if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
-                raise PolicyError(
-                    f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
-                    remedy="this car has one camera, steering and throttle, by these names (quantize: --action-names)",
-                )
-            loaded(policy)
-            forbid_opening()
-        except RoverError as error:
-            return pipe.send_bytes(_refusal(error))
-        except Exception as error:
-            what = f"{artifact}: cannot be loaded ({type(error).__name__}: {error})"
-            return pipe.send_bytes(_refusal(PolicyError(what)))
-        pipe.send_bytes(b"=" + unconfined.encode())
-        while True:
-            height, width, *state = _REQUEST.unpack(pipe.recv_bytes())
-            frame = np.frombuffer(pipe.recv_bytes(), np.uint8).reshape(height, width, 3)
-            try:
-                chunk = policy.predict_unclipped(frame, np.array(state, np.float32))
-            except RoverError as error:
-                pipe.send_bytes(_refusal(error))
-            except Exception as error:
-                what = " ".join(str(error).split())[-300:]
-                failed = PolicyError(f"{artifact}: inference failed ({type(error).__name__}: {what})")
-                pipe.send_bytes(_refusal(failed))
-            else:
-                pipe.send_bytes(b"=" + np.ascontiguousarray(chunk, np.float32).tobytes())
-
-
-def _refusal(error: RoverError) -> bytes:
-    found = None if error.found is None else str(error.found)
-    return b"!" + json.dumps({"what": error.what, "found": found, "remedy": error.remedy}).encode()
-
-
-def main(arguments: list[str], loaded: Callable[[Any], None] = lambda policy: None) -> None:
-    """Run as the program that PolicyProcess starts. arguments: its pipe, artifact and threads. loaded: see serve()."""
-    fd, artifact, threads = arguments
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)
-    serve(Connection(int(fd)), artifact, int(threads), loaded)
+    with contextlib.suppress(EOFError, OSError):
+        try:
+            policy, unconfined = _load_confined(artifact, threads)
+            if loaded:
+                loaded(policy)
+            forbid_opening()
+        except Exception as error:
+            return pipe.send_bytes(_refusal(f"{artifact}: cannot be loaded", error))
+        pipe.send_bytes(b"=" + unconfined.encode())
+        while True:
+            shape, state = pipe.recv()
+            frame = np.frombuffer(pipe.recv_bytes(), np.uint8).reshape(shape)
+            try:
+                chunk = policy.predict_unclipped(frame, np.array(state, np.float32))
+                answer = b"=" + np.ascontiguousarray(chunk, np.float32).tobytes()
+            except Exception as error:
+                answer = _refusal(f"{artifact}: inference failed", error)
+            pipe.send_bytes(answer)
 
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
+def _load_confined(artifact: str, threads: int) -> tuple[Any, str]:
+    """Confine this process, and load a policy in it; return it, and why the process is not confined. Raises RoverError.
+
+    Engines are imported here, because the process that drives must load none, and before the limit of memory, which an
+    engine exceeds.
+    """
+    from rover_lib.onboard.policy.load import import_engine, load_policy
+
+    with Artifact(artifact) as opened:
+        unconfined = UNCONFINED.get(import_engine(opened)) or confine(memory_mb(artifact, threads))
+        policy = load_policy(opened, threads=threads)
+    names = list(policy.state_names), list(policy.action_names)
+    if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
+        raise PolicyError(
+            f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
+            remedy="this car has one camera, steering and throttle, by these names (quantize: --action-names)",
+        )
+    return policy, unconfined
+
+
+def _refusal(what: str, error: Exception) -> bytes:
+    """Return an error as an answer: a RoverError's own sentence, or `what` and what was unexpected."""
+    text = str(error) if isinstance(error, RoverError) else f"{what} ({type(error).__name__}: {str(error)[-300:]})"
+    return b"!" + " ".join(text.split()).encode()
+
+
+@contextlib.contextmanager
+def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
+    """Inside this context, signals wait until its end, except for processes that are started in it: they get none."""
+    resource_tracker.ensure_running()  # or multiprocessing would start it here, and unblock SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

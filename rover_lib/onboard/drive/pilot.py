@@ -1,4 +1,4 @@
-"""Pilots say what to send at each tick of the control loop: by a policy's plans, or by a recording's pulses."""
+"""A pilot says what to send at each tick of the control loop: here, by a policy's plans."""
 
 import threading
 import time
@@ -6,14 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
 from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError
-from rover_lib.onboard.recording.episode import Controls
 
 FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees
@@ -24,9 +21,7 @@ BEGINS_S = 0.12
 LATE_FRAME_S = 0.2  # six frames of a camera
 CUT = 0.005  # of throttle; less is rounding and blending
 CAP = "is there a cap or dirt on the lens?"
-SLACK_S = 0.002  # a control that is due this much later belongs to this tick: recordings have about the ticks' rate
-HOLE_S = 0.3  # a gap between measured pulses after which a replay stops the car
-LAST_S = 0.1  # how long a replay's last pulses are held
+HOLE_S = 0.3  # a gap between actions after which another episode has begun
 
 
 @dataclass(frozen=True)
@@ -199,42 +194,3 @@ def blank(frame: Frame, settings: Settings) -> CameraError | None:
     if frame.contrast < settings.flat_level:
         return CameraError(f"nothing is on the camera's picture (contrast {frame.contrast:.1f} of 255)", remedy=CAP)
     return None
-
-
-class ReplayPilot:
-    """Sends a recording's pulses at the times at which they were recorded, without a policy or a camera.
-
-    throttle_limit: the largest throttle, forwards or backwards, in [0, 1]. Pulses outside the range that the Arduino
-    takes are clipped to it.
-    """
-
-    def __init__(self, controls: Controls, *, throttle_limit: float = 1.0, calibration: PwmCalibration | None = None):
-        c = calibration or PwmCalibration()
-        self._calibration = c
-        self._times = np.asarray(controls.times_s)
-        ends = [
-            c.throttle.pulse_us(a) for a in (max(c.throttle.low, -throttle_limit), min(c.throttle.high, throttle_limit))
-        ]
-        self._steering = np.clip(controls.steering_us, *c.steering.ends_us)
-        self._throttle = np.clip(controls.throttle_us, min(ends), max(ends))
-        actions = [c.throttle.action(int(us)) or 0.0 for us in (self._throttle.min(), self._throttle.max())]
-        self.most_throttle = max(map(abs, actions))
-        self._start_s: float | None = None
-
-    def ready(self, stop: threading.Event) -> None:
-        pass
-
-    def order(self, now_s: float) -> Order | None:
-        if self._start_s is None:
-            self._start_s = now_s
-        i = int(np.searchsorted(self._times, now_s - self._start_s + SLACK_S, side="right")) - 1
-        if i >= len(self._times) - 1 and now_s - self._start_s > self._times[-1] + LAST_S:
-            return None
-        steering_us, throttle_us = int(self._steering[max(i, 0)]), int(self._throttle[max(i, 0)])
-        if now_s - self._start_s - self._times[max(i, 0)] > HOLE_S:  # nobody knows what the human did meanwhile
-            throttle_us = self._calibration.throttle.neutral_us
-        actions = self._calibration.actions_from_pulses(steering_us, throttle_us)
-        return Order(actions.steering or 0.0, actions.throttle or 0.0, steering_us, throttle_us)
-
-    def sent(self, at_s: float, order: Order) -> None:
-        pass

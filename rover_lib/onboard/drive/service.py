@@ -14,7 +14,7 @@ recorded, nobody can arm the car. A permanent fault (the camera or the port is g
 again, disarmed.
 
 A drive ends after the service's --max-seconds, or earlier if the request says so. A request from another machine also
-promises heartbeats: if no `rover heartbeat` comes within the time that the request gives, the drive ends.
+promises heartbeats: if no `rover arm-car --heartbeat` comes within the time that the request gives, the drive ends.
 
 While disarmed, nothing has to be fast: the service has ordinary priority and one plan per second. Before the Arduino is
 asked to arm, it switches to real-time priority and full rate, and the car starts with a fresh plan.

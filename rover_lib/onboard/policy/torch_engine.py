@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from rover_lib.onboard.artifact.manifest import Artifact
-from rover_lib.onboard.artifact.torchscript import unknown_operators
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_packed_weights
 
@@ -41,8 +40,8 @@ class TorchEngine:
 def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     """Load an artifact.
 
-    Raises ArtifactError if it was made with another torch, needs a quantization engine that this torch lacks, cannot be
-    loaded, or has an operator that no artifact has.
+    Raises ArtifactError if it was made with another torch, needs a quantization engine that this torch lacks, or cannot
+    be loaded.
     """
     path, manifest = artifact.path, artifact.manifest
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
@@ -71,10 +70,4 @@ def load(artifact: Artifact, threads: int | None) -> TorchEngine:
         raise ArtifactError(
             f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
         ) from None
-    if unknown := unknown_operators(module.graph):
-        raise ArtifactError(
-            f"{path}: its program has operators that no artifact has",
-            found=", ".join(unknown)[:200],
-            remedy="do not load it; quantize again",
-        )
     return TorchEngine(module)

@@ -36,15 +36,9 @@ from rover_lib.onboard.stage import atomic_path, open_plain, plain, read_plain
 
 CHANNELS = ("steering", "throttle")
 CONTROL_FIELDS = (
-    "arduino_timestamp",
-    "system_timestamp",
-    "steering_normalized",
-    "throttle_normalized",
-    "steering_raw_us",
-    "throttle_raw_us",
-    "steering_period_us",
-    "throttle_period_us",
-)
+    "arduino_timestamp", "system_timestamp", "steering_normalized", "throttle_normalized", "steering_raw_us",
+    "throttle_raw_us", "steering_period_us", "throttle_period_us",
+)  # fmt: skip
 FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 # Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, and the car was in neutral.
@@ -193,9 +187,7 @@ class EpisodeWriter:
                 row[flag] = action is not None
         if extra:
             if taken := extra.keys() & {*CONTROL_FIELDS, *FLAG_FIELDS}:
-                raise EpisodeError(
-                    f"{self.folder.name}: {min(taken)} is no further column", remedy="give it another name"
-                )
+                raise EpisodeError(f"{self.folder.name}: column {min(taken)} is taken", remedy="give it another name")
             row |= plain(extra)
             self._extra |= dict.fromkeys(extra)
         self._append("control", row, row["system_timestamp"])
@@ -210,16 +202,13 @@ class EpisodeWriter:
         shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
         if not isinstance(frame_bgr, np.ndarray) or frame_bgr.shape != shape or frame_bgr.dtype != np.uint8:
             found = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
-            raise EpisodeError(
-                f"{self.folder.name}: frames must be uint8 {shape}", found=found, remedy="check the camera"
-            )
+            what = f"{self.folder.name}: frames must be uint8 {shape}"
+            raise EpisodeError(what, found=found, remedy="check the camera")
         number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
         ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         if not ok:
-            raise EpisodeError(
-                f"{self.folder.name}: frame {number} could not be written as JPEG", remedy="check the camera"
-            )
+            raise EpisodeError(f"{self.folder.name}: frame {number} is not JPEG", remedy="check the camera")
         picture = temporary / relative
         try:
             with self._disk():
@@ -267,9 +256,8 @@ class EpisodeWriter:
         try:
             line = json.dumps(row, allow_nan=False).encode() + b"\n"
         except (TypeError, ValueError) as e:
-            raise EpisodeError(
-                f"{self.folder.name}: a column cannot be written ({e})", remedy="give numbers or text"
-            ) from None
+            what = f"{self.folder.name}: a column cannot be written ({e})"
+            raise EpisodeError(what, remedy="give numbers or text") from None
         with self._disk():
             file = self._rows[kind]
             if (written := file.write(line)) < len(line):
@@ -303,24 +291,19 @@ class EpisodeWriter:
         except (TypeError, ValueError, OverflowError):
             found = math.nan
         if not math.isfinite(found):
-            raise EpisodeError(
-                f"{self.folder.name}: a time must be finite seconds", found=f"{t_s!r}", remedy="check the clock"
-            )
+            raise EpisodeError(f"{self.folder.name}: a time must be finite seconds", found=repr(t_s))
         return found
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeExists(
-                f"{self.folder}: exists already", remedy="name another folder, or move this one away first"
-            )
+            raise EpisodeExists(f"{self.folder}: exists already", remedy="name another folder, or move it away first")
 
     def _write(self, temporary: Path) -> None:
         """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
-            raise EpisodeError(
-                f"{self.folder.name}: {self.controls} controls and {self.frames} frames are no episode",
-                remedy="check that the camera and the Arduino deliver",
-            )
+            found = f"{self.controls} controls and {self.frames} frames"
+            remedy = "check that the camera and the Arduino deliver"
+            raise EpisodeError(f"{self.folder.name}: too little for an episode", found=found, remedy=remedy)
         for file in self._rows.values():
             file.close()
         about = self.about

@@ -291,8 +291,8 @@ def record(
                     lambda: f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames", status
                 )
             )
-            _log.addHandler(line.handler)
-            stack.callback(_log.removeHandler, line.handler)
+            _log.addHandler(line)
+            stack.callback(_log.removeHandler, line)
         tick = 0
         while not stop.is_set() and recorder.failure is None:
             now = clock()

@@ -33,6 +33,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
 
@@ -45,14 +46,10 @@ from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
-PAGES = 32
-CONNECTIONS = 2 * PAGES  # at a time, of all browsers; a peer may have three quarters of them
-REQUEST_S = 5.0  # a connection that is no page's by then is closed
 ACCEPT_AGAIN_S = 0.5
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
-HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]{1,253})(:\d{1,5})?", re.ASCII)
 ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulation
 SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
@@ -81,7 +78,6 @@ class Address:
                 wire.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, self.interface.encode() + b"\0")
             wire.bind(("0.0.0.0" if self.interface else "127.0.0.1", self.port))
             wire.listen(64)
-            wire.setblocking(False)
         except OSError as error:
             wire.close()
             remedy = "is another view open, or choose another --web-port"
@@ -98,10 +94,10 @@ class Address:
         make an address lead elsewhere. A name must be this machine's: the owner of another name could make it lead
         here, and the browser would take their page for ours.
         """
-        match = HOST.fullmatch(host)
-        if not match:
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
             return False
-        name = match[1].strip("[]").lower()
         with contextlib.suppress(ValueError):
             return ipaddress.ip_address(name).is_loopback or bool(self.interface)
         own = socket.gethostname().lower()
@@ -127,11 +123,10 @@ def read_token(path: Path) -> str:
 class View:
     """The web server of the view.
 
-    address: where browsers reach it. place: the socket to which drives connect; None if something else is shown.
-    drive_user: another user whose drives are accepted, besides this user's and root's. replay: whether a past drive is
-    shown. car: the car whose drives are shown; None means this machine's. ask: takes what a simulation's page asks for;
-    None for a car, whose page can only stop it. Raises ViewError for an unknown user, and CarError and ParamsError like
-    this_car() and CarShape.of().
+    address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
+    drive_user: another user whose drives are accepted, besides this user's and root's. car: the car whose drives are
+    shown; None means this machine's. ask: takes what a simulation's page asks for; None for a car, whose page can only
+    stop it. Raises ViewError for an unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
     def __init__(
@@ -140,11 +135,10 @@ class View:
         token: str,
         place: Path | None = None,
         drive_user: str | None = None,
-        replay: bool = False,
         car: Car | None = None,
         ask: Callable[[str], object] | None = None,
     ):
-        self._address, self._token, self._place, self._replay, self._ask = address, token, place, replay, ask
+        self._address, self._token, self._place, self._ask = address, token, place, ask
         self._users = {0, os.geteuid()}
         if drive_user:
             try:
@@ -156,12 +150,9 @@ class View:
         self._shape, self._pwm = CarShape.of(car), car.pwm
         self._drives: list[socket.socket] = []  # the last one, the newest, is shown
         self._number = 0
-        self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet", "replay": replay}
+        self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet"}
         self._picture = b""
         self._news = asyncio.Event()
-        self._pages = 0
-        self._browsers: dict[asyncio.BaseTransport, str] = {}  # open connections and their peers, the oldest first
-        self._talking: set[asyncio.BaseTransport] = set()  # those of pages
         self._html = PAGE.read_bytes()
 
     async def run(
@@ -203,7 +194,7 @@ class View:
             stack.push_async_callback(_end, asyncio.create_task(self._accept(drives)))
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        stack.push_async_callback(_end, asyncio.create_task(self._admit(wire, runner.server)))
+        await web.SockSite(runner, wire).start()
         name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
@@ -219,13 +210,13 @@ class View:
             actions = from_now(plan, head["sent_s"])
             ribbon = [tuple(p) for p in self._shape.ribbon(actions, 1 / plan["rate_hz"], width / height)]
         means = throttled_means((head.get("machine") or {}).get("throttled"))
+        channels = self._pwm.steering, self._pwm.throttle
         head |= {
             "n": self._number,
             "ribbon": ribbon,
             "left": self._shape.left,
-            "replay": self._replay,
             "pins": pins,
-            "pins_actions": self._actions(pins),
+            "pins_actions": pins and [c.action(us) or 0.0 for c, us in zip(channels, pins, strict=True)],
             "stopped": pins is not None and abs(pins[1] - self._pwm.throttle.neutral_us) <= ARDUINO_STEP_US,
             "throttled": ", ".join(means) if means else "",
         }
@@ -235,22 +226,15 @@ class View:
 
     def stop(self, who: str) -> int:
         """Ask each drive to stop, and return how many were asked. who: the IP address that asks."""
-        asked = 0
         if self._ask:
             self._ask("stop")
             return 1
+        asked = 0
         for drive in tuple(self._drives):
             with contextlib.suppress(OSError):  # this drive no longer reads
                 drive.send(f"stop {who}".encode())
                 asked += 1
         return asked
-
-    def _actions(self, pins: list[Any] | None) -> list[float] | None:
-        """Return the actions that the pins' pulses stand for."""
-        if not pins:
-            return None
-        channels = self._pwm.steering, self._pwm.throttle
-        return [channel.action(us) or 0.0 for channel, us in zip(channels, pins, strict=True)]
 
     # ---- drives
 
@@ -261,7 +245,7 @@ class View:
             if is_listened_at(place):
                 raise ViewError(f"{place}: another view listens there", remedy="end that one first")
             if place.exists() and not place.is_socket():
-                raise ViewError(f"{place}: is there, and is no socket", remedy="name another with --feed")
+                raise ViewError(f"{place}: not a socket", remedy="name another with --feed")
             place.unlink(missing_ok=True)  # left by a view that was killed
             wire.bind(str(place))
             place.chmod(0o666 if self._open_to_all else 0o600)
@@ -309,43 +293,10 @@ class View:
             drive.close()
             if shown and phase != "ended":
                 text = "the drive has gone without a word; what the car does is not known"
-                self.show(
-                    {**self._head, "phase": GONE, "text": text, "tick": None, "pins": None, "who": ""}, self._picture
-                )
+                gone = {"phase": GONE, "text": text, "tick": None, "pins": None, "who": ""}
+                self.show({**self._head, **gone}, self._picture)
 
     # ---- browsers
-
-    async def _admit(self, wire: socket.socket, server: Any) -> None:
-        """Accept browsers, but from nobody so many that others find no place. Runs until it is cancelled."""
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                browser, (peer, _) = await loop.sock_accept(wire)
-                if self._make_room(peer):
-                    transport, _ = await loop.connect_accepted_socket(server, browser)
-                    self._browsers[transport] = peer
-                    loop.call_later(REQUEST_S, self._drop, transport)
-                else:
-                    browser.close()
-            except OSError:  # no file descriptor is free, or the browser has gone again
-                await asyncio.sleep(ACCEPT_AGAIN_S)
-
-    def _make_room(self, peer: str) -> bool:
-        """Close connections that are no page's, the oldest first, until another of that peer may come."""
-        self._browsers = {t: p for t, p in self._browsers.items() if not t.is_closing()}
-        for limit, who in ((CONNECTIONS * 3 // 4, {peer}), (CONNECTIONS, {*self._browsers.values()})):
-            theirs = [t for t, p in self._browsers.items() if p in who]
-            if len(theirs) < limit:
-                continue
-            if not (idle := [t for t in theirs if t not in self._talking]):
-                return False
-            self._drop(idle[0])
-        return True
-
-    def _drop(self, transport: Any) -> None:
-        if transport not in self._talking:
-            transport.abort()
-            self._browsers.pop(transport, None)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
@@ -356,9 +307,9 @@ class View:
         return await handler(request)
 
     async def _give_page(self, request: web.Request) -> web.Response:
-        style, script = (base64.b64encode(hashlib.sha256(part).digest()).decode() for part in _parts(self._html))
+        style, script = (_digest_of(tag, self._html) for tag in (b"style", b"script"))
         headers = {
-            "Content-Security-Policy": f"default-src 'none'; style-src 'sha256-{style}'; script-src 'sha256-{script}'; "
+            "Content-Security-Policy": f"default-src 'none'; style-src '{style}'; script-src '{script}'; "
             f"img-src blob:; connect-src ws://{request.host}; frame-ancestors 'none'; base-uri 'none'",
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
@@ -369,32 +320,23 @@ class View:
     async def _talk(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Origin") != f"http://{request.host}":
             return _refuse("only the view's own page may ask this")
-        if self._pages >= PAGES:
-            return web.Response(status=503, text=f"{PAGES} pages are open already\n")
         page = _Page()
         wire = web.WebSocketResponse(heartbeat=BEAT_S, max_msg_size=64, compress=False)
-        self._pages += 1
-        transport: Any = request.transport
+        await wire.prepare(request)
+        sending = asyncio.create_task(self._send(wire, page))
         try:
-            self._talking.add(transport)
-            await wire.prepare(request)
-            sending = asyncio.create_task(self._send(wire, page))
-            try:
-                async for message in wire:
-                    if message.type != WSMsgType.TEXT:
-                        break
-                    if message.data == "stop":
-                        count = self.stop(request.remote or "0.0.0.0")
-                        await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
-                    elif shown := SHOWN.fullmatch(message.data):
-                        page.was_shown(int(shown[1]))
-                    elif self._ask and (asked := ASKED.fullmatch(message.data)):
-                        self._ask(asked[1])
-            finally:
-                await _end(sending)
+            async for message in wire:
+                if message.type != WSMsgType.TEXT:
+                    break
+                if message.data == "stop":
+                    count = self.stop(request.remote or "0.0.0.0")
+                    await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
+                elif shown := SHOWN.fullmatch(message.data):
+                    page.was_shown(int(shown[1]))
+                elif self._ask and (asked := ASKED.fullmatch(message.data)):
+                    self._ask(asked[1])
         finally:
-            self._pages -= 1
-            self._talking.discard(transport)
+            await _end(sending)
         return wire
 
     async def _send(self, wire: web.WebSocketResponse, page: "_Page") -> None:
@@ -410,11 +352,9 @@ class View:
 
 
 class _Page:
-    """The state of one page.
+    """One page. sent: number of the last message. showing: set while the page shows it. captured_s: of its picture.
 
-    sent: number of the last message. captured_s: when its picture was captured. delay_ms: time from the capture of the
-    last picture that the page showed until it said so; None if unknown. showing: set while the page shows the last
-    message.
+    delay_ms: time from the capture of the last picture that the page showed until it said so; None if unknown.
     """
 
     def __init__(self) -> None:
@@ -429,11 +369,11 @@ class _Page:
             self.showing.set()
 
 
-def _parts(html: bytes) -> tuple[bytes, bytes]:
-    """Return the page's style and script; the browser may apply and run no others."""
-    style, script = (re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S) for tag in (b"style", b"script"))
-    assert style and script, "view.html has one of each"
-    return style[1], script[1]
+def _digest_of(tag: bytes, html: bytes) -> str:
+    """Return the digest of the page's style or script; the browser may apply and run no others."""
+    part = re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S)
+    assert part, "view.html has one of each"
+    return f"sha256-{base64.b64encode(hashlib.sha256(part[1]).digest()).decode()}"
 
 
 def _refuse(why: str) -> web.Response:

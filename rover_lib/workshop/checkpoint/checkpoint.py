@@ -1,7 +1,6 @@
 """Read a checkpoint, the trainer's best_model.pth or what `lerobot-train` leaves, and check it before it is used.
 
-Nothing in a file is ever executed, and nothing is built to a size that a file merely claims. `trainer_checkpoint` and
-`lerobot_checkpoint` read the two formats.
+Nothing in a file is ever executed. `trainer` and `lerobot` read the two formats.
 """
 
 import hashlib
@@ -18,9 +17,10 @@ from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.kinds import refuse_holder, refuse_part
+from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import CORRECT_IT, TWO_ACTIONS, Contents, expected_shapes, tensor_bytes
+from rover_lib.workshop.checkpoint.contents import TWO_ACTIONS, check_weights, tensor_bytes
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer
 from rover_lib.workshop.recordings.samples import Layout
@@ -66,15 +66,10 @@ class Checkpoint:
             raise CheckpointError(
                 f"{self.path}: has {len(self.config.cameras)} cameras", remedy="another size is only known for one"
             )
-        if not all(map(is_whole, (height, width))):
+        if not all(is_whole(side, FEATURE_PX) for side in (height, width)):
             raise CheckpointError(
-                "an image size must be two whole numbers",
-                found=f"{quote(height)} and {quote(width)}",
-                remedy="give height and width in pixels",
-            )
-        if min(height, width) < FEATURE_PX:
-            raise CheckpointError(
-                f"an image of {width}x{height} is smaller than one feature of the backbone",
+                "an image size is two whole numbers of pixels, neither smaller than one feature of the backbone",
+                found=f"{quote(width)}x{quote(height)}",
                 remedy=f"use at least {FEATURE_PX}",
             )
         ((trained_height, trained_width),) = self.config.image_sizes
@@ -97,42 +92,44 @@ class Checkpoint:
         Raises CheckpointError if the policy's number of cameras, states or actions is not the recordings', and, for the
         trainer's files and ours, if the recordings have another rate or other names.
         """
-        c, rate_hz = self.config, layout.rate_hz
+        c = self.config
         has = len(c.cameras), len(c.state_names) if c.sees_state else 0, len(c.action_names)
-        recorded = len(layout.cameras), len(layout.state_names), len(layout.action_names)
-        if has != (recorded if c.sees_state else (recorded[0], 0, recorded[2])):
+        recorded = len(layout.cameras), len(layout.state_names) if c.sees_state else 0, len(layout.action_names)
+        if has != recorded:
             raise CheckpointError(
                 f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}",
                 found=f"recordings of {', '.join(map(str, recorded))}",
                 remedy="give the dataset that it was trained on",
             )
-        if rate_hz is None:  # our own recordings
+        if layout.rate_hz is None:  # our own recordings
             return self
-        if self.format != "lerobot" or self.report["written_here"]:
-            if rate_hz != c.rate_hz:
+        if self.format == "lerobot" and not self.report["written_here"]:
+            return self._reordered(layout, layout.rate_hz)
+        if layout.rate_hz != c.rate_hz:
+            raise CheckpointError(
+                f"{self.path}: plans {c.rate_hz:g} steps a second",
+                found=f"recordings of {layout.rate_hz:g} frames a second",
+                remedy="give recordings of that rate",
+            )
+        numbers = (("state", c.state_names, layout.state_names), ("action", c.action_names, layout.action_names))
+        for what, own, theirs in numbers[not c.sees_state :]:
+            if own == TWO_ACTIONS != theirs:
                 raise CheckpointError(
-                    f"{self.path}: plans {c.rate_hz:g} steps a second",
-                    found=f"recordings of {rate_hz:g} frames a second",
-                    remedy="give recordings of that rate",
+                    f"{self.path}: a policy whose {what} is {quote_all(own)}",
+                    found=f"recordings whose {what} is {quote_all(theirs)}",
+                    remedy=f"if they are the same, rename the {what} in the dataset's meta/info.json, or say so in the "
+                    "order of the recordings' actions: --action-names",
                 )
-            numbers = (("state", c.state_names, layout.state_names), ("action", c.action_names, layout.action_names))
-            for what, own, theirs in numbers[not c.sees_state :]:
-                if own == TWO_ACTIONS != theirs:
-                    raise CheckpointError(
-                        f"{self.path}: a policy whose {what} is {quote_all(own)}",
-                        found=f"recordings whose {what} is {quote_all(theirs)}",
-                        remedy=f"if they are the same, rename the {what} in the dataset's meta/info.json"
-                        if what == "state"
-                        else "if they are the same, say so in the order of the recordings' numbers: --action-names",
-                    )
-            return self
+        return self
 
-        def reordered(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+    def _reordered(self, layout: Layout, rate_hz: float) -> "Checkpoint":
+        """Return LeRobot's policy with the order of numbers, the cameras and the rate of the dataset."""
+
+        def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
             return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
 
-        states, actions = list(layout.state_order), list(layout.action_order)
+        c, notes = self.config, list(self.report["notes"])
         cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
-        notes = list(self.report["notes"])
         if c.cameras != cameras:
             notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
         # LeRobot never resizes: a policy was trained on its dataset's pictures, whatever its config.json says, which
@@ -146,11 +143,11 @@ class Checkpoint:
                 )
         weights = dict(self.weights)
         for name, order, axis in (
-            ("encoder_robot_state_input_proj.weight", states, 1),
-            ("vae_encoder_robot_state_input_proj.weight", states, 1),
-            ("vae_encoder_action_input_proj.weight", actions, 1),
-            ("action_head.weight", actions, 0),
-            ("action_head.bias", actions, 0),
+            ("encoder_robot_state_input_proj.weight", layout.state_order, 1),
+            ("vae_encoder_robot_state_input_proj.weight", layout.state_order, 1),
+            ("vae_encoder_action_input_proj.weight", layout.action_order, 1),
+            ("action_head.weight", layout.action_order, 0),
+            ("action_head.bias", layout.action_order, 0),
         ):
             if name in weights:
                 weights[name] = weights[name].index_select(axis, torch.tensor(order))
@@ -162,38 +159,42 @@ class Checkpoint:
             state_names=TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names,
             action_names=layout.action_names,
             rate_hz=rate_hz,
-            state_norm=reordered(c.state_norm, layout.state_order),
-            action_unnorm=reordered(c.action_unnorm, layout.action_order),
+            state_norm=reorder(c.state_norm, layout.state_order),
+            action_unnorm=reorder(c.action_unnorm, layout.action_order),
         )
         report = self.report | {"normalisation": normalisation(config), "notes": notes}
         return replace(self, config=config, weights=weights, report=report)
 
 
-def load_checkpoint(path: Path | str) -> Checkpoint:
+def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
     """Read and check a checkpoint.
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
     `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints; or the Hub's id
     user/name@revision.
 
+    checked: the sha256 of weights that an earlier call has held against their config, which takes LeRobot seconds to be
+    imported: these are not checked again.
+
     Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
     whose config and weights do not agree, and for a policy that this project cannot run.
     """
     path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
     refuse_part(path)
-    if path.is_dir() or path.name == "last":
+    if path.is_dir():
         if (found_at := lerobot_folder(path)) is None:
             refuse_holder(path)
         path, notes = found_at or (path, [])
-        found = _check_policy(path, read_lerobot(path))
-        return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
+        config, weights, extra = read_lerobot(path)
+        extra["notes"] = notes + extra["notes"]
+        return _checkpoint(path, "lerobot", path / "model.safetensors", checked, config, weights, extra)
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
             f"{path}: {what}",
             remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
-    return _check_policy(path, read_trainer(path))
+    return _checkpoint(path, "trainer", path, checked, *read_trainer(path))
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -215,25 +216,18 @@ def normalisation(c: ActConfig) -> dict[str, str]:
     return words
 
 
-def _check_policy(path: Path, read: Contents) -> Checkpoint:
-    config, weights = read.config, read.weights
-    expected = expected_shapes(config)
-    shapes = {k: tuple(v.shape) for k, v in weights.items()}
-    problems = []
-    if missing := sorted(expected.keys() - shapes.keys()):
-        problems.append(f"missing: {quote_all(missing)}")
-    if unknown := sorted(shapes.keys() - expected.keys()):
-        problems.append(f"unknown: {quote_all(unknown)}")
-    if wrong := [
-        f"{k} is {shapes[k]}, not {expected[k]}" for k in expected if k in shapes and shapes[k] != expected[k]
-    ]:
-        problems.append(f"of another shape: {quote_all(wrong)}")
-    if problems:
-        raise CheckpointError(f"{path}: config and weights do not agree ({'; '.join(problems)})", remedy=CORRECT_IT)
-    if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
-        raise CheckpointError(
-            f"{path}: NaN or Inf in {quote_all(bad)}", remedy="training diverged, take an earlier checkpoint"
-        )
+def _checkpoint(
+    path: Path,
+    kind: str,
+    file: Path,
+    checked: str | None,
+    config: ActConfig,
+    weights: dict[str, Tensor],
+    extra: dict[str, Any],
+) -> Checkpoint:
+    """file: the weights'. extra: more for the report. Raises CheckpointError unless config and weights agree."""
+    if (sha256 := sha256_of(file)) != checked:
+        check_weights(path, config, weights)
     parts: dict[str, int] = {}
     for k, v in weights.items():
         part = "vae (training only)" if k.startswith("vae_") else k.split(".")[0].removesuffix("_embed")
@@ -241,14 +235,14 @@ def _check_policy(path: Path, read: Contents) -> Checkpoint:
     total = sum(parts.values())
     acts = total - parts.get("vae (training only)", 0)
     report = {
-        "format": read.format,
-        "file_mb": read.file_bytes / 1e6,
+        "format": kind,
+        "file_mb": file.stat().st_size / 1e6,
         "weights_mb": tensor_bytes(weights) / 1e6,
         "parameters": total,
         "parameters_acting": acts,
         "parameters_by_part": parts,
         "int8_floor_mb": acts / 1e6,
         "normalisation": normalisation(config),
-        **read.extra,
+        **extra,
     }
-    return Checkpoint(path, read.format, config, weights, read.sha256, report)
+    return Checkpoint(path, kind, config, weights, sha256, report)

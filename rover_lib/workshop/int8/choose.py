@@ -10,17 +10,16 @@ Errors are against FP32, in percent of each action's recorded range. An action t
 not judged: its error is None, and `warnings` says so.
 """
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import EllipsisType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.fx import GraphModule, Interpreter, Node
 
 from rover_lib.onboard.errors import QuantizeError
-from rover_lib.workshop.act import ACT, block_of, blocks, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.frames import ODD, odd_share, usual
 from rover_lib.workshop.int8.observe import Calibration, restore_observed, set_ranges, times_of
@@ -78,14 +77,10 @@ class Chooser:
         odd: Sequence[Sample] = (),
     ):
         if not samples:
-            raise QuantizeError(
-                "choosing needs samples that calibration has not seen", found="none", remedy="record more episodes"
-            )
+            raise QuantizeError("choosing needs samples that did not calibrate", remedy="record more episodes")
         if len(constant_actions(action_range)) == len(action_range):
-            raise QuantizeError(
-                f"{' and '.join(action_range)} never change in these recordings: no error can be judged",
-                remedy="record episodes in which the car is steered",
-            )
+            remedy = "record episodes in which the car is steered"
+            raise QuantizeError(f"{' and '.join(action_range)} never change in these recordings", remedy=remedy)
         forget_graphs()  # for the first time, as nothing is converted yet
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
@@ -187,11 +182,10 @@ class Chooser:
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
         config, plain = self.checkpoint.config, replace(scheme, float_blocks=())
         some = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES))
-        before = _BeforeBlocks(graph, blocks(config), [self.inputs[i] for i in some])
-        table = {}
+        inputs, table = [self.inputs[i] for i in some], {}
         for block in progress(blocks(config), desc="blocks"):
             forget_graphs()
-            actions = before.predictions(convert(graph, config, plain, only=[block]), block)
+            actions = predictions(convert(graph, config, plain, only=[block]), inputs)
             table[block] = mae_pct(self._from_reference(actions, some), self.weights[some], self.action_range)
         return table
 
@@ -236,79 +230,6 @@ class Chooser:
                 best, cost, error = trial, cost + costs[block], found
                 steps.append({"float_blocks": list(best.float_blocks), "cost_pct": cost, **error})
         return best, steps
-
-
-class _BeforeBlocks:
-    """The float values that enter each block, once for every input: where one block alone is INT8, all before it is
-    float and need not run again.
-
-    graph: observed. inputs: of the policy.
-    """
-
-    @torch.inference_mode()
-    def __init__(self, graph: GraphModule, names: Sequence[str], inputs: Sequence[tuple[Tensor, ...]]):
-        nodes = list(graph.graph.nodes)
-        # The first block's input is quantized by what makes the columns of pixels, which is before the block.
-        self.known = {node.name for node in nodes}
-        self.cut = {block: _beginning(nodes, block) for block in names[1:]}
-        kept = {node.name for first in self.cut.values() for node in _used_from(nodes, first)}
-        self.inputs, self.values = inputs, []
-        for x in inputs:
-            run = _Keeping(graph, kept)
-            run.run(*x)
-            self.values.append(run.values)
-
-    @torch.inference_mode()
-    def predictions(self, converted: GraphModule, block: str) -> Tensor:
-        """(n, C, A) of raw actions: `act.predictions` of a policy of which this block alone was converted."""
-        if block not in self.cut:
-            return predictions(converted, self.inputs)
-        nodes = list(converted.graph.nodes)
-        cut = next(i for i, n in enumerate(nodes) if n.name not in self.known or _in_block(n, block))
-        actions = []
-        for values in self.values:
-            # what is done is not run again; of it, only what is still used has a value
-            done = {node: values.get(node.name) for node in nodes[:cut]}
-            actions.append(Interpreter(converted).run(*self.inputs[0], initial_env=done))
-        return torch.cat(actions)
-
-
-class _Keeping(Interpreter):
-    """Runs a graph and keeps some of its values, by their nodes' names."""
-
-    def __init__(self, graph: GraphModule, names: Container[str]):
-        super().__init__(graph)
-        self.names, self.values = names, dict[str, Any]()
-
-    def run_node(self, node: Node) -> Any:
-        value = super().run_node(node)
-        if node.name in self.names:
-            self.values[node.name] = value
-        return value
-
-
-def _in_block(node: Node, block: str) -> bool:
-    return node.op == "call_module" and block_of(str(node.target)) == block
-
-
-def _is_observer(node: Node) -> bool:
-    return node.op == "call_module" and str(node.target).startswith("activation_post_process")
-
-
-def _beginning(nodes: Sequence[Node], block: str) -> int:
-    """Where the first node of a block is, or the first observer of what it takes: that becomes its quantization."""
-    first = [i for i, node in enumerate(nodes) if _in_block(node, block)]
-    taken = {source for i in first for source in nodes[i].all_input_nodes if _is_observer(source)}
-    return min(first + [i for i, node in enumerate(nodes) if node in taken])
-
-
-def _used_from(nodes: Sequence[Node], first: int) -> list[Node]:
-    """The nodes before the `first` whose values it or a later one takes; an observer passes on what it takes."""
-    used = set()
-    for node in nodes[first:]:
-        for source in node.all_input_nodes:
-            used.add(source.all_input_nodes[0] if _is_observer(source) else source)
-    return [node for node in nodes[:first] if node in used]
 
 
 def best_of(tried: Mapping[str, Scheme], table: Mapping[str, Errors]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,24 +30,8 @@ from rover_lib.workshop.int8.quantize import QuantizedPolicy, int8_layers
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
 
-class Form(Protocol):
-    """A policy in the form that one engine runs."""
-
-    engine: str
-    versions: dict[str, str]
-
-    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        """Return the actions for n inputs, (n, C, A) float32, not clipped.
-
-        inputs: (state, frames...) of each sample, as `inputs_of` gives them.
-        """
-
-    def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
-        """Write the artifact, and return its content hash."""
-
-
 class TorchScript:
-    """The policy as TorchScript, traced and frozen."""
+    """The policy as TorchScript, traced and frozen. A form of a policy predicts, and saves itself as an artifact."""
 
     engine = TORCH
 
@@ -59,6 +43,7 @@ class TorchScript:
         self.traced = _reread(frozen)
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
+        """Return the actions for n inputs, (n, C, A) float32, not clipped. inputs: as `inputs_of` gives them."""
         with torch.jit.optimized_execution(False):
             return predictions(self.traced, inputs)
 
@@ -108,6 +93,9 @@ class Onnx:
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
         return artifact.save_onnx(path, self.model, manifest, vectors)
+
+
+Form = TorchScript | Onnx
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ import torch
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.columns import number, ratio
 from rover_lib.onboard.errors import PolicyError, PwmError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -158,18 +157,12 @@ class Fidelity:
         judged = list(units)
         per_frame = self.errors(mode).mean(1)[:, judged] * list(units.values())  # (n, judged actions)
         order = np.argsort(-per_frame.max(1), kind="stable")[:count]
-        return [
-            WorstFrame(
-                mode,
-                self.action_names[judged[int(per_frame[i].argmax())]],
-                int(i),
-                float(per_frame[i].max()),
-                self.samples[i],
-                self.reference[i],
-                self.chunks[mode][i],
-            )
-            for i in order
-        ]
+        found = []
+        for i in order:
+            action, error_pct = self.action_names[judged[int(per_frame[i].argmax())]], float(per_frame[i].max())
+            plans = self.reference[i], self.chunks[mode][i]
+            found.append(WorstFrame(mode, action, int(i), error_pct, self.samples[i], *plans))
+        return found
 
 
 class LerobotEager:
@@ -255,15 +248,10 @@ def fidelity(
         raise PolicyError("there are no frames to compare on", remedy="record more, or hold out a larger share")
     for mode, policy in others.items():
         if (tuple(policy.action_names), policy.chunk) != (names, reference.chunk):
-            raise PolicyError(
-                f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 {reference.chunk} "
-                f"of {list(names)}",
-                remedy="compare artifacts of one checkpoint",
-            )
+            what = f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 other ones"
+            raise PolicyError(what, remedy="compare artifacts of one checkpoint")
     if missing := [n for n in names if n not in action_range]:
-        raise PolicyError(
-            f"no recorded range of action {missing}", found=sorted(action_range), remedy="use other recordings"
-        )
+        raise PolicyError(f"no recorded range of action {missing}", remedy="use other recordings")
     expected: list[np.ndarray] = []
     planned: dict[str, list[np.ndarray]] = {mode: [] for mode in others}
     for sample in progress(samples, desc="comparing", total=len(samples)):
@@ -341,29 +329,6 @@ def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
     }
 
 
-def comparison_rows(
-    summaries: Mapping[str, Mapping[str, Any]], sizes_mb: Mapping[str, float], reference_mb: float
-) -> list[list[str]]:
-    """Artifacts beside their reference, a header first: each action's mean, 95th percentile and largest error.
-
-    summaries: `Fidelity.summary` by name. sizes_mb: of the same artifacts. reference_mb: of what they are compared
-    with, which stands first; an artifact may be called "reference" too.
-    """
-    keys = next(iter(summaries.values()))
-    actions = [key.removesuffix("_mae_pct") for key in keys if key.endswith("_mae_pct")]
-    header = ["", "MB", "times smaller"]
-    for action in actions:
-        header += [f"{action} mean %", "p95", "largest", "mean us"]
-    rows = [header, ["reference", number(reference_mb), "1.0", *["-"] * (len(header) - 3)]]
-    for name, summary in summaries.items():
-        row = [name, number(sizes_mb[name]), number(ratio(reference_mb, sizes_mb[name]))]
-        for action in actions:
-            row += [number(summary[f"{action}_{which}_pct"], ".2f") for which in ("mae", "p95", "max")]
-            row.append(number(summary.get(f"{action}_mae_us"), ".2f"))
-        rows.append(row)
-    return rows
-
-
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
     """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
     if found is None or (isinstance(found, float) and math.isnan(found)):
@@ -385,26 +350,17 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     speed are `onboard.care.limits.check_gates`.
     """
     fp32, judged = compared["fp32"], compared["modes"][mode]
-    rows = [
-        gate(f"{mode} {key}", judged[key], "<=", limits[key])
-        for key in judged
-        if key.endswith("_mae_pct") and key in limits
-    ]
-    rows += [
-        gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"])
-        for key in judged
-        if key.endswith("_of_spread_pct") and judged[key] is not None
-    ]
+    original, size_mb = limits["original"], judged["size_mb"]
+    errors = [key for key in judged if key.endswith("_mae_pct")]
+    spreads = [key for key in judged if key.endswith("_of_spread_pct") and judged[key] is not None]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
-    rows += [
+    loss = judge.worst(judged[key] for key in errors)
+    return [
+        *(gate(f"{mode} {key}", judged[key], "<=", limits[key]) for key in errors if key in limits),
+        *(gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"]) for key in spreads),
         gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
         gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"]),
-        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_full_mb"]),
-    ]
-    original = limits["original"]
-    loss = judge.worst(v for k, v in judged.items() if k.endswith("_mae_pct"))
-    rows += [
-        gate(f"{mode} model_size_mb", judged["size_mb"], "<=", original["model_size_mb"]),
+        gate(f"{mode} size_mb", size_mb, "<=", limits["size_full_mb"]),
+        gate(f"{mode} model_size_mb", size_mb, "<=", original["model_size_mb"]),
         gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"]),
     ]
-    return rows

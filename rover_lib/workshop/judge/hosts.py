@@ -18,7 +18,7 @@ from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
-CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # written by `python -m lab clock`
+CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # its program: commit 545214c
 SAME_WORK = 0.01
 NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
@@ -127,15 +127,13 @@ def _check(path: Path, content: Mapping[str, Any]) -> None:
     """Raise RoverError unless the file has everything that tables and figures read."""
     try:
         metrics, env = content["metrics"], content["env"]
-        series = metrics.get("series") or []
-        timed = [*metrics["artifacts"].values(), *(v for p in series for v in p["artifacts"].values())]
-        needed = [v[key] for v in timed for key in ("latency_p50_ms", "latency_p95_ms", "n")]
-        needed += [v["latency_p99_ms"] for v in metrics["artifacts"].values()]
-        needed += [env["cores"], *(p["t_s"] for p in series)]
-        readings = [p.get(key) for p in (metrics, *series) for key in ("temperature_c", "clock_mhz")]
-        for p in (metrics, *series):
+        points = [metrics, *(metrics.get("series") or [])]
+        numbers = [env["cores"], *(p["t_s"] for p in points[1:])]
+        numbers += [v[key] for p in points for v in p["artifacts"].values() for key in ("latency_p50_ms", "n")]
+        numbers += [v[f"latency_{p}_ms"] for v in metrics["artifacts"].values() for p in ("p95", "p99")]
+        numbers += [p[key] for p in points for key in ("temperature_c", "clock_mhz") if p.get(key) is not None]
+        for p in points:
             int(p.get("throttled") or "0x0", 16)
-        numbers = needed + [n for n in readings if n is not None]
         usable = metrics["main"] in metrics["artifacts"] and all(map(is_number, numbers))
         usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
     except (KeyError, TypeError, ValueError, AttributeError):

@@ -8,39 +8,24 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import (
-    BLACK,
-    BLUE,
-    COLOURS,
-    GREY,
-    MOST_ACTIONS,
-    NAMES,
-    RED,
-    Note,
-    claim,
-    figure_of,
-    legend_below,
-    new_figure,
-    note,
-    picture_of,
-)
+from rover_lib.workshop.plots import style
+from rover_lib.workshop.plots.style import COLOURS, GREY, MOST_ACTIONS, NAMES, Note, legend_below, line_of, new_figure
+
+AHEAD = "step of the plan (s ahead)"
 
 
 def sizes(metrics: Mapping[str, Any]) -> Figure:
     """Draw the sizes of the artifact files, which hold weights without an optimizer. metrics: those of compare.json."""
     sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
     fig, axes = new_figure(1, height_in=1.3 + 0.34 * len(sizes_mb))
-    ax, y = axes[0, 0], range(len(sizes_mb))
-    ax.barh(y, list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
+    ax = axes[0, 0]
+    ax.barh(range(len(sizes_mb)), list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
     for at, size_mb in enumerate(sizes_mb.values()):
         text = f"{size_mb:.1f} MB" + (f", {sizes_mb['fp32'] / size_mb:.1f}x smaller" if at else "")
         ax.annotate(text, (size_mb, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
     ax.margins(x=0.25)
-    ax.set_yticks(y, [NAMES.get(m, m) for m in sizes_mb])
-    ax.invert_yaxis()
+    style.name_rows(ax, sizes_mb)
     ax.set_xlabel("artifact file (MB, 10^6 bytes)")
-    claim(fig, claims.size(sizes_mb))
     return fig
 
 
@@ -49,25 +34,21 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     actions, steps = report.action_names, report.reference.shape[1]
     if all(report.pct(action) is None for action in actions):
         return Note("no action changes in these recordings: nothing is judged")
-    fig, fields = figure_of(len(actions), 2 if len(actions) < MOST_ACTIONS else MOST_ACTIONS, 3.6)
+    fig, fields = style.figure_of(len(actions), min(max(len(actions), 2), MOST_ACTIONS), 3.6)
     times_s = np.arange(steps) / rate_hz
-    for i, action in enumerate(actions):
-        ax, pct = fields[i], report.pct(action)
+    for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
         ax.set_title(action, fontsize=11)
-        if pct is None:
-            note(ax, "never changes in these\nrecordings: not judged")
+        if (pct := report.pct(action)) is None:
+            style.note(ax, "never changes in these\nrecordings: not judged")
             continue
         for mode in report.chunks:
-            error = report.in_pct(report.errors(mode)[..., i].mean(0), action)
-            ax.plot(times_s, error, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
-        ax.set(xlabel="step of the plan (s ahead)", ylabel="mean error (% of the recorded range)", ylim=(0, None))
+            ax.plot(times_s, report.in_pct(report.errors(mode)[..., i].mean(0), action), **line_of(mode))
+        ax.set(xlabel=AHEAD, ylabel="mean error (% of the recorded range)", ylim=(0, None))
         us = report.us(action) / pct
         if np.isfinite(us):
             other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
             other.set_ylabel("the same as pulse (us)")
-            other.tick_params(labelsize=9)
     legend_below(fig, next(ax for ax in fields if ax.get_lines()), 5)
-    claim(fig, claims.error(report))
     return fig
 
 
@@ -86,24 +67,22 @@ def worst_frames(
     fig, axes = new_figure(len(frames), 1 + max(len(every), 1), height_in=1.2 + 1.9 * len(frames))
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, worst in zip(axes, frames, strict=True):
-        row[0].imshow(picture_of(worst.sample))
-        row[0].axis("off")
-        row[0].set_title(f"{worst.action} {worst.error_pct:.2f} % off", fontsize=10)
+        style.show_picture(row[0], worst.sample, f"{worst.action} {worst.error_pct:.2f} % off")
         recorded = getattr(worst.sample, "chunk", None)
         for ax, name in zip(row[1:], every or (worst.action,), strict=True):
             i = report.action_names.index(name)
             if recorded is not None:
                 known = ~worst.sample.is_pad
                 ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")
-            ax.plot(times_s, worst.reference[:, i], color=BLACK, lw=1.8, label="FP32")
-            ax.plot(times_s, worst.other[:, i], color=COLOURS.get(mode, BLUE), lw=1.8, ls="--", label=f"{mode} INT8")
-            ax.set_ylabel(f"{name}", fontsize=9)
+            ax.plot(times_s, worst.reference[:, i], **line_of("fp32"))
+            ax.plot(times_s, worst.other[:, i], ls="--", **line_of(mode))
+            ax.set_ylabel(name, fontsize=9)
             low, high = report.action_range[name]
-            ax.set_ylim(low - 0.05 * (high - low + 1e-6), high + 0.05 * (high - low + 1e-6))
+            margin = 0.05 * (high - low + 1e-6)
+            ax.set_ylim(low - margin, high + margin)
     for ax in axes[-1, 1:]:
-        ax.set_xlabel("step of the plan (s ahead)")
+        ax.set_xlabel(AHEAD)
     legend_below(fig, axes[0, 1], 3)
-    claim(fig, "" if first else claims.worst_frame(frames[0]))
     return fig
 
 
@@ -112,23 +91,20 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
 
     metrics: those of compare.json.
     """
-    rows = {"fp32": metrics["fp32"]} | dict(metrics["modes"])
-    rows = {m: v for m, v in rows.items() if v["trials"]}
+    rows = {m: v for m, v in ({"fp32": metrics["fp32"]} | dict(metrics["modes"])).items() if v["trials"]}
     fig, axes = new_figure(1, height_in=1.5 + 0.36 * max(len(rows), 1))
     ax = axes[0, 0]
     for y, (mode, v) in enumerate(rows.items()):
         colour = COLOURS.get(mode, GREY)
         ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
         ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
-        ax.annotate(
-            f"{v['hits']} of {v['trials']}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=10
-        )
-    ax.set_yticks(range(len(rows)), [NAMES.get(m, m) for m in rows])
-    ax.set_ylim(len(rows) - 0.5, -0.5)
+        text = f"{v['hits']} of {v['trials']}"
+        ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=10)
+    ax.set_ylim(-0.5, len(rows) - 0.5)
+    style.name_rows(ax, rows)
     lows = [100 * v["hits_wilson_low"] for v in rows.values()]
     ax.set_xlim(max(0, min(lows, default=0) - 5), 101)
     ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
-    claim(fig, claims.hits(metrics))
     return fig
 
 
@@ -148,18 +124,15 @@ def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
     for ax, i in zip(axes[0], worlds, strict=False):
         for mode, trial in trials.items():
             path = trial.per_world[i].trajectory
-            style = "-" if mode == "fp32" else "--"
             # Forward is up. Positive y is to the left of the car.
-            ax.plot(-path.y_m, path.x_m, style, color=COLOURS.get(mode, GREY), lw=1.8, label=NAMES.get(mode, mode))
+            ax.plot(-path.y_m, path.x_m, "-" if mode == "fp32" else "--", **line_of(mode))
         x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
-        ax.add_patch(Circle((-y, x), 0.16, color=RED))
+        ax.add_patch(Circle((-y, x), 0.16, color=style.RED))
         ax.set_aspect("equal", adjustable="datalim")
         ax.set_xlabel("to the right (m)")
         missed = [NAMES.get(m, m) for m, t in trials.items() if not t.per_world[i].hit]
-        outcome = "all hit" if not missed else "all missed" if len(missed) == len(trials) else ""
-        outcome = outcome or (f"{missed[0]} missed" if len(missed) == 1 else f"{len(missed)} of {len(trials)} missed")
+        outcome = "all hit" if not missed else f"{len(missed)} of {len(trials)} missed"
         ax.set_title(f"{100 * apart(i):.0f} cm apart, {outcome}", fontsize=9)
     axes[0, 0].set_ylabel("ahead of the start (m)")
     legend_below(fig, axes[0, 0], 5)
-    claim(fig, claims.apart(max(map(apart, worlds), default=0.0), len(trials["fp32"].per_world)))
     return fig

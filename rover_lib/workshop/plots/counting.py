@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots.style import NAMES, legend, new_figure, simd_bars
+from rover_lib.workshop.plots.style import NAMES, legend, name_rows, new_figure, simd_bars
 
 # Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all instructions, and the SIMD
 # instructions among them. Notebook 03 shows them for a run that `make count` has not counted. Source: `make count
@@ -49,8 +49,7 @@ def instruction_counts(metrics: Mapping[str, Any] | None = None) -> Figure:
     ax, y = axes[0, 0], np.arange(len(rows))
     total, simd = (np.array([row[i] for row in rows]) for i in (1, 2))
     simd_bars(ax, y, total, simd)
-    ax.set_yticks(y, [row[0] for row in rows])
-    ax.invert_yaxis()
+    name_rows(ax, [row[0] for row in rows])
     ax.set_xlabel("instructions of one inference (10^9)")
     ax.set_title(f"{title}; counted on an emulated Cortex-A76", fontsize=10, loc="right")
     legend(ax, loc="lower right")

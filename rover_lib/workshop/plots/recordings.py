@@ -3,40 +3,16 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rover_lib.workshop.act import block_of
 from rover_lib.workshop.int8 import frames
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver
 from rover_lib.workshop.int8.scheme import OBSERVERS
-from rover_lib.workshop.plots import claims
-from rover_lib.workshop.plots.style import (
-    BLUE,
-    COLOURS,
-    DPI,
-    GREY,
-    MIST,
-    OTHERS,
-    PARTS,
-    RED,
-    SLATE,
-    WIDTH_IN,
-    Drawn,
-    Note,
-    action_colour,
-    bar_values,
-    claim,
-    figure_of,
-    legend,
-    legend_below,
-    new_figure,
-    part_colours,
-    picture_of,
-)
+from rover_lib.workshop.plots import style
+from rover_lib.workshop.plots.style import BLUE, GREY, MIST, OTHERS, RED, SLATE, Note, legend, legend_below, new_figure
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, HANDLED
 
@@ -60,15 +36,9 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
             ax.barh(0, size_mb, left=left, color=colour, label=name)
             left += size_mb
     ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=[SLATE, BLUE])
-    bar_values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
-    ax.set_yticks(range(3), rows)
-    ax.invert_yaxis()
+    style.bar_values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
+    style.name_rows(ax, rows)
     ax.set_xlabel("size (MB, 10^6 bytes)")
-    claim(
-        fig,
-        f"{report['file_mb'] / report['int8_floor_mb']:.1f}x in all: {report['file_mb'] / acting_mb:.1f}x left out, "
-        f"{acting_mb / report['int8_floor_mb']:.1f}x by INT8",
-    )
     legend(ax, loc="lower right")
     return fig
 
@@ -79,43 +49,45 @@ def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Fi
     fig, axes = new_figure(1, 2, height_in=1.5 + 0.21 * len(blocks), sharey=True)
     left, right = axes[0]
     y = np.arange(len(blocks))
-    colours = part_colours(blocks)
+    colours = style.part_colours(blocks)
     left.barh(y, [parameters.get(b, 0) / 1e6 for b in blocks], color=colours)
     right.barh(y, [macs[b] / 1e6 for b in blocks], color=colours)
-    left.set_yticks(y, blocks)
-    left.invert_yaxis()
+    style.name_rows(left, blocks)
     left.set_xlabel(f"parameters (10^6), {sum(parameters.values()) / 1e6:.2f} in all")
     right.set_xlabel(f"multiply-accumulates (10^6), {sum(macs.values()) / 1e6:.0f} in all")
     left.set_title("what must be stored", fontsize=11)
     right.set_title("what must be computed", fontsize=11)
-    for part, colour in PARTS.items():
+    for part, colour in style.PARTS.items():
         right.barh(0, 0, color=colour, label=part)
     legend(right, loc="lower right")
-    claim(fig, claims.work(parameters, macs))
     return fig
 
 
 def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pictures: int = 5) -> Figure:
     """Draw one episode: what the cameras saw, and what was done; for a car also the pulses that its servos got."""
     samples = episode.samples
-    shown = [samples[i] for i in np.linspace(0, len(samples) - 1, pictures).round().astype(int)]
-    car = tuple(actions) == ACTION_NAMES
-    rows = 2 if car else len(actions)
-    fig = plt.figure(
-        figsize=(WIDTH_IN, 6.2 if car else 2.0 + 0.9 * rows), dpi=DPI, layout="constrained", FigureClass=Drawn
-    )
-    plt.close(fig)
-    grid = fig.add_gridspec(1 + rows, pictures, height_ratios=(1.1, *([1.3] if car else [0.6]) * rows))
-    for i, sample in enumerate(shown):
-        ax = fig.add_subplot(grid[0, i])
-        ax.imshow(picture_of(sample))
-        ax.set_title(f"{sample.time_s:.1f} s", fontsize=9)
-        ax.axis("off")
-    draw = _drive if car else _motion
-    draw([fig.add_subplot(grid[1 + row, :]) for row in range(rows)], samples, actions)
-    fig.suptitle(
-        f"{episode.id}: {episode.label or 'no label'}, {len(samples)} samples of {episode.frames} frames", fontsize=11
-    )
+    shown = np.linspace(0, len(samples) - 1, pictures).round().astype(int)
+    lines = {name: [s.chunk[0, i] for s in samples] for i, name in enumerate(actions)}
+    if tuple(actions) == ACTION_NAMES:
+        pulses = np.array([s.pulses_us or list(vars(s.car.pwm.pulses(*s.chunk[0].tolist())).values()) for s in samples])
+        computed = "" if samples[0].pulses_us else ",\ncomputed"
+        lines |= {f"{name}\npulse (us{computed})": pulses[:, i] for i, name in enumerate(actions)}
+    heights = (1.3, *[0.6] * len(lines))
+    fig, axes = new_figure(len(heights), pictures, height_in=2.0 + 0.9 * len(lines), height_ratios=heights)
+    for ax, i in zip(axes[0], shown, strict=True):
+        style.show_picture(ax, samples[i], f"{samples[i].time_s:.1f} s")
+    grid = axes[0, 0].get_gridspec()
+    for row, (name, values) in enumerate(lines.items(), 1):
+        for ax in axes[row]:
+            ax.remove()
+        ax = fig.add_subplot(grid[row, :])
+        ax.plot([s.time_s for s in samples], values, color=style.action_colour(name.split("\n")[0], row - 1), lw=1.5)
+        ax.set_ylabel(name, fontsize=8, rotation=0, ha="right")
+        ax.tick_params(labelsize=8, labelbottom=row == len(lines))
+        ax.spines[["top", "right"]].set_visible(False)
+    ax.set_xlabel("time in the episode (s)")
+    label = episode.label or "no label"
+    fig.suptitle(f"{episode.id}: {label}, {len(samples)} samples of {episode.frames} frames", fontsize=11)
     return fig
 
 
@@ -123,46 +95,14 @@ def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float 
     """Draw what one sample saw, and what was done from there on, which is the plan that a perfect policy would make."""
     fig, axes = new_figure(1, 2, height_in=2.6)
     left, right = axes[0]
-    left.imshow(picture_of(sample))
-    left.axis("off")
+    style.show_picture(left, sample, f"{sample.time_s:.1f} s in the episode")
     known = ~sample.is_pad
     times_s = np.arange(len(sample.chunk)) / rate_hz
     for i, name in enumerate(actions):
-        right.plot(times_s[known], sample.chunk[known, i], color=action_colour(name, i), lw=1.8, label=name)
+        right.plot(times_s[known], sample.chunk[known, i], color=style.action_colour(name, i), lw=1.8, label=name)
     right.set(xlabel="s ahead", ylabel="what was done")
-    right.set_title(f"{sample.time_s:.1f} s in the episode", fontsize=10)
     legend(right)
     return fig
-
-
-def _motion(fields: Sequence[Axes], samples: Sequence[Sample], actions: Sequence[str]) -> None:
-    """Draw each action over time, in its own units."""
-    for i, (ax, name) in enumerate(zip(fields, actions, strict=True)):
-        ax.plot([s.time_s for s in samples], [s.chunk[0, i] for s in samples], color=action_colour(name, i), lw=1.5)
-        ax.set_ylabel(name, fontsize=8, rotation=0, ha="right")
-        ax.tick_params(labelsize=8, labelbottom=ax is fields[-1])
-        ax.spines[["top", "right"]].set_visible(False)
-    fields[-1].set_xlabel("time in the episode (s)")
-
-
-def _drive(fields: Sequence[Axes], samples: Sequence[Sample], _: Sequence[str]) -> None:
-    """Draw a car's steering and throttle, and their pulses."""
-    times_s = [s.time_s for s in samples]
-    actions = np.stack([s.chunk[0] for s in samples])
-    pulses = [s.pulses_us or vars(s.car.pwm.pulses(*s.chunk[0].tolist())).values() for s in samples]
-    steering_us, throttle_us = zip(*pulses, strict=True)
-    unit = "{} pulse (us)" if samples[0].pulses_us else "{} pulse (us, computed)"
-    upper, lower = fields
-    rows = ((upper, actions[:, 0], actions[:, 1], "{} (share of full)"), (lower, steering_us, throttle_us, unit))
-    for ax, steering, throttle, unit in rows:
-        other = ax.twinx()
-        ax.plot(times_s, steering, color=COLOURS["steering"], lw=1.5)
-        other.plot(times_s, throttle, color=COLOURS["throttle"], lw=1.5, ls="--")
-        ax.set_ylabel(unit.format("steering"), color=COLOURS["steering"])
-        other.set_ylabel(unit.format("throttle"), color="#8F4A74")  # the same pink, dark enough to read
-        ax.spines["top"].set_visible(False)
-        other.spines["top"].set_visible(False)
-    lower.set_xlabel("time in the episode (s)")
 
 
 def faults(recordings: Recordings) -> Figure | Note:
@@ -177,15 +117,14 @@ def faults(recordings: Recordings) -> Figure | Note:
     fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(bars))
     ax = axes[0, 0]
     ax.barh(range(len(bars)), [count for _, count, _ in bars], color=[colours[handled] for *_, handled in bars])
-    bar_values(ax, range(len(bars)), [count for _, count, _ in bars], "{:d}")
-    ax.set_yticks(range(len(bars)), [kind.replace("_", " ") for kind, *_ in bars])
-    ax.invert_yaxis()
+    style.bar_values(ax, range(len(bars)), [count for _, count, _ in bars], "{:d}")
+    style.name_rows(ax, [kind.replace("_", " ") for kind, *_ in bars])
     ax.set_xlabel("times")
     for handled in counted:
         ax.barh(0, 0, color=colours[handled], label=handled)
     legend(ax, loc="lower right")
     totals = ", ".join(f"{sum(kinds.values())} {handled}" for handled, kinds in counted.items())
-    claim(fig, f"{used}; faults: {totals}")
+    ax.set_title(f"{used}; faults: {totals}", fontsize=11)
     return fig
 
 
@@ -194,37 +133,24 @@ def calibration_coverage(
 ) -> Figure:
     """Draw which recorded actions the calibration samples cover, beside those that judge later."""
     first_two = list(names[:2])
-    fig, fields = figure_of(1 + len(names), 3, 3.4)
+    fig, fields = style.figure_of(1 + len(names), 3, 3.4)
     unit = " (share of full)" if tuple(names) == ACTION_NAMES else ""
-    sets = (
-        ("could calibrate", pool, GREY, "o", 8),
-        ("held out", held_out, OTHERS[1], "x", 14),
-        ("calibrate", chosen, SLATE, "o", 10),
-    )
-    for label, samples, colour, marker, size in sets:
+    sets = (("could calibrate", pool, GREY), ("held out", held_out, OTHERS[1]), ("calibrate", chosen, SLATE))
+    for label, samples, colour in sets:
         first = np.stack([s.chunk[0] for s in samples])
-        fields[0].scatter(
-            first[:, 0],
-            first[:, len(first_two) - 1],
-            s=size,
-            c=colour,
-            marker=marker,
-            lw=0.8,
-            alpha=0.8,
-            label=f"{label} ({len(samples)})",
-        )
+        x, y = first[:, 0], first[:, len(first_two) - 1]
+        fields[0].scatter(x, y, s=10, c=colour, marker="x" if label == "held out" else "o", label=f"{label} ({len(x)})")
     fields[0].set(xlabel=f"{first_two[0]}{unit}", ylabel=f"{first_two[-1]}{unit}")
     fields[0].set_title("one point per frame", fontsize=11)
     for i, ax in enumerate(fields[1:]):
         every = np.concatenate([s.chunk[:, i] for s in pool])
         bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
-        for samples, colour, style in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
+        for samples, colour, kind in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
             values = np.concatenate([s.chunk[:, i] for s in samples])
-            ax.hist(values, bins, weights=np.full(len(values), 100 / len(values)), color=colour, histtype=style, lw=1.5)
+            ax.hist(values, bins, weights=np.full(len(values), 100 / len(values)), color=colour, histtype=kind, lw=1.5)
         ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)")
         ax.set_title(f"{names[i]} over whole plans", fontsize=11)
     legend_below(fig, fields[0], 3)
-    claim(fig, claims.coverage([s.chunk[0] for s in chosen], [s.chunk[0] for s in pool], names))
     return fig
 
 
@@ -250,9 +176,9 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
         limit = seen.limit.item()
         edges = np.linspace(-limit, limit, 129)
         ax.bar(edges[:-1], share.view(128, -1).sum(1), np.diff(edges), align="edge", color=GREY)
-        for name, style in styles.items():
+        for name, dashes in styles.items():
             for i, x in enumerate(ranges[name]):
-                ax.axvline(x, color=SLATE, ls=style, lw=1.6, label=name if i == 0 else None)
+                ax.axvline(x, color=SLATE, ls=dashes, lw=1.6, label=name if i == 0 else None)
         low, high = ranges["minmax"]
         ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
         ax.set_yscale("log")
@@ -284,10 +210,7 @@ def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int =
     top.set_xlabel("calibration frame")
     fig.colorbar(shown, ax=top, ticks=[-1, 0, 1, 2], format=lambda x, _: f"{10.0**x:g}", label="times the median")
     for ax, i in zip(axes[1], oddest, strict=True):
-        ax.imshow(picture_of(samples[i]))
-        ax.set_title(f"{samples[i].episode.removeprefix('episode_')}\nframe {samples[i].row}", fontsize=8)
-        ax.axis("off")
-    claim(fig, claims.odd_frames(frames.describe_odd(calibration.frames, calibration.seen), table.max().item()))
+        style.show_picture(ax, samples[i], f"{samples[i].episode.removeprefix('episode_')}\nframe {samples[i].row}")
     return fig
 
 

@@ -30,11 +30,6 @@ SKY = "#56B4E9"
 GREEN = "#009E73"
 BLUE = "#0072B2"
 RED = "#D55E00"  # a limit, a floor, a fault, a stopped car; and the balloon
-INDIGO = "#332288"
-PINK = "#CC79A7"
-OLIVE = "#999933"
-SAND = "#DDCC77"
-WINE = "#882255"
 SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
 MIST = "#AAB7C4"  # what is compared with a slate figure: before, without, the rest
 GREY = "#B0B0B0"
@@ -47,15 +42,12 @@ COLOURS = {
     "mixed": GREEN,
     "static_affine": SKY,
     "lerobot": "#777777",
-    "steering": INDIGO,
-    "throttle": PINK,
+    "steering": "#332288",
+    "throttle": "#CC79A7",
 }
-PARTS = {"backbone": OLIVE, "encoder": SAND, "decoder": WINE}  # parts of the policy; all others are grey
+PARTS = {"backbone": "#999933", "encoder": "#DDCC77", "decoder": "#882255"}  # of the policy; all others are grey
 NAMES = {
     "fp32": "FP32",
-    "dynamic": "dynamic",
-    "static": "static",
-    "mixed": "mixed",
     "static_affine": "static, affine",
     "lerobot": "LeRobot, eager FP32",
     "torch_affine": "torch, affine",
@@ -64,6 +56,7 @@ NAMES = {
     "static.onnx": "static INT8, for ONNX Runtime",
     "executorch": "ExecuTorch INT8",
 }
+MOST_ACTIONS = 3  # a figure shows at most this many beside each other
 
 
 class Drawn(Figure):
@@ -89,16 +82,8 @@ class Note:
 
 def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
     """Make a figure and its (rows, columns) axes. pyplot is told to forget it, so only the caller shows it."""
-    fig, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(WIDTH_IN, height_in),
-        dpi=DPI,
-        layout="constrained",
-        squeeze=False,
-        FigureClass=Drawn,
-        **options,
-    )
+    size = {"figsize": (WIDTH_IN, height_in), "dpi": DPI, "layout": "constrained", "FigureClass": Drawn}
+    fig, axes = plt.subplots(rows, columns, squeeze=False, **size, **options)
     plt.close(fig)
     for ax in axes.flat:
         ax.spines[["top", "right"]].set_visible(False)
@@ -124,9 +109,27 @@ def picture_of(sample: Any) -> np.ndarray:
     seen = sample.frame_bgr()
     frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
     height = max(len(frame) for frame in frames)
-    sizes = [(round(frame.shape[1] * height / len(frame)), height) for frame in frames]
-    same = [f if f.shape[1::-1] == size else cv2.resize(f, size) for f, size in zip(frames, sizes, strict=True)]
+    same = [cv2.resize(f, (round(f.shape[1] * height / len(f)), height)) if len(f) != height else f for f in frames]
     return np.concatenate(same, axis=1)[..., ::-1]
+
+
+def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
+    """Draw what a sample saw, without axes."""
+    ax.imshow(picture_of(sample))
+    ax.set_title(title, fontsize=9)
+    ax.axis("off")
+
+
+def line_of(mode: str) -> dict[str, Any]:
+    """Return the colour and the label of a mode's line."""
+    return {"color": COLOURS.get(mode, GREY), "label": NAMES.get(mode, mode), "lw": 1.8}
+
+
+def name_rows(ax: Axes, names: Iterable[str]) -> None:
+    """Name the rows of horizontal bars, the first one on top. Modes get their names of NAMES."""
+    shown = [NAMES.get(name, name) for name in names]
+    ax.set_yticks(range(len(shown)), shown)
+    ax.invert_yaxis()
 
 
 def legend(ax: Axes, **options: Any) -> None:
@@ -161,9 +164,6 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
     return [k for k in keys if errors[k] is not None]
 
 
-MOST_ACTIONS = 3  # a figure shows at most this many beside each other
-
-
 def few_actions(table: Mapping[str, Mapping[str, float | None]]) -> tuple[dict[str, dict[str, float | None]], str]:
     """Return a table of <action>_mae_pct as it can be drawn, and what it then has, in words.
 
@@ -176,10 +176,15 @@ def few_actions(table: Mapping[str, Mapping[str, float | None]]) -> tuple[dict[s
     return worst_of, f"mean error of the worst of {len(keys)} actions"
 
 
-def claim(fig: Figure, sentence: str) -> None:
-    """Write above a figure what it shows. `claims` computes such sentences from what is drawn."""
-    if sentence:
-        fig.suptitle(sentence, fontsize=12, weight="bold")
+def draw_errors(ax: Axes, table: Mapping[str, Mapping[str, Any]], keys: list[str], *, values: bool = False) -> None:
+    """Draw a bar for each action of each row of a table. keys: of the actions. values: write the numbers too."""
+    height = 0.8 / max(len(keys), 1)
+    for i, key in enumerate(keys):
+        y, x = np.arange(len(table)) + (i - (len(keys) - 1) / 2) * height, [row[key] for row in table.values()]
+        ax.barh(y, x, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
+        if values:
+            bar_values(ax, y, x, "{:.2f}")
+    name_rows(ax, table)
 
 
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:

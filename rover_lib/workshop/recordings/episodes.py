@@ -35,38 +35,34 @@ import os
 import stat
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import simplejpeg
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.pwm import NEUTRAL, Channel, PwmCalibration
+from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import refuse_holder
 from rover_lib.onboard.recording.episode import (
-    BURST_MIN,
     CONTROL_FIELDS,
     DATA_BYTES,
     FRAME_FIELDS,
     NOBODY,
     OUTCOMES,
-    arduino_step_s,
-    driver_of,
-    find_backlog,
     find_killed,
-    no_pulse,
     number_of,
     read_car_of,
 )
+from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
-from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, Formula, formulas_of, half_unit_of
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source, relative
+from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
 from rover_lib.workshop.untrusted import quote, quote_all
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
@@ -74,12 +70,9 @@ HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 # Faults of which one is enough to leave a recording out, and those that follow from another.
 FOLLOWING = ("absent", "nothing_usable")
-DECISIVE = ("no_formula", "no_car", "no_overlap", "not_seconds", "coarse_times", "wrong_header", "broken_json")
-LAST_S = 1e11  # Unix time is a hundredth of it
-FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
+DECISIVE = ("no_formula", "no_car", "no_overlap", "wrong_header", "broken_json")
 JPEG_HEAD = 1024  # in which most cameras say how large the picture is
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,35 +88,6 @@ class Split:
     held_out: tuple[Sample, ...]
     note: str | None
     episodes: dict[str, list[str]]
-
-
-@dataclass
-class Faults:
-    """Counts faults by file and kind, and keeps the note of the first."""
-
-    root: Path
-    counted: dict[tuple[str, str], list] = field(default_factory=dict)
-
-    def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
-        if count:
-            entry = self.counted.setdefault((relative(path, self.root), kind), [0, note])
-            entry[0] += count
-
-    def listed(self) -> tuple[Fault, ...]:
-        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
-
-
-@dataclass(frozen=True)
-class _Control:
-    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured, and its
-    pulse, in microseconds, then is NaN.
-    """
-
-    system_s: float
-    arduino_s: float
-    actions: tuple[float | None, float | None]
-    driver: str
-    pulses_us: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -229,7 +193,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         return None
     (label, outcome), tables = _read_tables(folder, faults)
     try:
-        controls, formulas = _read_controls(*tables["control_samples"], car.pwm, faults)
+        controls, formulas = read_controls(*tables["control_samples"], car.pwm, faults)
     except EpisodeError as e:
         faults.add(folder, "no_formula", str(e))
         return None
@@ -238,7 +202,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         faults.add(folder, "nothing_usable", f"{len(controls)} usable controls and {len(frames)} usable frame entries")
         return None
     source = tables["control_samples"][0]
-    controls = _place_bursts(controls, source, faults)
+    controls = place_bursts(controls, source, faults)
     samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
         faults.add(folder, "nothing_usable", "no frame with a picture, an action and a known state")
@@ -286,22 +250,9 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], 
 
 
 def _read_bytes(path: Path, faults: Faults) -> bytes | None:
-    """Return a data file's bytes.
-
-    None, with a fault, if it is absent, empty, unreadable, too large, or a link that leaves its folder.
-    """
+    """Return a data file's bytes. None, with a fault, if it is absent, empty, unreadable or too large."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            faults.add(path, "unreadable", "not a file")
-            return None
-        if status.st_size > DATA_BYTES:
-            faults.add(path, "too_large", f"{status.st_size / 1e6:.0f} MB, at most {DATA_BYTES / 1e6:.0f} are read")
-            return None
-        if not _inside(path, path.parent):
-            faults.add(path, "path_leaves_folder", "a link to somewhere else")
-            return None
-        data = path.read_bytes()
+        data = read_plain(path, DATA_BYTES)
     except FileNotFoundError:
         faults.add(path, "absent", "not there")
         return None
@@ -347,206 +298,6 @@ def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[
     return rows
 
 
-def _read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -> tuple[list[_Control], dict]:
-    """Return the usable readings, ordered by system time, and by channel the formula that its actions followed, if it
-    was another than the car's, and they were recomputed.
-
-    Raises EpisodeError if a channel's actions follow no formula of its pulses.
-    """
-    read: list[tuple[int, dict[str, float], list[str], str]] = []
-    for i, row in enumerate(rows):
-        if not isinstance(row, dict):
-            faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
-            continue
-        lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
-        wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
-        numbers = {name: number_of(row.get(name)) for name in wanted}
-        values = {name: value for name, value in numbers.items() if value is not None}
-        bad = [name for name in wanted if name not in values]
-        nan = [name for name, value in values.items() if math.isnan(value)]
-        if bad:
-            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
-            continue  # the recorder did not write such a row, so nothing in it can be trusted
-        if nan:
-            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {quote(row.get(nan[0]))}")
-        if "system_timestamp" in nan or _is_no_second(values["system_timestamp"], f"control {i}", path, faults):
-            continue  # without a time it cannot be the action of a frame
-        for name in lost:
-            faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
-        if (driver := driver_of(row)) is None:
-            faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
-            continue
-        read.append((i, values, lost, driver))
-    pairs = {}
-    formulas = {}
-    for name in ACTION_NAMES:
-        rows_of = {i: values for i, values, lost, _ in read if name not in lost}
-        recorded, meant, formula = _read_actions(pwm.channel(name), rows_of, path, faults)
-        pairs[name] = recorded, meant
-        if formula:
-            formulas[name] = formula
-    # Too few readings to show a formula are of older firmware too, if the other channel's are.
-    actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
-    controls = []
-    for i, values, _, driver in read:
-        pair = actions["steering"].get(i), actions["throttle"].get(i)
-        pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
-        times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
-        controls.append(_Control(*times_s, pair, driver, pulses))
-    system_s, arduino_s = (np.abs(np.diff([getattr(c, s) for c in controls])) for s in ("system_s", "arduino_s"))
-    if len(controls) > LEAST_READINGS:
-        # Most of a backlog's steps are too short, but not all of the recording's.
-        known = arduino_s[np.isfinite(arduino_s)]
-        usual_s, live_s = np.median(known) if len(known) else 0.0, np.quantile(system_s, 0.9)
-        if usual_s > 0 and live_s > 0 and not 0.1 < live_s / usual_s < 10:
-            note = f"its steps are {1000 * usual_s:.3g}, the system's clock's {1000 * live_s:.3g} ms; it is not used"
-            faults.add(path, "arduino_clock_not_in_ms", note, len(controls))
-            controls = [replace(c, arduino_s=math.nan) for c in controls]
-    went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
-    return _in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
-
-
-def _read_actions(
-    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
-) -> tuple[dict[int, float], dict[int, float], Formula | None]:
-    """Return one channel's recorded actions by the number of their control, those that their pulses mean, and the
-    formula that the recorded ones follow, if it is another than the car's. Those that were not measured are left out.
-
-    Raises EpisodeError if they follow none.
-    """
-    name = channel.name
-    recorded, meant = {}, {}
-    duties_pct = {}
-    for i, values in rows.items():
-        action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
-        if any(math.isnan(v) for v in (action, pulse_us, period_us)):
-            continue  # the caller has counted it, with the field's name
-        expected = channel.action(pulse_us, period_us)
-        if expected is None:
-            kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
-            note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
-            faults.add(path, f"{name}_{kind}", note)
-            continue
-        recorded[i], meant[i] = action, expected
-        duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
-    found, expects, duties = (np.array(list(of.values())) for of in (recorded, meant, duties_pct))
-    _refuse_other_pulses(channel, rows, duties_pct)
-    half_unit = half_unit_of(found)
-    off = np.abs(found - expects)
-    agrees = off <= EXACT + half_unit
-    # Firmware may have been changed within a recording, so only what disagrees must follow another formula.
-    formulas = formulas_of(channel, found[~agrees], duties[~agrees], half_unit)
-    unlike = len(found) >= LEAST_READINGS and agrees.mean() < FOLLOWS
-    rounded = half_unit and not formulas and agrees.mean() >= FOLLOWS and (off > EXACT).any()
-    if formulas or unlike or rounded:
-        wrong = off > EXACT if rounded else ~agrees
-        first = next(i for i, is_wrong in zip(recorded, wrong, strict=True) if is_wrong)
-        seen = f"control {first}: {recorded[first]:g} recorded, its pulse says {meant[first]:.4f}"
-        if unlike and not formulas:
-            raise EpisodeError(
-                f"{name} follows no formula of its pulses: {100 * agrees.mean():.0f} % the car's, the rest no line",
-                found=seen,
-                remedy="correct them, or record again",
-            )
-        said = f"recorded as {', then as '.join(map(str, formulas))} instead of {Formula.of(channel)}"
-        note = f"{f'rounded to {2 * half_unit:g}' if rounded else said}; {seen}; recomputed from the pulses"
-        faults.add(path, f"{name}_recomputed", note, int(wrong.sum()))
-        return meant, meant, formulas[0] if formulas else None
-    return recorded, meant, None
-
-
-def _refuse_other_pulses(channel: Channel, rows: dict[int, dict[str, float]], duties_pct: dict[int, float]) -> None:
-    """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
-    (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
-    pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
-    far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
-    if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        row = rows[far[0]]
-        raise EpisodeError(
-            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us",
-            found=f"control {far[0]}: {row[f'{channel.name}_raw_us']:g} us of {row[f'{channel.name}_period_us']:g} us",
-            remedy="write pulses and periods in microseconds, or say which car it is in metadata.car",
-        )
-
-
-def _take(
-    channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
-) -> dict[int, float]:
-    """Return the actions of one channel, as recorded, or where pulses deny them, as these mean them if `recompute`."""
-    name = channel.name
-    for i, action in list(recorded.items()):
-        if recompute and abs(action - meant[i]) > EXACT:
-            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; recomputed from the pulses"
-            faults.add(path, f"{name}_recomputed", note)
-            recorded[i] = meant[i]
-        elif not channel.low <= action <= channel.high:
-            faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
-            del recorded[i]
-        elif abs(action - meant[i]) > EXACT:
-            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; taken as recorded"
-            faults.add(path, f"{name}_disagrees_with_pulse", note)
-    return recorded
-
-
-def _in_order(
-    timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: Faults
-) -> list[Item]:
-    """Sort the items by time, keeping the order of equal times, and count the steps back in time.
-
-    If the clock was set back, everything from there on is left out. timed: (time in seconds, item), in the file's
-    order. went_on: for each item but the first, whether it was made after the one before it, whatever their times say.
-    """
-    times_s = [time_s for time_s, _ in timed]
-    end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
-    note = f"the clock was set back at {what} {end}; from there on, times may be those of other moments"
-    faults.add(path, f"clock_set_back_at_{what}", note, len(timed) - end)
-    back = sum(b < a for a, b in pairwise(times_s[:end]))
-    faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", back)
-    return [item for _, item in sorted(timed[:end], key=lambda pair: pair[0])]
-
-
-def _was_set_back(times_s: list[float], i: int) -> bool:
-    """Whether the two times before `i` are both later than those at `i` and `i + 1`.
-
-    A single wrong time does not mean that the clock was set back.
-    """
-    return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])
-
-
-def _place_bursts(controls: list[_Control], path: Path, faults: Faults) -> list[_Control]:
-    """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
-    placed: list[_Control] = []
-    moved = dropped = 0
-    farthest_s = 0.0
-    end = len(controls)
-    while end:
-        # A burst and the live control that ends it: late[start..end-2] are true, late[end-1] is not.
-        start = end - 1
-        while start and late[start - 1]:
-            start -= 1
-        run, end = controls[start:end], start
-        placed.append(run[-1])
-        if len(run) - 1 < BURST_MIN:
-            placed.extend(reversed(run[:-1]))
-            continue
-        for k in range(len(run) - 2, -1, -1):
-            control, after = run[k], run[k + 1]
-            step_s = arduino_step_s(control.arduino_s, after.arduino_s)
-            if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
-                dropped += k + 1
-                break
-            time_s = placed[-1].system_s - step_s
-            farthest_s = max(farthest_s, control.system_s - time_s)
-            placed.append(replace(control, system_s=time_s))
-            moved += 1
-    faults.add(
-        path, "serial_burst", f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived", moved
-    )
-    faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
-    return sorted(placed, key=lambda c: c.system_s)
-
-
 def _inside(path: Path, folder: Path) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
@@ -566,8 +317,6 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if math.isnan(number) or math.isnan(time_s):
             faults.add(path, "not_finite", f"frame {i}: {quote(row.get('timestamp'))}")
             continue
-        if _is_no_second(time_s, f"frame {i}", path, faults):
-            continue
         if number in numbers:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
@@ -582,25 +331,14 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             faults.add(frame.path, "another_size", note)
             frames[i] = replace(frame, size=None)
     went_on = [b.number > a.number for a, b in pairwise(frames)]
-    frames = _in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
+    frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
     for frame in frames[1:]:
         if frame.time_s > kept[-1].time_s:
             kept.append(frame)
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
-    if 2 * len(kept) < len(frames):
-        note = f"{len(frames)} frames have {len(kept)} different times; write them to the millisecond"
-        faults.add(path, "coarse_times", note, len(kept))
-        return []
     return kept
-
-
-def _is_no_second(time_s: float, which: str, path: Path, faults: Faults) -> bool:
-    """Whether a time is none in seconds since 1970, but in milliseconds: a fault then says so."""
-    if time_s > LAST_S:
-        faults.add(path, "not_seconds", f"{which} was at {time_s:.0f}, which is no time in seconds; divide by 1000")
-    return time_s > LAST_S
 
 
 def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
@@ -643,7 +381,7 @@ def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
 
 
 def _actions_of(
-    frames: list[_Frame], controls: list[_Control], sync_s: float
+    frames: list[_Frame], controls: list[Control], sync_s: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Return for each frame its action, (n, 2) float32, whether it has one, (n,), whether any control is near, (n,),
     and the pulses of each action in microseconds, (n, 2), and who drove.
@@ -674,7 +412,7 @@ def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tupl
 
 
 def _make_samples(
-    folder: Path, car: Car, frames: list[_Frame], controls: list[_Control], chunk: int, sync_s: float, faults: Faults
+    folder: Path, car: Car, frames: list[_Frame], controls: list[Control], chunk: int, sync_s: float, faults: Faults
 ) -> tuple[Sample, ...]:
     actions, known, near, pulses_us, drivers = _actions_of(frames, controls, sync_s)
     if not near.any():

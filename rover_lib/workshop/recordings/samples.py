@@ -250,11 +250,7 @@ class Recordings:
         changed = [e for e in self.episodes if e.formulas]
         if not changed:
             return ""
-        each: list[tuple[str, Formula]] = []
-        for name, formula in (pair for e in changed for pair in e.formulas.items()):
-            if not any(name == n and formula.is_like(f) for n, f in each):
-                each.append((name, formula))
-        found = sorted(f"{name} = {formula}" for name, formula in each)
+        found = sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()})
         return (
             f"the actions of {len(changed)} of {len(self.episodes)} episodes were recomputed from their pulses, "
             f"as they follow another formula: {', '.join(found)}"

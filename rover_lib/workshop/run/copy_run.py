@@ -2,10 +2,9 @@
 
     python -m rover_lib.workshop.run.copy_run demo try1     # what `make notebooks-open NAME=demo AS=try1` does
 
-The copy is a run like any other: `rover report runs/try1` judges it again, and `rover list` says whether it must.
+The copy is a run like any other: `rover report runs/try1` judges it again, and `rover inspect` says whether it must.
 """
 
-import json
 import os
 import re
 import shutil
@@ -26,7 +25,7 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     """
     source, folder = (run_folder(runs_dir, n, NotebookError) for n in (name, copy or f"{name}-copy"))
     if not (source / f"{NAMES[0]}.ipynb").is_file():
-        raise NotebookError(f"there is no run {source}", remedy="rover list shows the runs that there are")
+        raise NotebookError(f"there is no run {source}", remedy="rover inspect shows the runs that there are")
     if folder == source:
         raise NotebookError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
     if (folder / f"{NAMES[0]}.ipynb").is_file():
@@ -36,9 +35,8 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     with build_beside(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
-        own = "run_dir = " + json.dumps(json.dumps(str(folder)))[1:-1]
-        for path in new.glob("*.ipynb"):  # whatever folder papermill wrote there: the run may have been moved since
-            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', lambda _: own, path.read_text()))
+        for path in new.glob("*.ipynb"):  # earlier versions wrote the run's own folder into them
+            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', r"run_dir = \".\"", path.read_text()))
     return folder
 
 

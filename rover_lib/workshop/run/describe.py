@@ -1,4 +1,4 @@
-"""Describe a file or a folder of this project, for `rover inspect`, and list the runs, for `rover list`."""
+"""Describe a file or a folder of this project, or the runs in it, for `rover inspect`."""
 
 import json
 import shlex
@@ -12,6 +12,7 @@ from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Source
 
+FIRST = "make demo, or rover run, makes the first"
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
 STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
@@ -23,6 +24,11 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     """
     path, kinds = source.path, kinds_of(source.path)
     kind = kinds[0] if kinds else None
+    if path == Path("runs") or (kind is None and path.is_dir()):
+        if found := runs(path):
+            return {"runs": {run["name"]: run["verdict"] for run in found}}
+        if path == Path("runs"):
+            raise RoverError(f"{path}: no run in it", remedy=FIRST)
     if kind == "artifact":
         from rover_lib.onboard.cli import describe_artifact
 
@@ -91,7 +97,7 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
     """{name, verdict} of each run in a folder such as runs/, by name. Raises RoverError if there is no such folder."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise RoverError(f"{folder}: no such folder", remedy="make demo, or rover run, makes the first run")
+        raise RoverError(f"{folder}: no such folder", remedy=FIRST)
     paths = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     return [{"name": p.name, "verdict": verdict_of(p)} for p in paths if set(kinds_of(p)) & {"run", "pretrained"}]
 

@@ -13,7 +13,7 @@ import re
 import shutil
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -37,12 +37,26 @@ NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Notebooks for a finished run, which `make count` and `rover world latency`, `students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
+# Parameters of notebooks whose defaults are in params.yml, with their places there.
+IN_PARAMS = {
+    "samples": ("calibration", "samples"),
+    "seed": ("calibration", "seed"),
+    "smooth": ("quantization", "smooth"),
+    "scheme": ("quantization", "scheme"),
+    "observers": ("quantization", "observers"),
+    "percentile": ("quantization", "percentile"),
+    "iterations": ("benchmark", "iterations"),
+    "threads": ("benchmark", "threads"),
+}
 KERNEL_ENVIRONMENT = {
     "OMP_WAIT_POLICY": "PASSIVE",  # rover_lib/__init__.py says why; a cell may import torch before it
     # Two known warnings would only be noise in a stored output: QNNPACK ignores reduce_range, tqdm misses widgets.
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
+
+
+LINE = re.compile(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", re.M)  # of a parameters cell
 
 
 class NotebookError(RoverError):
@@ -65,10 +79,14 @@ def parameters_of(notebook: Path) -> set[str]:
 
 def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
     """Return (name, literal, comment) for each line of the notebook's `parameters` cell."""
-    for cell in nbformat.read(notebook, as_version=4).cells:
-        if "parameters" in cell.metadata.get("tags", []):
-            return re.findall(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", cell.source, re.M)
-    return []
+    return [(name, literal, comment) for name, literal, comment in LINE.findall(_parameters_cell(notebook)[1].source)]
+
+
+def _parameters_cell(notebook: Path) -> tuple[Any, Any]:
+    """Read a notebook; return it with its `parameters` cell, which is empty and elsewhere if it has none."""
+    content = nbformat.read(notebook, as_version=4)
+    cells = [cell for cell in content.cells if "parameters" in cell.metadata.get("tags", [])]
+    return content, cells[0] if cells else nbformat.v4.new_code_cell()
 
 
 def run(
@@ -88,11 +106,9 @@ def run(
     tqdm.tqdm(iterable, desc=, total=). timed: False leaves out the last notebook, the benchmark, so that it can be
     executed at another time.
 
-    The new run is made beside the old one of that name, in .<name>.new, and replaces it when it is complete. If each
-    stage replaced its own files instead, a run that fails at its third notebook would destroy the policies of the last
-    good one and leave a mixture of two runs' reports. So for a while both are on the disk, about 570 MB each for a
-    full-size policy. Only a run's own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of
-    other hosts stay.
+    The new run is made in .<name>.new beside the old one of that name, and its files replace the old one's when it is
+    complete: a run that fails at its third notebook shall not destroy the policies of the last good one. Only a run's
+    own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of other hosts stay.
 
     Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C or kill -9,
     the old run is as it was, and what the finished notebooks made waits in .<name>.new: the same command continues.
@@ -111,10 +127,8 @@ def run(
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
     with build_beside(folder, files_of_a_run, asked) as new:
-        given["run_dir"] = str(new)
         finished = {path.name for path in new.glob("*.ipynb")}
-        others = _benchmarks_of_other_hosts(folder)
-        for path in others:  # notebook 05 shows them
+        for path in folder.glob("benchmark-*.json"):  # notebook 05 shows those of other hosts
             shutil.copy2(path, new)
         executed = sources if timed else sources[:-1]
         try:
@@ -126,9 +140,6 @@ def run(
             if {path.name for path in new.glob("*.ipynb")} <= finished:  # the next one shall not fail there again
                 (new / ASKED).unlink(missing_ok=True)
             raise
-        for path in others:
-            (new / path.name).unlink()
-        _say_final_paths(new, folder)
     return folder
 
 
@@ -141,18 +152,12 @@ def files_of_a_run(folder: Path) -> list[Path]:
     return [path for path in own if path.exists()]
 
 
-def _benchmarks_of_other_hosts(folder: Path) -> list[Path]:
-    return [p for p in folder.glob("benchmark-*.json") if p.stem != f"benchmark-{socket.gethostname()}"]
-
-
-def _say_final_paths(new: Path, folder: Path) -> None:
-    """Replace the path of the folder in which the files were made by that of their final folder."""
-    for path in [*new.glob("*.json"), *new.glob("*.ipynb")]:
-        text = path.read_text()
-        final = text.replace(str(new), str(folder)).replace(json.dumps(str(new))[1:-1], json.dumps(str(folder))[1:-1])
-        if final != text:
-            with atomic_path(path) as temporary:  # if we are killed here, the next one takes them for finished
-                temporary.write_text(final)
+def find_notebook(asked: str) -> str:
+    """The name of the notebook that begins like `asked`, such as 04. Raises NotebookError if there is none."""
+    found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
+    if len(found) != 1:
+        raise NotebookError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
+    return found[0]
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
@@ -165,37 +170,48 @@ def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS
     if not source.is_file() or not folder.is_dir():
         missing = folder if source.is_file() else source
         raise NotebookError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
-    if unknown := sorted(set(overrides) - parameters_of(source)):  # papermill would only warn, and work for minutes
+    if unknown := sorted(set(overrides) - parameters_of(source)):
         known = sorted(parameters_of(source) - {"run_dir"})
         raise NotebookError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
-    _execute(source, folder, {"run_dir": str(folder), **overrides}, False)
+    _execute(source, folder, overrides, False)
     return folder / source.name
 
 
-def _execute(source: Path, folder: Path, given: dict[str, Any], bars: bool) -> None:
+def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -> None:
+    """Execute a notebook in a run's folder. given: what its parameters are, instead of params.yml's and its own."""
     # Imported here, because it takes a second, and the kernels import this module too and do not need it.
     import papermill
     from nbclient.exceptions import DeadKernelError
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
-    terminal = os.ttyname(sys.stderr.fileno()) if bars and _is_terminal(sys.stderr) else ""
-    log = f"/proc/{os.getpid()}/fd/{sys.stderr.fileno()}" if bars and not terminal and _has_number(sys.stderr) else ""
-    places = {TTY_VARIABLE: terminal, LOG_VARIABLE: log}
+    places = {TTY_VARIABLE: "", LOG_VARIABLE: ""} | (_place_of(sys.stderr) if bars else {})
+    how = {"cwd": str(folder), "progress_bar": False, "kernel_name": "python3", "kernel_manager_class": ThisPython}
     with set_environment({**places, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
         try:
-            papermill.execute_notebook(
-                str(source),
-                str(temporary),
-                parameters=given,
-                cwd=str(folder),
-                progress_bar=False,
-                kernel_name="python3",
-                kernel_manager_class=ThisPython,
-            )
+            papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
         except papermill.PapermillExecutionError as e:
             raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
             raise NotebookError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e
+
+
+def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
+    """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml.
+
+    A parameter that is turned there acts, in whichever folder the notebook lies: its run is where it is executed.
+    """
+    values, p = {"run_dir": ".", **given}, params()
+    notebook, cell = _parameters_cell(source)
+    lines = []
+    for name, literal, comment in LINE.findall(cell.source):
+        if name in values:
+            literal = repr(str(values[name]) if isinstance(values[name], Path) else values[name])
+        elif name in IN_PARAMS:
+            section, key = IN_PARAMS[name]
+            literal = repr(p[section][key])
+        lines.append(f"{name} = {literal}" + (f"  # {comment}" if comment else ""))
+    cell.source = "\n".join(lines)
+    return notebook
 
 
 @contextmanager
@@ -213,18 +229,14 @@ def set_environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[key] = value
 
 
-def _is_terminal(stream: Any) -> bool:
-    try:
-        return os.isatty(stream.fileno())
-    except (AttributeError, OSError, ValueError):
-        return False
-
-
-def _has_number(stream: Any) -> bool:
-    """Whether a stream is a file of the system, which a kernel can open too."""
+def _place_of(stream: Any) -> dict[str, str]:
+    """Where a kernel writes its progress: the stream's terminal, or the file that it is; none if it is neither."""
     with suppress(AttributeError, OSError, ValueError):
-        return bool(stream.fileno() >= 0)
-    return False
+        number = stream.fileno()
+        if os.isatty(number):
+            return {TTY_VARIABLE: os.ttyname(number)}
+        return {LOG_VARIABLE: f"/proc/{os.getpid()}/fd/{number}"}
+    return {}
 
 
 def _sentence(error: Any) -> str:

@@ -9,26 +9,28 @@ import re
 import shutil
 import sys
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup, escape
 
+from rover_lib.onboard.artifact.acceptance import THIS_CAR
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.release import THIS_CAR
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.judge.advice import CALLED, Names, against
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
-from rover_lib.workshop.judge.verdict import CALLED, Names, against, count, error_pct, verdict
+from rover_lib.workshop.judge.verdict import headline, verdict
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
 CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
+AGAIN = "'rover run' of its checkpoint makes it again"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
@@ -52,7 +54,9 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     try:
         made = contents["quantize"]["metrics"]["modes"]
         _refuse_other_artifacts(folder, made, contents["compare"]["inputs"])
-        files["benchmark"] = _benchmark(folder, made)
+        if (timed := benchmark_of(folder, made)) is None:
+            raise RoverError(f"{folder}: no benchmark of its artifacts, only of others", remedy=AGAIN)
+        files["benchmark"] = timed
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
         names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
@@ -61,45 +65,26 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
         judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
     except KeyError as missing:
-        raise RoverError(
-            f"{folder}: what its stages left has no {missing}",
-            remedy="was it made by another version? 'rover run' of its checkpoint makes it again",
-        ) from missing
+        raise RoverError(f"{folder}: its stages lack {missing}, as of another version", remedy=AGAIN) from missing
     inputs = {path.name: sha256_of(path) for path in files.values()}
-    content = write_stage(
-        folder / "run.json", "run", params={"verdict": p["verdict"], "gates": p["gates"]}, metrics=judged, inputs=inputs
-    )
-    figures = {name: (folder / "figures" / f"{name}.png") for name in FIGURES}
-    drawn = {name: path.read_bytes() for name, path in figures.items() if path.is_file()}
-    beside = [path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))]
+    given = {"verdict": p["verdict"], "gates": p["gates"]}
+    content = write_stage(folder / "run.json", "run", params=given, metrics=judged, inputs=inputs)
     with atomic_path(folder / PAGE) as temporary:
-        temporary.write_text(page(content, names.name, drawn, beside))
+        temporary.write_text(page(content, folder, names.name))
     return content
 
 
 def _files(folder: Path) -> dict[str, Path]:
     """The JSON of each stage but the benchmark. Raises RoverError for one that is missing, and without a benchmark."""
     if not folder.is_dir():
-        raise RoverError(f"{folder}: there is no such run", remedy="rover list shows the runs that there are")
+        raise RoverError(f"{folder}: no such run", remedy="rover inspect shows the runs that there are")
     files = {stage: folder / f"{stage}.json" for stage in (*STAGES, *LATER)}
     missing = [files[stage].name for stage in STAGES if not files[stage].is_file()]
     if not any(folder.glob("benchmark-*.json")):
         missing.append("benchmark-<host>.json")
     if missing:
-        raise RoverError(
-            f"{folder}: no verdict without {', '.join(missing)}", remedy="rover run makes them, of a checkpoint"
-        )
+        raise RoverError(f"{folder}: no verdict without {', '.join(missing)}", remedy=AGAIN)
     return {stage: path for stage, path in files.items() if path.is_file()}
-
-
-def _benchmark(folder: Path, modes: Mapping[str, Any]) -> Path:
-    """The benchmark of the run's own artifacts. Raises RoverError if there is none."""
-    path = benchmark_of(folder, modes)
-    if path is None:
-        raise RoverError(
-            f"{folder}: no benchmark of its artifacts, only of others", remedy="'rover run' of its checkpoint times it"
-        )
-    return path
 
 
 def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Mapping[str, str]) -> None:
@@ -107,18 +92,12 @@ def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Ma
     figures are of another. modes: quantize.json's. compared: compare.json's inputs.
     """
     if not is_of(compared, modes):
-        raise RoverError(
-            f"{folder / 'compare.json'}: is of other artifacts than this run's",
-            remedy="'rover run' of its checkpoint compares them",
-        )
+        raise RoverError(f"{folder / 'compare.json'}: is of other artifacts than this run's", remedy=AGAIN)
     for mode, made in modes.items():
         path = folder / f"policy_{mode}.pt"
         if path.is_file() and (found := content_hash(path)) != made["content_hash"]:
-            raise RoverError(
-                f"{path}: is not the artifact that this run made, and its figures are not of it",
-                found=f"content {found[:12]} instead of {made['content_hash'][:12]}",
-                remedy="'rover run' of its checkpoint judges it",
-            )
+            contents = f"content {found[:12]} instead of {made['content_hash'][:12]}"
+            raise RoverError(f"{path}: not the artifact that this run made", found=contents, remedy=AGAIN)
 
 
 def _relative(path: Path | str) -> str:
@@ -137,16 +116,6 @@ def typed(command: str) -> str:
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
-def headline(judged: Mapping[str, Any]) -> str:
-    """The verdict in one line, as `rover list` shows it."""
-    failed = judged["failed"]
-    misses = f"; {count(len(failed), 'gate')} failed" if failed else ""
-    if judged["deploy"] is None:
-        return f"{'to benchmark only: no policy for this car' if judged['ready'] else 'not ready to drive'}{misses}"
-    row = next(row for row in judged["modes"] if row["mode"] == judged["deploy"])
-    return f"deploy {judged['artifact']}, {row['size_mb']:.1f} MB, {error_pct(row):.2f} % off{misses}"
-
-
 def text(judged: Mapping[str, Any]) -> str:
     """The verdict for a terminal, in lines."""
     lines = [f"Verdict: {judged['headline']}", *(f"  {line}" for line in judged["why"]), "", *table(judged)]
@@ -163,23 +132,15 @@ def text(judged: Mapping[str, Any]) -> str:
 def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The modes beside each other, a header first: for a terminal and for a page. A dash where nothing was measured."""
     actions = list(dict.fromkeys(action for row in judged["modes"] for action in row["errors_pct"]))
-    counted = any(row["instructions_g"] for row in judged["modes"])
-    header = [
-        "",
-        "MB",
-        "times smaller",
-        *(f"{action} error, %" for action in actions),
-        "hits",
-        judged["compared"],
-        "times faster",
-    ]
-    lines = [tuple([*header, *(["10^9 instructions"] if counted else [])])]
+    counted = ("10^9 instructions",) if any(row["instructions_g"] for row in judged["modes"]) else ()
+    errors = (f"{action} error, %" for action in actions)
+    lines = [("", "MB", "times smaller", *errors, "hits", judged["compared"], "times faster", *counted)]
     for row in judged["modes"]:
-        errors = [number(row["errors_pct"].get(action), ".2f") for action in actions]
-        hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
-        cells = [CALLED[row["mode"]], f"{row['size_mb']:.1f}", f"{row['times_smaller']:.1f}", *errors, hits]
-        cells += [number(row["time_ms"], ".1f"), number(row["times_faster"], ".1f")]
-        lines.append(tuple([*cells, *([number(row["instructions_g"], ".3g")] if counted else [])]))
+        cells = [CALLED[row["mode"]], number(row["size_mb"]), number(row["times_smaller"])]
+        cells += [number(row["errors_pct"].get(action), ".2f") for action in actions]
+        cells += [f"{row['hits']} of {row['trials']}" if row["trials"] else "-", number(row["time_ms"])]
+        cells += [number(row["times_faster"]), *(number(row["instructions_g"], ".3g") for _ in counted)]
+        lines.append(tuple(cells))
     return lines
 
 
@@ -202,49 +163,46 @@ def write_card(run_dir: Path | str) -> Path:
     """
     folder = Path(run_dir)
     judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
-    path, recordings = folder / "README.md", load["recordings"]
+    path = folder / "README.md"
     if path.exists() and CARD not in path.read_text(errors="replace"):
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
-    recorded = f"{count(recordings['episodes'], 'episode')}, {recordings['samples']} frames"
-    use, cautions = "No artifact of this policy should drive a car.", judged["cautions"]
-    if judged["artifact"]:
-        use = f"To drive, in a checkout of {CARD}: `rover drive {judged['artifact']}`. "
-        use += "In LeRobot: `python -m lerobot_robot_rover ARTIFACT FOLDER`."
-        cautions = cautions or ["Nothing speaks against it."]
-    text = [
-        "---", "library_name: lerobot", "pipeline_tag: robotics", "tags: [lerobot, robotics, act, int8]", "---", "",
-        f"# {folder.resolve().name}: {judged['headline']}", "", *judged["why"], "",
-        f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows), "",
-        f"Errors are mean differences from FP32, in percent of the recorded range. Speed: {judged['timing']}.", "",
-        f"Calibrated and judged on {recorded}: {recordings['layout'].replace('|', '/')}.", "",
-        use, "", "## Keep in mind", "", *(f"- {line}" for line in cautions), "",
-    ]  # fmt: skip
-    path.write_text("\n".join(text))
+    recordings = load["recordings"]
+    card = _pages(escaped=False).get_template("card.md")
+    path.write_text(
+        card.render(name=folder.resolve().name, judged=judged, header=header, rows=rows, recordings=recordings)
+    )
     return path
 
 
-def page(content: Mapping[str, Any], name: str, figures: Mapping[str, bytes], files: Sequence[str] = ()) -> str:
-    """run.json as one HTML page that needs no other file. name: the run's. figures: PNGs by their names in FIGURES.
-    files: names of files beside it, to which it links.
-    """
+def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
+    """run.json as one HTML page that needs no other file. folder: of the run, with its figures. name: the run's."""
     judged, env = content["metrics"], content["env"]
     header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
-    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-    pages.filters["words"] = _to_html
-    return pages.get_template(PAGE).render(
-        name=name,
-        judged=judged,
-        header=header,
-        rows=rows,
-        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
-        worth=_worth(judged),
-        figures=[(FIGURES[figure], b64encode(figures[figure]).decode()) for figure in FIGURES if figure in figures],
-        files=files,
-        made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
-        against=against,
-        typed=typed,
+    drawn = {words: folder / "figures" / f"{figure}.png" for figure, words in FIGURES.items()}
+    return (
+        _pages(escaped=True)
+        .get_template(PAGE)
+        .render(
+            name=name,
+            judged=judged,
+            header=header,
+            rows=rows,
+            kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
+            worth=_worth(judged),
+            figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
+            files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
+            made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+            against=against,
+            typed=typed,
+        )
     )
+
+
+def _pages(*, escaped: bool) -> Environment:
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=escaped)
+    pages.filters["words"] = _to_html
+    return pages
 
 
 def _to_html(line: str) -> Markup:

@@ -32,17 +32,21 @@ class Opened:
 
 
 def load(
-    checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent, units: Units | None = None
+    checkpoint: Path | str,
+    episodes: Path | str | Source,
+    progress: Progress = silent,
+    units: Units | None = None,
+    checked: str | None = None,
 ) -> Opened:
     """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
     For a LeRobot policy, the cameras that the policy uses are read from a LeRobotDataset unless the user chose others,
     and the policy gets the dataset's order and rate of numbers. One that was trained on the actions of older firmware
-    gets today's units. units: those that an earlier call found, see `in_todays_units`. Raises CheckpointError and
-    EpisodeError.
+    gets today's units. units: those that an earlier call found, see `in_todays_units`. checked: as of
+    `load_checkpoint`. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
-    policy = load_checkpoint(checkpoint)
+    policy = load_checkpoint(checkpoint, checked)
     check_sizes(policy)  # a sample has as many actions as a plan; with a million, a few frames would fill the memory
     source = Source.of(episodes)
     if policy.format == "lerobot" and not source.cameras:  # the trainer's file does not say what its camera is called
@@ -103,7 +107,7 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
         torch.set_num_threads(1)
     # To find them again would take planning. A run of before they were kept says only in words that there are any.
     units = loaded.get("units") if "units" in loaded.get("normalisation", {}) else {}
-    again = load(given["checkpoint"], Source.loaded(given), progress, units)
+    again = load(given["checkpoint"], Source.loaded(given), progress, units, loaded["sha256"])
     now, root = again.checkpoint, again.recordings.root
     layout = stage["metrics"].get("recordings", {}).get("layout")
     words = again.recordings.layout.words()

@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.workshop.act import ACT, ActConfig, Affine, inputs_of, predictions
+from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation
-from rover_lib.workshop.recordings.formula import OLD, Formula
+from rover_lib.workshop.recordings.formula import OLD
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
 FRAMES = 8  # planned twice, in FP32
-Units = Mapping[str, Sequence[float]]  # by action, neutral_pct and span_pct of the formula that the policy speaks
+Units = Mapping[str, Sequence[float]]  # by action, neutral_pct and span_pct of the formula that the policy learned
 BETTER = 0.5  # the files' reading must leave at most this share of the error; one of the two is off by 222 us
 
 
@@ -36,48 +36,43 @@ def in_todays_units(
         return policy
     car = car_of(recordings.samples)
     if known is not None:
-        formulas = {n: Formula(at, span, OLD[n].low, OLD[n].high) for n, (at, span) in known.items()}
-        return _in_units_of(policy, car, formulas) if formulas else policy
-    few = pick_evenly(samples, FRAMES)
-    recorded: dict[str, Formula] = {n: f for e in recordings.episodes for n, f in e.formulas.items()}
+        return _in_units_of(policy, car, known) if known else policy
+    recorded = {n: OLD[n] for e in recordings.episodes for n in e.formulas}
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
         tried.append(OLD)
+    few = pick_evenly(samples, FRAMES)
     best, least = policy, BETTER * _error(policy, few) if tried else 0.0
     for formulas in tried:
-        converted = _in_units_of(policy, car, formulas)
+        converted = _in_units_of(policy, car, {n: (f.neutral_pct, f.span_pct) for n, f in formulas.items()})
         if (error := _error(converted, few)) <= least:
             best, least = converted, error
     return best
 
 
-def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) -> Checkpoint:
+def _in_units_of(policy: Checkpoint, car: Car, units: Units) -> Checkpoint:
     """Return the policy with today's actions outside, and those of the formulas inside."""
     # What a file says is gain * action + offset.
-    gains, offsets = [], []
-    for name in ACTION_NAMES:
-        channel = car.pwm.channel(name)
-        formula = formulas.get(name, Formula.of(channel))
-        gains.append(channel.span_pct / formula.span_pct)
-        offsets.append((channel.neutral_pct - formula.neutral_pct) / formula.span_pct)
-    converted = replace(policy, config=_convert(policy.config, np.array(gains), np.array(offsets)))
-    said = ", ".join(f"{name} = {formula}" for name, formula in formulas.items())
-    words = normalisation(converted.config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
-    units = {name: [formula.neutral_pct, formula.span_pct] for name, formula in formulas.items()}
-    return replace(converted, report=policy.report | {"normalisation": words, "units": units})
+    channels = [car.pwm.channel(name) for name in ACTION_NAMES]
+    neutral, span = np.array([units.get(c.name, (c.neutral_pct, c.span_pct)) for c in channels]).T
+    gains = np.array([c.span_pct for c in channels]) / span
+    offsets = (np.array([c.neutral_pct for c in channels]) - neutral) / span
+    same = Affine((1.0, 1.0), (0.0, 0.0))
+    state, action = policy.config.state_norm or same, policy.config.action_unnorm or same
+    scale, shift = np.array(action.scale), np.array(action.shift)
+    config = replace(
+        policy.config,
+        state_norm=_affine(np.array(state.scale) * gains, np.array(state.scale) * offsets + np.array(state.shift)),
+        action_unnorm=_affine(scale / gains, (shift - offsets) / gains),
+    )
+    said = ", ".join(f"{name} = (duty % - {at:g}) / {by:g}" for name, (at, by) in units.items())
+    words = normalisation(config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
+    report = policy.report | {"normalisation": words, "units": {name: list(pair) for name, pair in units.items()}}
+    return replace(policy, config=config, report=report)
 
 
-def _convert(config: ActConfig, gains: np.ndarray, offsets: np.ndarray) -> ActConfig:
-    def values(norm: Affine | None) -> tuple[np.ndarray, np.ndarray]:
-        return (np.ones(2), np.zeros(2)) if norm is None else (np.array(norm.scale), np.array(norm.shift))
-
-    def affine(scale: np.ndarray, shift: np.ndarray) -> Affine:
-        return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
-
-    scale, shift = values(config.state_norm)
-    state = affine(scale * gains, scale * offsets + shift)
-    scale, shift = values(config.action_unnorm)
-    return replace(config, state_norm=state, action_unnorm=affine(scale / gains, (shift - offsets) / gains))
+def _affine(scale: np.ndarray, shift: np.ndarray) -> Affine:
+    return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
 
 def _error(policy: Checkpoint, samples: Sequence[Sample]) -> float:

@@ -17,24 +17,20 @@ from lab.a76 import core as a76
 from lab.a76 import count_run as counting
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, CountError, emulate, prepare
-from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, write_observations
+from lab.a76.count import STEADY, Counted, count_artifact
 from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
-from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.care import pi5
-from rover_lib.onboard.errors import QuantizeError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT
-from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
-# Of the tiny policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
-BUDGETS_M = {"policy_fp32": 195.7, "policy_static": 35.2, "policy_static.onnx": 39.2}
+# Of the thin policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
+BUDGETS_M = {"policy_fp32": 55.8, "policy_static": 35.2, "policy_static.onnx": 39.2}
 SVC = 0xD4000001
 SMALL = "policy_static_54x96"
 START, ROUNDS, SECTION = 0x400000, 1000, 7
@@ -91,13 +87,9 @@ def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
     ("words", "cycles"),
     [
         ([0x4E829420] * 6, 3),  # sdot: two a cycle
-        ([0x4EA29C20] * 2, 4),  # mul v0.4s: only the first pipe multiplies integers, in two cycles
         ([0x4E21D820], 2),  # scvtf v0.4s, v1.4s: the first pipe converts, in two cycles
-        ([0x4F821020] * 4, 2),  # fmla v0.4s by element: two a cycle
-        ([0xAD400560] * 2, 2),  # ldp q0, q1: two accesses each, two a cycle
         ([0x4C402160] * 2, 4),  # ld1 of four registers
         ([0x3D800160] * 3, 3),  # str q0: one a cycle
-        ([0x3DC00160] * 4, 2),  # ldr q0: two a cycle
         ([0xF9400160, 0xF9800160], 1),  # a load, and a prefetch, which is no store
     ],
 )
@@ -130,16 +122,6 @@ def test_lines_are_counted_by_the_cache_that_lacks_them(plugin_only, tmp_path, a
     path = program(tmp_path / "walks", [*code, *mov(8, 93), *mov(0, 0), SVC])
     done = emulate(plugin_only, [path], tmp_path, watch=f"memory={SECTION}")
     assert (done.near_lines(SECTION), done.far_lines(SECTION)) == (near, far)
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    assert not emulate(plugin_only, [path], elsewhere, watch=f"memory={SECTION + 1}").more
-    done = emulate(plugin_only, [path], elsewhere, watch="threads=1")
-    assert done.by_thread(SECTION) == [done.total(SECTION)]
-
-
-def test_a_program_that_fails_ends_in_a_sentence(plugin_only, tmp_path):
-    with pytest.raises(CountError, match=r"ended with 3 after its start: it printed nothing"):
-        emulate(plugin_only, [program(tmp_path / "fails", [*mov(8, 93), *mov(0, 3), SVC])], tmp_path)
 
 
 def test_what_hangs_is_ended(plugin_only, tmp_path, monkeypatch):
@@ -181,13 +163,12 @@ def core(users_cache) -> Core:
 
 
 @pytest.fixture(scope="module")
-def tiny_run(tiny_file, tmp_path_factory) -> Path:
-    """A run's folder with artifacts of the tests' small policy, always the same."""
+def tiny_run(thin, tmp_path_factory) -> Path:
+    """A run's folder with artifacts of the tests' thin policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
-    checkpoint, samples = load_checkpoint(tiny_file), memory_samples(16)
+    (checkpoint, calibration), samples = thin, memory_samples(16)
     # Each parity vector of FP32 takes the emulated core four seconds.
     scheme, options = q.Scheme("static"), {"samples": samples[:1]}
-    calibration = calibrate(checkpoint, samples)
     calibration.save(folder / "calibration.pt")
     export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
@@ -201,11 +182,11 @@ def tiny_run(tiny_file, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def again(tiny_file) -> SimpleNamespace:
+def again(thin) -> SimpleNamespace:
     """What `opened` would give: held-out frames from memory."""
     recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
     parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
-    return SimpleNamespace(checkpoint=load_checkpoint(tiny_file), parts=parts, recordings=recordings)
+    return SimpleNamespace(checkpoint=thin[0], parts=parts, recordings=recordings)
 
 
 @pytest.fixture(scope="module")
@@ -267,26 +248,6 @@ def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     assert "policy_static.onnx" in reports.table(report)
 
 
-@pytest.mark.release  # half a minute more of the emulated core
-def test_a_pi_4_has_no_dot_product(report, counts, tiny_run, again, monkeypatch):
-    """Of four counts one is made here: the others are those of `report`."""
-    count = counting.count_artifact
-
-    def count_new(core, artifact, *args, **options):
-        new = core.cpu == a76.A72 and artifact.stem == "policy_static"
-        return count(core, artifact, *args, **options) if new else counts[artifact.stem]
-
-    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
-    monkeypatch.setattr(counting, "count_artifact", count_new)
-    content = counting.count_other_core(tiny_run, a76.A72)
-    assert read_stage(tiny_run / "arm-cortex-a72.json", "arm") == content
-    rows = content["metrics"]["artifacts"]
-    assert rows["policy_fp32"]["ratio"] == 1 and 1.5 < rows["policy_static"]["ratio"] < 5
-    assert "policy_static" in reports.other_core_table(content)
-    with pytest.raises(CountError, match=r"no policy_fp32\.pt in it"):
-        counting.count_other_core(tiny_run.parent, a76.A72)
-
-
 def test_an_image_size_without_fp32_is_only_counted(report):
     small = report["metrics"]["artifacts"][SMALL]
     assert small["instructions_g"] > small["sdot_g"] > 0
@@ -301,68 +262,14 @@ def test_gates_are_of_what_drives(report):
     assert rows["policy_static cost of the tenth plan against the third, %"]["passed"]
 
 
-def test_the_int8_backbone_is_the_same_bit_for_bit(report):
-    bits = report["metrics"]["backbone_bits"]
-    assert bits == {"frames": 4, "values": 4 * 64 * 3 * 4, "differing": 0}
-
-
-def test_bits_that_differ_are_found(tiny_run, again, tmp_path):
-    counting.cut_backbone(tiny_run, again.checkpoint, memory_samples(1), tmp_path)
-    bits = np.load(tmp_path / "here.npy")
-    bits[0, 0, 0, 0] += 1
-    np.save(tmp_path / "there.npy", bits)
-    assert counting.compare_bits(tmp_path) == {"frames": 1, "values": 64 * 3 * 4, "differing": 1}
-    np.save(tmp_path / "there.npy", bits[0])
-    with pytest.raises(CountError, match="and not on the core"):
-        counting.compare_bits(tmp_path)
-
-
-def test_another_calibration_has_no_bits_to_compare(tiny_run, again, tmp_path):
-    for name in ("policy_static.pt", "quantize.json"):
-        (tmp_path / name).write_bytes((tiny_run / name).read_bytes())
-    calibrate(again.checkpoint, memory_samples(4, seed=5)).save(tmp_path / "calibration.pt")
-    with pytest.raises(QuantizeError, match=r"calibration\.pt are not those of quantize\.json"):
-        counting.cut_backbone(tmp_path, again.checkpoint, memory_samples(1), tmp_path)
-
-
-def test_a_small_fp32_is_compared_on_as_many_frames_as_are_counted(tiny_run):
-    manifests = {path.stem: read_manifest(path) for path in tiny_run.glob("policy_*.pt")}
-    plans = counting.plans_of(manifests, 12)
-    assert (len(plans["policy_fp32"].frames), plans["policy_fp32"].counted) == (COUNTED, COUNTED)
-    assert plans["policy_static"] == counting.Plan("policy_fp32", tuple(range(12)), COUNTED)
-    assert next(iter(plans)) == "policy_fp32"  # takes longest
-
-
 def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
     monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
     monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
     fake = SimpleNamespace(chunks=np.full((STEADY, 32, 2), 0.5, np.float32))
     monkeypatch.setattr(counting, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
     monkeypatch.setattr(counting, "artifact_metrics", lambda counted, manifest: {})
-    monkeypatch.setattr(counting, "compare_bits", lambda folder: {})
     with pytest.raises(CountError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count_run(tiny_run, frames=4)
-
-
-@pytest.mark.release  # half a minute to import torch again on the emulated core; the budgets below hold to 2 %
-def test_a_count_is_repeatable(report, core, tiny_run):
-    again = count_artifact(core, tiny_run / "policy_static.pt", memory_samples(12, seed=1)[:3], counted=3)
-    assert again.steady / 1e9 == pytest.approx(
-        report["metrics"]["artifacts"]["policy_static"]["instructions_g"], rel=0.002
-    )
-
-
-def test_the_guest_reads_the_pictures_of_several_cameras(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(Path(counting.__file__).parent / "guest")
-    from inferences import frame_of
-
-    one, other = memory_samples(2)
-    both = {"front": one.picture, "wrist": other.picture[:40]}
-    samples = [SimpleNamespace(state=one.state, frame_bgr=lambda: both), other]
-    with np.load(write_observations(tmp_path / "seen.npz", samples)) as seen:
-        found = frame_of(seen, 0)
-        assert list(found) == ["front", "wrist"] and all(np.array_equal(found[name], both[name]) for name in both)
-        assert np.array_equal(frame_of(seen, 1), other.picture)
 
 
 def test_a_loaded_policy_is_warm(report):
@@ -372,9 +279,8 @@ def test_a_loaded_policy_is_warm(report):
 
 
 def test_counts_stay_within_their_budget(report):
-    for stem, budget_m in BUDGETS_M.items():
-        counted_m = report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3
-        assert counted_m == pytest.approx(budget_m, rel=0.02), f"{stem}: set BUDGETS_M if it is meant"
+    counted = {stem: report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3 for stem in BUDGETS_M}
+    assert counted == pytest.approx(BUDGETS_M, rel=0.02), "set BUDGETS_M if it is meant"
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):

@@ -1,7 +1,6 @@
 """Other engines: what needs none of them is tested always, the engines themselves with ROVER_PEERS=1."""
 
 import os
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,20 +9,16 @@ import cv2
 import needs
 import numpy as np
 import pytest
-import torch
 from policies import memory_samples
 
 from lab.a76 import peers
-from lab.a76.core import BLOCK, CountError, prepare
+from lab.a76.core import CountError, prepare
 from lab.a76.count import Counted, count_artifact
 from lab.a76.count_run import errors_pct
-from lab.a76.peers import ENGINES, Made
+from lab.a76.peers import ENGINES
 from lab.a76.report import LABEL, artifact_metrics
-from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.artifact.manifest import read_manifest
-from rover_lib.onboard.policy.load import load_policy
-from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
@@ -133,23 +128,6 @@ def test_as_many_layers_are_int8_as_in_ours(tiny, tiny_run):
         peers.check_int8("engine", {"int8_layers": 3, "float_layers": ["a", "b"]}, expected)
 
 
-def test_their_float_policy_is_ours(tiny, tiny_file, monkeypatch):
-    monkeypatch.syspath_prepend(str(peers.FOLDER))
-    from float_policy import float_policy, observations
-
-    sample = memory_samples(1, seed=5)[0]
-    frame = prepare_frame(sample.frame_bgr(), *tiny.config.image_sizes[0])
-    npz = tiny_file.parent / "calibration.npz"
-    np.savez(npz, state=sample.state[None], frames=frame[None])
-    (observation,) = observations(str(npz))
-    model, example = float_policy(str(tiny_file))
-    assert [x.shape for x in example] == [x.shape for x in observation]
-    with torch.inference_mode():
-        given = model(*map(torch.from_numpy, observation))
-        expected = ACT(tiny.config, tiny.weights)(torch.from_numpy(sample.state[None]), torch.from_numpy(frame))
-    torch.testing.assert_close(given, expected, rtol=0, atol=1e-6)
-
-
 def test_counts_of_another_policy_are_refused(tmp_path):
     with pytest.raises(CountError, match=r"arm\.json: not found; count the run's own artifacts first"):
         peers.count_peers(tmp_path)
@@ -158,72 +136,6 @@ def test_counts_of_another_policy_are_refused(tmp_path):
     (tmp_path / "policy_fp32.pt").write_bytes(b"another")
     with pytest.raises(CountError, match=r"counted from another policy_fp32\.pt; count the run's own artifacts"):
         peers.count_peers(tmp_path)
-
-
-@needs.qemu
-def test_blocks_of_a_stripped_library_are_told_apart(tmp_path):
-    source = tmp_path / "one.c"
-    source.write_text("int one(int a) { return a * 3; }\n")
-    subprocess.run(
-        ["gcc", "-shared", "-fPIC", "-fvisibility=hidden", "-s", "-o", tmp_path / "one.so", source], check=True
-    )
-    blocks = np.array([(0x5000001100, 2, 8, 4, 4, 12), (0x5000001140, 1, 5, 0, 0, 9)], BLOCK)
-    names = GuestFunctions(f"5000000000-5000010000 r-xp 0 08:01 1    {tmp_path / 'one.so'}\n")
-    assert by_kernel(blocks, names) == {"[one.so] loops with SDOT": (16, 8, 8), "[one.so]": (5, 0, 0)}
-
-
-@pytest.fixture
-def without_engines(tiny_run, monkeypatch):
-    """count_peers with the engines' part left out: their chunks are our FP32's, steering off by a hundredth."""
-    samples = tiny_run.opened.parts.held_out
-    monkeypatch.setattr(peers, "open_run", lambda run_dir: tiny_run.opened)
-    monkeypatch.setattr(peers, "pick_evenly", lambda given, n: tuple(given[:n]))
-    monkeypatch.setattr(peers, "prepare", lambda progress: None)
-    monkeypatch.setattr(peers, "packages_here", lambda engine: None)
-    monkeypatch.setattr(peers, "packages_there", lambda engine: None)
-
-    def made_by(engine, checkpoint, calibrating, folder):
-        folder.mkdir(exist_ok=True)
-        path = folder / f"{engine.name}{engine.suffix}"
-        path.write_bytes(b"x" * 1_500_000)
-        assert calibrating == tiny_run.opened.parts.calibration
-        return Made(path, {"int8_layers": 7, "float_layers": [], "versions": {"tool": "1"}})
-
-    def count(core, artifact, given, guest, on_step, stop):
-        assert given == (samples[:6] if artifact.suffix in (".onnx", ".pte") else samples[:6:2])
-        policy = load_policy(tiny_run.folder / "policy_fp32.pt", threads=1)
-        on_step()
-        return counted(np.stack([policy.predict_chunk(s.frame_bgr(), s.state) for s in given]) + np.float32([0.01, 0]))
-
-    monkeypatch.setattr(peers, "quantize_with", made_by)
-    monkeypatch.setattr(peers, "count_artifact", count)
-
-
-def without_errors(metrics: dict) -> dict:
-    """The metrics but for errors: the last bits of a plan in float are not the same each time."""
-    rows = metrics["peers"].items()
-    return metrics | {"peers": {name: {k: v for k, v in row.items() if "_mae_" not in k} for name, row in rows}}
-
-
-def test_peers_join_what_was_counted(without_engines, tiny_run):
-    before = arm_json(tiny_run.folder)
-    content = peers.count_peers(tiny_run.folder, frames=6)
-    assert read_stage(tiny_run.folder / "arm.json", "arm") == content
-    assert {k: v for k, v in content["metrics"].items() if k != "peers"} == before["metrics"]
-    assert (content["params"], before["inputs"].items() <= content["inputs"].items()) == (before["params"], True)
-    rows = content["metrics"]["peers"]
-    assert set(rows) == {"torch_fp32", "torch_affine", "onnxruntime", "executorch"}
-    assert rows["torch_fp32"]["artifact"] == "policy_fp32"
-    assert rows["torch_fp32"]["instructions_g"] == 0.2
-    for name in ("torch_affine", "onnxruntime", "executorch"):
-        assert rows[name]["steering_mae_pct"] == pytest.approx(1, rel=1e-3), name
-        assert rows[name]["throttle_mae_pct"] == pytest.approx(0, abs=1e-3), name
-        assert rows[name]["frames_on_the_core"] == (3 if name == "torch_affine" else 6)
-    assert rows["executorch"]["file_mb"] == 1.5
-    assert rows["executorch"]["made_with"] == {"tool": "1"}
-    assert read_manifest(tiny_run.folder / "peers" / "policy_static_affine.pt")["scheme"] == "affine"
-    again = peers.count_peers(tiny_run.folder, frames=6)["metrics"]
-    assert without_errors(again) == without_errors(content["metrics"]), "again, over itself"
 
 
 # --- the engines ------------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
-from rover_lib.onboard.care.release import Releases, pack
 from rover_lib.onboard.policy.load import load_policy
 
 
@@ -36,16 +35,3 @@ def test_loading_opens_it_once(artifacts, onnx_static, opens):
     load_policy(artifacts["static"])
     load_policy(onnx_static)
     assert opens == {artifacts["static"].name: 1, onnx_static.name: 1}
-
-
-def test_a_release_opens_it_once_a_step(artifacts, tmp_path, opens):
-    """Switching checks a release twice: before, and again through the link that the service will follow."""
-    releases = Releases(tmp_path / "models")
-    about = pack(artifacts["static"], tmp_path / "packed", releases.expected, ["camera"])
-    assert opens == {"policy_static.pt": 1}
-    opens.clear()
-    assert releases.stage(tmp_path / "packed", unsigned=True, allow=["camera"]).changed
-    assert opens == {"policy.pt": 1}
-    opens.clear()
-    releases.switch(about["name"], unsigned=True)
-    assert opens == {"policy.pt": 2}

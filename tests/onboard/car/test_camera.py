@@ -73,21 +73,6 @@ def test_only_the_newest_is_kept(camera, writer):
     assert camera.wait(frame.number, 0.05) is None
 
 
-def test_of_frames_that_wait_the_last_is_taken(camera, writer):
-    writer.write(b"".join(jpeg(v) for v in (10, 20, 30, 40)))
-    frame = camera.wait(1, 1.0)
-    while (later := camera.wait(frame.number, 0.2)) is not None:
-        frame = later
-    assert frame.image[20, 20, 0] == pytest.approx(40, abs=2)
-
-
-def test_a_frame_in_pieces(camera, writer):
-    data = jpeg(77)
-    for i in range(0, len(data), 100):
-        writer.write(data[i : i + 100])
-    assert camera.wait(1, 1.0).image[20, 20, 0] == pytest.approx(77, abs=2)
-
-
 def test_the_same_frame_again_is_counted(camera, writer):
     for repeats in (1, 2, 3):
         writer.write(jpeg(100))
@@ -106,29 +91,19 @@ def test_an_unplugged_camera(camera, writer):
         camera.latest()
 
 
-def test_another_size(camera, writer):
-    writer.write(jpeg(100, (32, 36)))
-    with pytest.raises(CameraError, match="changed from 64x36 to 32x36"):
-        camera.wait(1, 2.0)
+def test_what_cannot_be_read_is_said(tmp_path):
+    (tmp_path / "drive.mp4").touch()
+    for source, message in (("63", "no such camera"), (tmp_path, "no pictures"), (tmp_path / "drive.mp4", "ffmpeg")):
+        with pytest.raises(CameraError, match=message):
+            Camera(source).open()
 
 
-def test_what_is_no_stream_of_jpegs(camera, writer, monkeypatch):
-    monkeypatch.setattr(c, "MOST_BYTES", 10_000)
-    writer.write(bytes(20_000))
-    with pytest.raises(CameraError, match="no JPEG in"):
-        camera.wait(1, 2.0)
-
-
-def test_no_frame_at_all(fifo, monkeypatch):
-    monkeypatch.setattr(c, "FIRST_FRAME_S", 0.2)
-    with pytest.raises(CameraError, match=r"no frame within 0\.2 s"), Camera(fifo):
-        pass
-
-
-@pytest.mark.parametrize("source", ["63", "/dev/video63", "no/such/folder"])
-def test_no_such_camera(source):
-    with pytest.raises(CameraError, match="no such camera"):
-        Camera(source).open()
+def test_pictures_of_another_form_are_refused(readings):
+    readings.read([*live(5), jpeg(100, (32, 36))])
+    assert "changed from 160x90 to 32x36" in readings.ended
+    small = Readings()
+    small.read([jpeg(100, (40, 20))])
+    assert "too small" in small.ended
 
 
 def test_a_folder_and_its_end(tmp_path):
@@ -154,8 +129,7 @@ def test_a_film_begins_when_it_is_told_to():
     assert list(c._pace(lambda: iter(()), 1000, threading.Event(), threading.Event())) == []
 
 
-@pytest.mark.parametrize("at", [0, 0.5, 0.95])
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("at", "axis"), [(0, 0), (0.5, 1), (0.95, 0)])
 def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen(at, axis):
     """A strip of 5 % lies in one or two rows or columns of the blocks that are compared; it drove on."""
     rng, camera = np.random.default_rng(0), Camera("frozen")
@@ -195,34 +169,6 @@ def test_a_film_that_begins_again_is_no_frozen_camera():
     camera.begin()
     assert repeats() == [0] * 6
     assert repeats() == [1, 2, 3, 4, 5, 6]
-
-
-def test_an_empty_folder(tmp_path):
-    with pytest.raises(CameraError, match="no pictures"):
-        Camera(tmp_path).open()
-
-
-def test_a_video_is_none(tmp_path):
-    (tmp_path / "drive.mp4").write_bytes(b"nothing")
-    with pytest.raises(CameraError, match=r"ffmpeg -i drive\.mp4 -q:v 3 drive\.mjpeg makes one of a video"):
-        Camera(tmp_path / "drive.mp4").open()
-
-
-def test_a_file_of_jpegs(tmp_path):
-    (tmp_path / "drive.mjpeg").write_bytes(b"".join(jpeg(v) for v in (10, 20, 30)))
-    with Camera(tmp_path / "drive.mjpeg", rate_hz=100) as camera, pytest.raises(CameraError, match="after 3 frames"):
-        camera.wait(3, 1.0)
-
-
-def test_a_reader_that_breaks(fifo, monkeypatch):
-    def broken(*_):
-        yield jpeg(100), None
-        time.sleep(0.1)
-        raise RuntimeError("the driver is gone")
-
-    monkeypatch.setattr(c, "_fifo", broken)
-    with Camera(fifo) as camera, pytest.raises(CameraError, match="the driver is gone"):
-        camera.wait(1, 1.0)
 
 
 # ---- what is no frame, on a virtual clock
@@ -281,27 +227,12 @@ def live(count, seed=0):
     return [hostile.jpeg(cv2.add(scene, rng.integers(0, 3, scene.shape, np.uint8))) for _ in range(count)]
 
 
-def test_a_still_scene_is_always_new(readings):
-    newest = readings.read(live(100))
-    assert [repeats for _, repeats, _ in newest] == [0] * 100
-
-
-@pytest.mark.parametrize("ring", [1, 2, 3, 10, 31])
+@pytest.mark.parametrize("ring", [1, 3, 31])
 def test_a_ring_of_old_pictures_shows_nothing_new(readings, ring):
     newest = readings.read(live(50) + live(50)[50 - ring :] * 40)
     repeats = [repeats for _, repeats, _ in newest]
     assert repeats[:50] == [0] * 50
     assert repeats[50:90] == list(range(1, 41))
-
-
-def test_a_frozen_picture_on_which_a_pixel_flickers_shows_nothing_new(readings):
-    rng = np.random.default_rng(0)
-    pictures = []
-    for _ in range(20):
-        picture = hostile.scene()
-        picture[rng.integers(360), rng.integers(640)] = rng.integers(256, size=3)
-        pictures.append(hostile.jpeg(picture))
-    assert readings.read(pictures)[-1][1] == 19
 
 
 def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
@@ -311,22 +242,6 @@ def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
     assert len(newest) == 15  # the fourth of them ends it, 0.13 s after the last good one
     assert newest[7][0] == 5 and newest[11][0] == 9
     assert "4 pictures in a row were no frames: a JPEG is damaged or cut short" in readings.ended
-
-
-def test_damaged_pictures_before_the_first_frame_are_left_out(readings):
-    good = live(10)
-    assert readings.read([hostile.cut(p) for p in good] + good)[0][:2] == (1, 0)
-
-
-@pytest.mark.parametrize("name", ["a bomb of 16,000 x 16,000, whole", "a PNG", "nothing"])
-def test_what_is_no_picture_ends_a_camera(readings, name):
-    readings.read(live(5) + [hostile.HOSTILE[name]] * 5)
-    assert "4 pictures in a row were no frames" in readings.ended
-
-
-def test_too_small_a_picture(readings):
-    readings.read([jpeg(100, (40, 20))])
-    assert "too small a picture to drive by, found 40x20" in readings.ended
 
 
 LATE_S = 0.02
@@ -345,29 +260,20 @@ def test_the_clock_of_a_cameras_time_stamps_is_found(readings, kind):
     assert all(age_s == pytest.approx(0.0 if kind == "no" else LATE_S, abs=1e-5) for _, _, age_s in newest)
 
 
-@pytest.mark.parametrize("kind", ["monotonic", "wall"])
-@pytest.mark.parametrize("late_s", [1.5, 30.0, -1.0])
+@pytest.mark.parametrize(("kind", "late_s"), [("monotonic", 1.5), ("wall", 30.0), ("wall", -1.0)])
 def test_stamps_that_become_old_are_a_fault(readings, kind, late_s):
     newest = readings.read(live(30), lambda now_s, i: CLOCKS[kind](now_s, i) - (late_s if i >= 20 else 0))
     assert newest[-1][0] == 16 and len(newest) == 19
-    assert "were no frames: a frame's time stamp is not of now" in readings.ended
-
-
-def test_a_stamp_that_stands_still_is_a_fault(readings):
-    newest = readings.read(live(30), lambda now_s, i: min(now_s, 5000 + 20 / 30))
-    assert newest[-1][0] == 16 and len(newest) == 19
-    assert "found the same again" in readings.ended
+    assert "time stamp" in readings.ended
+    still = Readings()
+    newest = still.read(live(30), lambda now_s, i: min(now_s, 5000 + 20 / 30))
+    assert newest[-1][0] == 16 and len(newest) == 19 and "the same again" in still.ended
 
 
 @pytest.mark.parametrize("stamp", [lambda now_s, i: now_s - 1.5, lambda now_s, i: now_s - 30, lambda now_s, i: 4999.0])
 def test_stamps_that_were_never_of_now_are_no_frames(readings, stamp):
     assert readings.read(live(30), stamp) == []
     assert readings.camera._refusal.what == "a frame's time stamp is not of now"
-
-
-def test_one_late_frame_among_the_first_does_not_decide(readings):
-    newest = readings.read(live(20), lambda now_s, i: now_s - (0.7 if i == 2 else 0.02))
-    assert readings.camera.time_stamps == "monotonic" and newest[-1][0] == 16
 
 
 def test_the_wall_clock_may_be_set(readings):

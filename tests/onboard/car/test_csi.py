@@ -10,7 +10,6 @@ import rpicam_vid
 
 from rover_lib.onboard.car.camera import Camera, CameraError
 from rover_lib.onboard.car.csi import command, is_csi
-from rover_lib.onboard.care.doctor import camera_rate
 
 SIZE = 96, 64
 
@@ -62,17 +61,6 @@ def test_frames_have_the_sensors_time_stamps(csi):
         assert frame.repeats == 0
 
 
-@pytest.mark.slow
-def test_a_picture_that_was_cut_costs_two_frames_and_shifts_no_time_stamp(csi):
-    with csi("cut 12") as camera:
-        frame = camera.latest()
-        end = time.monotonic() + 1.0
-        while time.monotonic() < end:
-            frame = camera.wait(frame.number, 1.0)
-            age_s = time.monotonic() - frame.captured_s
-        assert 0.004 < age_s < 0.015 + 1 / 60  # one picture's time more, if it were another's
-
-
 @pytest.mark.parametrize(
     ("fault", "sentence"),
     [
@@ -88,25 +76,7 @@ def test_what_goes_wrong_is_said(csi, monkeypatch, fault, sentence):
             camera.wait(camera.frames, 0.1)
 
 
-def test_a_frozen_one_gives_no_new_frame_and_is_ended(csi):
-    with csi("freeze 20") as camera:
-        end = time.monotonic() + 3
-        while camera.wait(camera.frames, 0.3) and time.monotonic() < end:
-            pass
-        assert time.monotonic() < end
-        start = time.monotonic()
-    assert time.monotonic() - start < 1.0
-
-
 def test_without_the_program_it_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CameraError, match="rpicam-apps"):
         Camera("csi").open()
-
-
-@pytest.mark.slow
-def test_the_doctor_measures_it(csi):
-    csi()
-    (check,) = camera_rate("csi", rate_hz=30.0)
-    assert check.verdict == "ok", str(check)
-    assert f"csi: {SIZE[0]}x{SIZE[1]}, monotonic time stamps" in check.found

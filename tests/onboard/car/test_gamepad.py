@@ -1,6 +1,5 @@
 """A gamepad's rules, by FIFOs that speak struct input_event: this kernel has no uinput, and no real one was tried."""
 
-import os
 import time
 from functools import partial
 
@@ -10,9 +9,8 @@ from virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError, Stick
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink
-from rover_lib.onboard.errors import CarError
 
 
 @pytest.fixture
@@ -40,7 +38,7 @@ def test_the_human_counts_while_l1_is_held(pad, opened):
     assert opened.sticks() is None
 
 
-@pytest.mark.parametrize("what", ["repeated", "old", "another button", "nothing"])
+@pytest.mark.parametrize("what", ["repeated", "old", "another button"])
 def test_only_a_press_that_is_seen_counts(pad, opened, what):
     """A button that is stuck, or events that waited, are nobody."""
     if what == "repeated":
@@ -96,21 +94,6 @@ def test_one_that_is_back_is_opened_again(pad, monkeypatch):
     link._gamepad.close()
 
 
-def test_a_half_event_waits_for_its_rest(pad, opened):
-    pad.hold(True)
-    opened.sticks()
-    event = gamepads.EVENT.pack(int(time.monotonic()), 0, ABS, STEERING, 32767)
-    os.write(pad._pad, event[:7])
-    assert opened.sticks() == (0, 0)
-    os.write(pad._pad, event[7:])
-    assert opened.sticks() == (1, 0)
-
-
-@pytest.mark.parametrize(("value", "deflection"), [(0, -1), (127, 0), (140, 0), (255, 1), (300, 1)])
-def test_a_stick_of_eight_bits(value, deflection):
-    assert Stick(0, 255).deflection(value) == deflection
-
-
 def kernel(root, *nodes):
     """Make a folder like /sys/class/input. nodes: (name, which gamepad, kind)."""
     for i, (name, whole, kind) in enumerate(nodes):
@@ -128,10 +111,8 @@ def kernel(root, *nodes):
 @pytest.mark.parametrize(
     ("nodes", "sentence"),
     [
-        ([], "none in /dev/input"),
         ([("keyboard", "a", "keys")], "none in /dev/input"),
         ([("X-Box", "a", "pad")], "X-Box (event0, without motion sensors: cannot be used)"),
-        ([("X-Box", "a", "pad"), ("other", "b", "motion")], "without motion sensors"),
         ([("A", "a", "pad"), ("B", "b", "pad"), ("", "a", "motion"), ("", "b", "motion")], "A (event0), B (event1)"),
         ([("DualSense", "a", "pad"), ("motion", "a", "motion")], "DualSense (event0) cannot be read"),
     ],
@@ -152,6 +133,3 @@ def test_car_yml_names_the_human(tmp_path):
         MISSING["s"],
         "hold L1 of the gamepad",
     ]
-    path.write_text(path.read_text().replace("gamepad", "nobody"))
-    with pytest.raises(CarError, match="human must be receiver or gamepad"):
-        read_car(path)

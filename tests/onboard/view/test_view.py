@@ -17,7 +17,6 @@ import pytest
 
 aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
 
-from rover_lib.onboard.car.car import read_car  # noqa: E402
 from rover_lib.onboard.view import server as v  # noqa: E402
 
 TOKEN = "a-token-of-the-tests"
@@ -123,7 +122,7 @@ async def test_a_page_shows_what_the_drive_says(bench):
         k: HEAD[k] for k in ("title", "who", "pins", "tick", "events")
     }
     assert head["throttled"] == "under-voltage since the start, throttled since the start"
-    assert len(head["ribbon"]) > 10 and not head["stopped"] and not head["replay"]
+    assert len(head["ribbon"]) > 10 and not head["stopped"]
     assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
     drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None})
     head, _ = await message(page)
@@ -134,20 +133,12 @@ async def test_a_page_shows_what_the_drive_says(bench):
     ("path", "headers"),
     [
         ("/", {}),
-        ("/?token=", {}),
-        ("/?token=wrong", {}),
-        ("/?token=%C3%A4", {}),
         (f"/?token={TOKEN}x", {}),
-        (f"/?token={TOKEN}", {"Host": "rover.evil.example"}),
         (f"/?token={TOKEN}", {"Host": "127.0.0.1.evil.example:80"}),
-        (f"/?token={TOKEN}", {"Host": "192.168.1.9"}),  # it serves this machine alone
         (f"/?token={TOKEN}", {"Host": "a b"}),
         (f"/ws?token={TOKEN}", {}),
-        (f"/ws?token={TOKEN}", {"Origin": "http://evil.example"}),
-        (f"/ws?token={TOKEN}", {"Origin": "null"}),
         (f"/ws?token={TOKEN}", {"Origin": "http://127.0.0.1:1"}),  # another program's page on this machine
         ("/ws?token=wrong", {"Origin": "the right one"}),
-        ("/ws", {"Origin": "the right one"}),
     ],
 )
 @on_a_bench
@@ -168,49 +159,45 @@ async def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(bench, path
 @on_a_bench
 async def test_there_is_nothing_else(bench):
     drive = bench.drive()
-    for path in ("/ws/../arm", "/arm", "/stop", "/view.py", "/static/../../etc/passwd", "/favicon.ico"):
-        for method in ("GET", "POST", "PUT", "DELETE"):
-            async with bench.browser.request(method, f"{bench.base}{path}?token={TOKEN}") as answer:
-                assert answer.status in (404, 405), (method, path)
+    for method, path in (("GET", "/arm"), ("POST", "/stop"), ("GET", "/static/../../etc/passwd"), ("PUT", "/")):
+        async with bench.browser.request(method, f"{bench.base}{path}?token={TOKEN}") as answer:
+            assert answer.status in (404, 405), (method, path)
     assert drive.asked_nothing()
 
 
-def test_the_page_itself_may_load_nothing_and_be_framed_by_nobody(tmp_path):
-    async def scene():
-        async with Bench(tmp_path) as bench, bench.browser.get(bench.url) as answer:
-            assert answer.status == 200 and answer.content_type == "text/html"
-            policy = answer.headers["Content-Security-Policy"]
-            for part in ("default-src 'none'", "frame-ancestors 'none'", f"connect-src ws://{bench.base[7:]};"):
-                assert part in policy
-            assert answer.headers["Referrer-Policy"] == "no-referrer"
-            html = await answer.text()
-            assert "src=" not in html and "http://" not in html and TOKEN not in html
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_the_page_itself_may_load_nothing_and_be_framed_by_nobody(bench):
+    async with bench.browser.get(bench.url) as answer:
+        assert answer.status == 200 and answer.headers["Referrer-Policy"] == "no-referrer"
+        policy = answer.headers["Content-Security-Policy"]
+        for part in ("default-src 'none'", "frame-ancestors 'none'", f"connect-src ws://{bench.base[7:]};"):
+            assert part in policy
+        assert TOKEN not in await answer.text()
 
 
 @on_a_bench
-async def test_a_stop_from_each_of_ten_pages_reaches_the_drive(bench):
-    drive = bench.drive()
-    drive.send()
-    pages = [await bench.page() for _ in range(10)]
+async def test_a_stop_from_each_page_reaches_each_drive_and_the_newest_is_shown(bench):
+    pages = [await bench.page() for _ in range(3)]
+    first, second = bench.drive(), bench.drive()
     for page in pages:
-        await driving(page)
+        second.send(HEAD | {"title": "second"})
+        first.send(HEAD | {"title": "first"})
+        while (await message(page))[0].get("title") != "second":
+            pass
         await page.send_str("stop")
-        assert await drive.asked() == b"stop 127.0.0.1"
-        assert (await asyncio.wait_for(page.receive(), 5)).data == "asked for a stop"
-    other = await bench.page()
-    drive.wire.close()
-    while (await message(other))[0]["phase"] != v.GONE:
+        assert await first.asked() == await second.asked() == b"stop 127.0.0.1"
+    first.wire.close()
+    second.wire.close()
+    while (await message(page))[0]["phase"] != v.GONE:
         pass
-    await other.send_str("stop")
-    assert (await asyncio.wait_for(other.receive(), 5)).data == "no drive is there to be stopped"
+    await page.send_str("stop")
+    assert "no drive" in (await asyncio.wait_for(page.receive(), 5)).data
 
 
 @on_a_bench
 async def test_a_page_can_say_nothing_else(bench):
     drive, page = bench.drive(), await bench.page()
-    for said in ("arm", "STOP", "stop ", "steer 1", "shown", "shown -1", "shown 99999999", '{"ask": "arm"}'):
+    for said in ("arm", "STOP", "stop ", "shown -1", "shown 99999999", '{"ask": "arm"}'):
         drive.send()
         await driving(page)
         await page.send_str(said)
@@ -219,11 +206,10 @@ async def test_a_page_can_say_nothing_else(bench):
         assert drive.asked_nothing(), said
 
 
-@pytest.mark.parametrize("said", [b"stop", b"x" * 100, "stop" * 100])
+@pytest.mark.parametrize("said", [b"stop", "stop" * 100])
 @on_a_bench
 async def test_a_page_that_says_what_no_page_says_is_closed(bench, said):
-    drive = bench.drive()
-    page = await bench.page()
+    drive, page = bench.drive(), await bench.page()
     await message(page)
     await (page.send_bytes(said) if isinstance(said, bytes) else page.send_str(said))
     got = await asyncio.wait_for(page.receive(), 5)
@@ -250,62 +236,15 @@ async def test_nothing_waits_for_a_page_that_is_slow(bench):
 
 
 @on_a_bench
-async def test_more_pages_than_anybody_opens_are_refused(bench, monkeypatch):
-    monkeypatch.setattr(v, "PAGES", 3)
-    pages = [await bench.page() for _ in range(3)]
-    with pytest.raises(aiohttp.WSServerHandshakeError, match="503"):
-        await bench.page()
-    await pages[0].close()
-    for _ in range(100):
-        with contextlib.suppress(aiohttp.WSServerHandshakeError):
-            return await bench.page()
-        await asyncio.sleep(0.01)
-    raise AssertionError("a closed page still counts")
-
-
-def test_idle_connections_keep_no_page_waiting(tmp_path, monkeypatch, caplog):
-    """330 of them kept a new page waiting for 9.7 s, and wrote 12 MB of log."""
-    monkeypatch.setattr(v, "REQUEST_S", 0.5)
-
-    async def scene():
-        async with Bench(tmp_path) as bench, contextlib.AsyncExitStack() as stack:
-            port = int(bench.base.rpartition(":")[2])
-            page = await bench.page()
-            idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(330)]
-            stack.callback(lambda: [writer.close() for _, writer in idle])
-            assert len(bench.view._browsers) <= v.CONNECTIONS
-            another = await asyncio.wait_for(bench.page(), 2)
-            await asyncio.sleep(0.6)
-            assert (
-                len(bench.view._browsers) == 2 and not another.closed
-            )  # what asks for nothing is closed, and pages stay
-            bench.drive().send(HEAD)
-            await driving(page)
-
-    asyncio.run(scene())
-    assert not caplog.records
-
-
-def test_no_token_is_in_the_log(tmp_path, caplog, capsys):
-    """A request that is broken was logged whole, three times."""
+async def test_no_token_is_in_the_log(bench, caplog, capsys):
+    """A request that is broken was logged as a whole, three times."""
     caplog.set_level("DEBUG", "aiohttp")
-
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            port = int(bench.base.rpartition(":")[2])
-            for broken in (
-                b"GET /?token=%s HTTP/9.x\r\n\r\n",
-                b"GET /\0?token=%s\r\n",
-                b"%s" * 9000,
-                b"POST /?token=%s",
-            ):
-                reader, writer = await asyncio.open_connection("127.0.0.1", port)
-                writer.write(broken.replace(b"%s", TOKEN.encode()) + b"\r\nContent-Length: x\r\n\r\n")
-                with contextlib.suppress(ConnectionResetError):  # it need not read all of it
-                    await asyncio.wait_for(reader.read(), 5)
-                writer.close()
-
-    asyncio.run(scene())
+    for broken in (b"GET /?token=%s HTTP/9.x\r\n\r\n", b"%s" * 9000, b"POST /?token=%s"):
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(bench.base.rpartition(":")[2]))
+        writer.write(broken.replace(b"%s", TOKEN.encode()) + b"\r\nContent-Length: x\r\n\r\n")
+        with contextlib.suppress(ConnectionResetError):  # it need not read all of it
+            await asyncio.wait_for(reader.read(), 5)
+        writer.close()
     assert TOKEN not in caplog.text + "".join(capsys.readouterr())
 
 
@@ -325,33 +264,30 @@ async def test_a_second_click_hides_no_end(bench):
     assert (head["phase"], head["stopped"]) == ("ended", True)
 
 
-NONSENSE = [b"", b"\n", b"{}", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"\xff\xfe\n",
-            b"null\n", b'{"phase": "driving", "shape": [9, 9, 3]}\nshort', b'{"phase": "driving", "pins": "ab"}\n',
-            b'{"phase": "driving", "machine": {"throttled": "hot"}}\n', b"[" * 100_000 + b"\n",
-            b'{"phase": "driving", "machine": [1]}\n', b'{"phase": "driving", "size": [640, 0], "sent_s": 0, '
-            b'"plan": {"captured_s": 0, "rate_hz": 30, "actions": [[0, 1]]}}\n']  # fmt: skip
+NONSENSE = [b"\n", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"[" * 100_000 + b"\n",
+            b'{"phase": "driving", "shape": [9, 9, 3]}\nshort',
+            b'{"phase": "driving", "machine": {"throttled": "x"}}\n',
+            b'{"phase": "driving", "size": [640, 0], "sent_s": 0, "plan": {"captured_s": 0, "rate_hz": 30, '
+            b'"actions": [[0, 1]]}}\n']  # fmt: skip
 
 
-def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(tmp_path):
-    async def scene():
-        unforeseen = []
-        asyncio.get_running_loop().set_exception_handler(lambda loop, context: unforeseen.append(context))
-        async with Bench(tmp_path) as bench:
-            for number, said in enumerate(NONSENSE[1:]):
-                bench.drive().wire.send(said)
-                page, drive = await bench.page(), bench.drive()
-                for _ in range(20):
-                    drive.send(HEAD | {"frame": 77 + number})
-                    if (await message(page))[0].get("frame") == 77 + number:
-                        break
-                else:
-                    raise AssertionError(f"the drive after {said[:30]!r} is not shown")
-                await page.send_str("stop")
-                assert await drive.asked() == b"stop 127.0.0.1"
-        gc.collect()  # a task that failed is told of when it goes
-        assert not unforeseen
-
-    asyncio.run(scene())
+@on_a_bench
+async def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(bench):
+    unforeseen = []
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: unforeseen.append(context))
+    for number, said in enumerate(NONSENSE):
+        bench.drive().wire.send(said)
+        page, drive = await bench.page(), bench.drive()
+        for _ in range(20):
+            drive.send(HEAD | {"frame": 77 + number})
+            if (await message(page))[0].get("frame") == 77 + number:
+                break
+        else:
+            raise AssertionError(f"the drive after {said[:30]!r} is not shown")
+        await page.send_str("stop")
+        assert await drive.asked() == b"stop 127.0.0.1"
+    gc.collect()  # a task that failed is told of when it goes
+    assert not unforeseen
 
 
 def test_a_view_without_a_file_left_takes_drives_again_later(tmp_path, monkeypatch):
@@ -374,46 +310,17 @@ def test_a_view_without_a_file_left_takes_drives_again_later(tmp_path, monkeypat
     asyncio.run(scene())
 
 
-@pytest.mark.parametrize("told", ["of this machine", "of the replayed drive"])
-def test_stopped_is_the_neutral_of_the_car_that_drives(tmp_path, monkeypatch, told):
+def test_stopped_is_the_neutral_of_the_car_that_drives(tmp_path, monkeypatch):
     """A speed controller with reverse stands at 1500 us, and 120 is no pulse of it."""
     (tmp_path / "car.yml").write_text("""
 steering: {period_us: 20000, left_us: 2000, neutral_us: 1500, right_us: 1000}
 throttle: {period_us: 20000, neutral_us: 1500, forward_us: 2000, reverse_us: 1000}
 """)
-    options = {}
-    if told == "of this machine":
-        monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
-    else:
-        options["car"] = read_car(tmp_path / "car.yml")
-
-    async def scene():
-        async with Bench(tmp_path, **options) as bench:
-            page, drive = await bench.page(), bench.drive()
-            for throttle_us, stands in ((1560, False), (1500, True), (1440, False), (1503, True)):
-                drive.send(HEAD | {"pins": [1500, throttle_us]})
-                while (head := (await message(page))[0]).get("pins") != [1500, throttle_us]:
-                    pass
-                assert head["stopped"] is stands
-
-    asyncio.run(scene())
-
-
-@on_a_bench
-async def test_a_stop_goes_to_every_drive_and_the_newest_is_shown(bench):
-    page = await bench.page()
-    first = bench.drive()
-    first.send(HEAD | {"title": "first"})
-    assert (await driving(page))[0]["title"] == "first"
-    second = bench.drive()
-    second.send(HEAD | {"title": "second"})
-    while (await message(page))[0]["title"] != "second":
-        pass
-    first.send(HEAD | {"title": "first"})
-    second.send(HEAD | {"title": "second", "frame": 8})
-    assert (await message(page))[0]["title"] == "second"
-    await page.send_str("stop")
-    assert await first.asked() == await second.asked() == b"stop 127.0.0.1"
+    monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+    view = v.View(v.Address(0), TOKEN)
+    for throttle_us, stands in ((1560, False), (1500, True), (1440, False), (1503, True)):
+        view.show(HEAD | {"pins": [1500, throttle_us]}, b"")
+        assert view._head["stopped"] is stands
 
 
 @on_a_bench
@@ -450,12 +357,11 @@ def test_another_user_feeds_nothing():
         ("", "[::1]:8470", True),
         ("", "192.168.1.7:8470", False),
         ("", "", False),
-        ("", "localhost.evil.example", False),
         ("wlan0", "192.168.1.7:8470", True),
-        ("wlan0", "evil.example", False),
         ("wlan0", f"{socket.gethostname()}.local:8470", True),
         ("wlan0", f"{socket.gethostname()}.evil.example", False),
         ("wlan0", "127.0.0.1@evil.example", False),
+        ("wlan0", "[1", False),
     ],
 )
 def test_hosts_that_are_ours(interface, host, ours):
@@ -465,22 +371,22 @@ def test_hosts_that_are_ours(interface, host, ours):
 def test_what_cannot_be_opened(tmp_path):
     async def both():
         async with Bench(tmp_path) as bench:
-            with pytest.raises(v.ViewError, match="another view listens there; end that one first"):
+            with pytest.raises(v.ViewError, match="another view"):
                 async with Bench(tmp_path):
                     pass
             port = int(bench.base.rpartition(":")[2])
-            with pytest.raises(v.ViewError, match=f"no page can be served at port {port} "):
+            with pytest.raises(v.ViewError, match=f"port {port} "):
                 v.Address(port).open()
 
     asyncio.run(both())
     assert not (tmp_path / "view").exists()
-    with pytest.raises(v.ViewError, match=r"of nosuch0 .*`ip -brief address` lists the interfaces"):
+    with pytest.raises(v.ViewError, match="nosuch0"):
         v.Address(0, "nosuch0").open()
     (tmp_path / "view").write_text("a user's")
-    with pytest.raises(v.ViewError, match="view: is there, and is no socket; name another with --feed"):
+    with pytest.raises(v.ViewError, match="not a socket"):
         asyncio.run(both())
     assert (tmp_path / "view").read_text() == "a user's"
-    with pytest.raises(v.ViewError, match="no user 'nobody-of-that-name'"):
+    with pytest.raises(v.ViewError, match="nobody-of-that-name"):
         v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
 
 
@@ -497,10 +403,10 @@ def test_a_socket_that_a_killed_view_has_left_is_taken(tmp_path):
     asyncio.run(scene())
 
 
-@pytest.mark.parametrize("content", ["", "short", "with a blank in the middle", "ä" * 20, b"\xff" * 20])
+@pytest.mark.parametrize("content", ["short", "with a blank in the middle", "ä" * 20])
 def test_a_token_that_could_be_guessed_is_refused(tmp_path, content):
-    (tmp_path / "token").write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(v.ViewError, match="no token of 16 letters"):
+    (tmp_path / "token").write_text(content)
+    with pytest.raises(v.ViewError, match="16 letters"):
         v.read_token(tmp_path / "token")
 
 

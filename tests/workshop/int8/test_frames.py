@@ -108,10 +108,9 @@ def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_pa
     for observer in (m for m in graph.modules() if isinstance(m, RangeObserver)):
         low, high = observer.range()
         assert observer.min_val <= low <= 0 <= high <= max(observer.max_val, 0)
-    for wrong, said in (({"wider": (("layer9", 0.5),)}, "layer9"), ({"wider": (("x", 2.0),)}, "in \\[0, 1\\]")):
-        with pytest.raises(QuantizeError, match=said):
-            restore_observed(dazzled, Scheme(observer="frames", usual_pct=75, **wrong), again)
-    with pytest.raises(QuantizeError, match="kept no frames; calibrate again"):
+    with pytest.raises(QuantizeError, match="layer9"):
+        restore_observed(dazzled, Scheme(observer="frames", usual_pct=75, wider=(("layer9", 0.5),)), again)
+    with pytest.raises(QuantizeError, match="kept no frames"):
         restore_observed(dazzled, Scheme(observer="frames"), replace(again, frames={}))
 
 
@@ -131,16 +130,6 @@ def test_odd_frames_take_no_steps_from_the_others(dazzled, jumping, jumped):
     }
     assert worst(by_kind["frames"]["usual"]) < 0.8 * worst(by_kind["minmax"]["usual"])
     assert worst(table[list(table)[-1]]) < 0.8 * worst(table["minmax"])
-
-
-@pytest.mark.slow
-def test_odd_frames_weigh_what_they_are_among_unseen_ones(dazzled, jumping, jumped):
-    """Training knows the frames that calibrate: of others, a policy found four times as many odd."""
-    odd = frames.odd_samples(jumped.frames, jumped.seen, jumping)  # an eighth of those
-    for white, share in ((0, 1 / 8), (2, 1 / 4)):
-        unseen = [*memory_samples(8 - white, seed=9), *odd[:white]]
-        chooser = Chooser(dazzled, jumped, unseen, RANGE, odd)
-        assert (chooser.weights * chooser.is_odd).sum() / chooser.weights.sum() == pytest.approx(share)
 
 
 @pytest.mark.slow

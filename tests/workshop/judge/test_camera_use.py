@@ -72,14 +72,12 @@ def test_it_is_cheap():
 @pytest.mark.parametrize(
     ("policy", "says"),
     [
-        (
-            Known(looks=0.02, copies=1),
-            "this policy ignores its camera: another picture moves steering by 0.10 %, another",
-        ),
+        (Known(looks=0.02, copies=1), "this policy ignores its camera"),
         (Known(looks=1, copies=0), None),  # of one that does not need its state nothing bad can be said
         (Known(looks=0, copies=0), "plans the same whatever it is shown"),
         (Known(looks=0.004, copies=0), "plans the same whatever it is shown"),  # it follows by 0.02 % of the range
-        (Known(looks=0.1, copies=0.5), "steering hardly follows the camera: another picture moves steering by 0.50 %"),
+        (Known(looks=np.array([1, 0]), copies=np.array([0.5, 1])), "throttle hardly follows the camera"),
+        (Known(looks=0.1, copies=0.5), "steering by 0.50 %"),
     ],
 )
 def test_what_must_be_known_before_it_drives(policy, says):
@@ -87,22 +85,10 @@ def test_what_must_be_known_before_it_drives(policy, says):
     assert len(warnings) == (says is not None) and (says is None or says in warnings[0])
 
 
-def test_one_action_alone_may_be_blind():
-    policy = Known(looks=np.array([1, 0]), copies=np.array([0.5, 1]))
-    assert looked(policy).warnings() == [
-        "throttle hardly follows the camera: another picture moves throttle by 0.00 %, another state by 25.00 %"
-    ]
-
-
 def test_an_action_that_never_changes_is_not_judged():
     found = looked(Known(looks=np.array([1, 0]), copies=1), action_range=RANGE | {"throttle": (0.1, 0.1)})
     assert found.warnings() == [] and found.summary()["throttle_by_picture_pct"] is None
     assert "not judged" in str(found.table())
-
-
-def test_an_action_that_is_no_servos_has_no_microseconds():
-    found = looked(Known(1, 1, ("left", "right")), action_range={"left": (0, 1), "right": (0, 1)})
-    assert "left_by_state_pct" in found.summary() and "left_by_state_us" not in found.summary()
 
 
 def test_one_frame_cannot_be_swapped():

@@ -109,47 +109,30 @@ def test_the_table_says_how_hot_and_how_fast(folders):
 
 
 @pytest.mark.parametrize(
-    "spoil, words",
+    "spoil",
     [
-        (lambda c: "{", "not readable as JSON"),
-        (lambda c: b"\xff\xfe".decode("latin-1"), "not readable as JSON"),
-        (lambda c: json.dumps({"schema": 1, "stage": "compare"}), "expected schema 1 of stage 'benchmark'"),
-        (lambda c: json.dumps({**c, "schema": 9}), "expected schema 1"),
-        (lambda c: json.dumps({**c, "metrics": {}}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "artifacts": {}}}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "throttled": "hot"}}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "metrics": {**c["metrics"], "series": [{"t_s": 1}]}}), "no figures of a benchmark"),
-        (lambda c: json.dumps({**c, "env": None}), "has no env"),
-        (lambda c: json.dumps({**c, "inputs": [1]}), "has no inputs"),
+        lambda c: "{",
+        lambda c: json.dumps({**c, "schema": 9}),
+        lambda c: json.dumps({**c, "metrics": {}}),
+        lambda c: json.dumps({**c, "metrics": {**c["metrics"], "throttled": "hot"}}),
+        lambda c: json.dumps({**c, "metrics": {**c["metrics"], "series": [{"t_s": 1}]}}),
+        lambda c: json.dumps({**c, "env": None}),
     ],
 )
-def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil, words):
+def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil):
     written(folders[1], "rover1", 60.0)
     bad = written(folders[1], "rover2", 60.0)
-    bad.write_bytes(spoil(json.loads(bad.read_text())).encode("latin-1"))
+    bad.write_text(spoil(json.loads(bad.read_text())))
     benchmarks = hosts.read_benchmarks(*folders)
     assert list(benchmarks.by_host) == [hosts.THIS, "rover1"]
     *_, count, sentence = str(benchmarks.table()).splitlines()
-    assert count == "1 file is left out:" and sentence.startswith("benchmark-rover2.json: ") and words in sentence
+    assert count == "1 file is left out:" and sentence.startswith("benchmark-rover2.json: ")
     assert str(folders[1]) not in str(benchmarks.table())  # a published notebook holds no path
-
-
-def test_a_folder_that_is_not_there_is_nothing(folders, tmp_path):
-    (folders[1] / "benchmark-rover1.json").mkdir()
-    assert str(hosts.read_benchmarks(folders[0], tmp_path / "nowhere").table()).endswith(hosts.NO_ROVER)
-    assert "1 file is left out" in str(hosts.read_benchmarks(*folders).table())
 
 
 def drawn(figure):
     figure.canvas.draw()
     return [ax.get_ylabel().replace("\n", " ") or ax.get_title() for ax in figure.axes]
-
-
-def test_every_host_has_a_panel(folders):
-    written(folders[1], "rover1", 60.0)
-    figure = plots.latency(hosts.read_benchmarks(*folders).by_host)
-    assert [ax.get_title().partition(" (")[0] for ax in figure.axes] == [hosts.THIS, "rover1"]
-    assert [label.get_text() for label in figure.axes[1].get_yticklabels()] == ["static"]
 
 
 def test_a_soak_over_time(folders):
@@ -167,9 +150,3 @@ def test_a_soak_over_time(folders):
     assert 7 < first_hot_min < 10  # 80 degrees after 300 s * ln(43 / 8) = 8.4 min
     times_ms = figure.axes[0].lines[0].get_ydata()
     assert times_ms[0] == pytest.approx(60) and times_ms[-1] == pytest.approx(90)
-
-
-def test_a_host_without_sensors_has_no_empty_panels(folders):
-    written(folders[1], "rover1", 60.0, soak_s=60)
-    figure = plots.soak(hosts.read_benchmarks(*folders).soaks())
-    assert drawn(figure) == ["latency of one inference (ms)"]

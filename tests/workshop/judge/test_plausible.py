@@ -1,5 +1,6 @@
 """Statistics of other recordings are said, for a policy whose own plans were recorded."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,9 +59,7 @@ def test_its_own_recordings_fit(tiny, driven):
 )
 def test_statistics_of_other_actions_are_said(tiny, driven, scale, shift, says):
     (warning,) = of(tiny, driven, action_unnorm=Affine(scale, shift)).warnings()
-    import re
-
-    assert re.match(says, warning) and "statistics, that it was trained with?" in warning
+    assert re.match(says, warning)
 
 
 def test_statistics_of_other_states_are_said(tiny, driven):

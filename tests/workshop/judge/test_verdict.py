@@ -7,14 +7,16 @@ from pathlib import Path
 import pytest
 from recorded import real_episode
 
+from rover_lib.onboard.care.limits import check_gates
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge import verdict as v
+from rover_lib.workshop.judge.advice import Names, gate_in_words
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 
 RESULTS = Path(__file__).parents[3] / "results"
-NAMES = v.Names("runs/mine", "best model.pth", "episodes")
+NAMES = Names("runs/mine", "best model.pth", "episodes")
 PARAMS = params()
 
 
@@ -38,25 +40,24 @@ def judge(stages):
     return v.verdict(stages, PARAMS, NAMES)
 
 
-def row(judged, mode):
-    return next(row for row in judged["modes"] if row["mode"] == mode)
+def because(judged, mode):
+    return next(row["because"] for row in judged["modes"] if row["mode"] == mode)
 
 
 def commands(judged):
     return [step["command"] for step in judged["next"]]
 
 
-def miss(stages, mode, throttle_pct):
-    stages["compare"]["modes"][mode]["throttle_mae_pct"] = throttle_pct
+def miss(stages, throttle_pct, *modes):
+    for mode in modes:
+        stages["compare"]["modes"][mode]["throttle_mae_pct"] = throttle_pct
 
 
 def test_the_demo_deploys_static(demo):
     judged = judge(demo)
     assert judged["deploy"] == "static" and judged["artifact"] == "policy_static.pt" and not judged["failed"]
-    assert row(judged, "mixed")["because"].startswith("is no better than static INT8")
-    assert "times as long as static INT8" in row(judged, "fp32")["because"]
-    assert len(judged["next"]) == 3
-    assert commands(judged)[0] == "rover view runs/mine/policy_static.pt"
+    assert "no better" in because(judged, "mixed") and "times as long" in because(judged, "fp32")
+    assert commands(judged)[0] == "rover view runs/mine/policy_static.pt" and len(judged["next"]) == 3
     assert "rover_artifact=runs/mine/policy_static.pt" in commands(judged)[1]
 
 
@@ -73,39 +74,32 @@ def test_what_a_workstation_measures_of_memory_fails_nothing(demo):
 
 
 def test_a_throttle_that_misses_its_gate_is_healed_by_mixed(demo):
-    miss(demo, "static", 2.8)
-    demo["quantize"]["modes"]["mixed"]["float_blocks"] = ["encoder.0.attention"]
+    miss(demo, 2.8, "static")
     demo["quantize"]["sensitivity"]["head"] = {"steering_mae_pct": 0.2, "throttle_mae_pct": 2.5}
     demo["quantize"]["layers"][0]["clipped_pct"] = 7.0
     judged = judge(demo)
-    assert judged["deploy"] == "mixed"
     (failed,) = judged["failed"]
-    assert failed["words"] == "throttle error of static INT8, % of the recorded range"
-    assert (failed["found"], failed["limit"]) == (2.8, 1.0)
-    remedies = "\n".join(failed["remedies"])
-    assert "Mixed fixes it: it leaves encoder.0.attention in float" in remedies
-    assert "rover distill 'best model.pth' episodes --qat --name mine-qat" in remedies
-    assert "Most of it comes from head: 2.50 %" in remedies
-    assert f"{demo['quantize']['layers'][0]['name']} met larger values" in remedies
+    assert judged["deploy"] == "mixed" and (failed["found"], failed["limit"]) == (2.8, 1.0)
     worst = [w["episode"] for w in demo["compare"]["worst"] if (w["mode"], w["action"]) == ("static", "throttle")]
-    assert f"Record more drives like {worst[0]}" in remedies
-    assert "throttle error" in row(judged, "static")["because"] and "mine-qat" in commands(judged)[2]
+    named = ("Mixed fixes it", "encoder.0.attention", "rover distill 'best model.pth' episodes --qat --name mine-qat")
+    for part in (*named, "head: 2.50 %", demo["quantize"]["layers"][0]["name"], worst[0]):
+        assert part in "\n".join(failed["remedies"])
+    assert "throttle error" in because(judged, "static") and "mine-qat" in commands(judged)[2]
 
 
 def test_a_mixed_that_is_useless_leaves_fp32_until_it_is_trained_for_int8(demo):
     """One of 43.8 MB that is slower than FP32 was once what a run ended with."""
-    for mode, error in (("static", 2.8), ("mixed", 0.9)):
-        miss(demo, mode, error)
+    miss(demo, 2.8, "static")
+    miss(demo, 0.9, "mixed")
     demo["compare"]["modes"]["mixed"]["size_mb"] = 43.8
     timed = demo["benchmark"]["artifacts"]
     timed["mixed"]["latency_p50_ms"] = 1.2 * timed["fp32"]["latency_p50_ms"]
     judged = judge(demo)
-    assert judged["deploy"] == "fp32"
-    assert row(judged, "mixed")["because"].startswith("takes 1.2 times as long as FP32")
-    assert commands(judged)[1:] == [
-        "rover distill 'best model.pth' episodes --qat --name mine-qat",
-        "rover run runs/mine-qat/best_model.pth episodes --name mine-qat",
-    ]
+    assert judged["deploy"] == "fp32" and because(judged, "mixed").startswith("takes 1.2 times as long as FP32")
+    assert commands(judged)[2] == "rover run runs/mine-qat/best_model.pth episodes --name mine-qat"
+    # The trainer's format has no place for what LeRobot normalises: of such a policy only LeRobot's folder is left.
+    demo["load"]["checkpoint"]["format"] = "lerobot"
+    assert "runs/mine-qat/pretrained_model" in commands(judge(demo))[2]
 
 
 def test_a_mixed_beside_a_static_that_keeps_its_gates_is_not_worth_its_time(demo):
@@ -113,10 +107,12 @@ def test_a_mixed_beside_a_static_that_keeps_its_gates_is_not_worth_its_time(demo
     timed = demo["benchmark"]["artifacts"]
     timed["mixed"]["latency_p50_ms"] = 4.8 * timed["static"]["latency_p50_ms"]
     judged = judge(demo)
-    assert judged["deploy"] == "static"
-    because = row(judged, "mixed")["because"]
-    size = 43.8 / demo["compare"]["modes"]["static"]["size_mb"]
-    assert because == f"takes 4.8 times as long as static INT8, and its file is {size:.1f} times as large"
+    assert judged["deploy"] == "static" and because(judged, "mixed").startswith("takes 4.8 times")
+    # What does more work and was faster by chance, on a busy machine, is not called faster.
+    timed["mixed"]["latency_p50_ms"] = 0.8 * timed["static"]["latency_p50_ms"]
+    judged = judge(demo)
+    assert judged["deploy"] == "static" and "noise" in because(judged, "mixed")
+    assert len({row["times_faster"] for row in judged["modes"] if row["mode"] in ("static", "mixed")}) == 1
 
 
 def test_what_does_not_drive_is_not_deployed(demo):
@@ -124,23 +120,9 @@ def test_what_does_not_drive_is_not_deployed(demo):
     judged = judge(demo)
     assert judged["deploy"] is None and judged["artifact"] is None and "12 of 40" in judged["why"][0]
     assert "train longer" in judged["failed"][0]["remedies"][0] and "record" in " ".join(commands(judged))
-
-
-def test_fewer_worlds_ask_for_fewer_balloons(demo):
     for mode in (demo["compare"]["fp32"], *demo["compare"]["modes"].values()):
-        mode["hits"] = mode["trials"] = 4
+        mode["hits"] = mode["trials"] = 4  # fewer worlds ask for fewer balloons
     assert judge(demo)["deploy"] == "static"
-
-
-def test_what_ignores_its_camera_is_not_deployed(demo):
-    looking = demo["compare"]["looking"]
-    looking |= {f"{a}_by_picture_pct": 0.0 for a in ("steering", "throttle")}
-    assert judge(demo)["deploy"] is None
-    looking["steering_by_picture_pct"] = 5.0
-    assert judge(demo)["deploy"] == "static"
-
-
-DRIVES = ("ansible", "rover drive", "deploy.yml")
 
 
 @pytest.mark.parametrize(
@@ -154,39 +136,48 @@ DRIVES = ("ansible", "rover drive", "deploy.yml")
 def test_a_policy_that_is_not_ready_gets_no_command_that_drives(demo, stage, change, says):
     demo[stage] |= change
     judged = judge(demo)
-    assert judged["deploy"] is None and says in judged["why"][0] and judged["why"][-1].startswith("What helps")
-    assert not any(word in command for command in commands(judged) for word in DRIVES)
+    assert judged["deploy"] is None and says in judged["why"][0]
+    assert not any(word in " ".join(commands(judged)) for word in ("ansible", "rover drive", "deploy.yml"))
+
+
+def test_one_action_that_follows_the_camera_is_enough(demo):
+    looking = demo["compare"]["looking"]
+    looking |= {"steering_by_picture_pct": 5.0, "throttle_by_picture_pct": 0.0}
+    assert judge(demo)["deploy"] == "static"
 
 
 @pytest.mark.parametrize(
-    ("refused", "says"),
+    ("refused", "allow", "asked"),
     [
-        ({}, None),
-        ({"camera": "c", "chunk": "p", "mode": "m"}, """ -e '{"rover_allow": ["camera", "chunk", "mode"]}'"""),
-        ({"actions": "it gives x", "camera": "c"}, "A policy for another robot, to benchmark only: it gives x."),
+        ({}, "policy_static.pt", []),
+        ({"camera": "c", "mode": "m"}, """ -e '{"rover_allow": ["camera", "mode"]}'""", ["c."]),
+        ({"actions": "it gives x", "camera": "c"}, None, []),
     ],
-)
-def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused, says):
+)  # fmt: skip
+def test_what_a_rover_refuses_is_asked_before_a_command_is_printed(demo, refused, allow, asked):
+    """A rover refused CarRacing's square pictures, and only a deploy command that was not printed said so."""
     judged = v.verdict(demo, PARAMS, NAMES, dict.fromkeys(("fp32", "static", "mixed", "dynamic"), refused))
-    deploying = [command for command in commands(judged) if "deploy.yml" in command]
-    if "actions" in refused:
-        assert says in judged["why"] and commands(judged) == ["rover benchmark runs/mine/policy_static.pt"]
+    if allow is None:
+        assert "it gives x." in judged["why"][-1]
+        assert commands(judged) == ["rover benchmark runs/mine/policy_static.pt"]
     else:
-        assert deploying[0].endswith(says or "policy_static.pt")
-    # A rover refused CarRacing's square pictures, and only a deploy command that was not printed said so.
-    asked = [c for c in judged["cautions"] if c.startswith("Was it trained for this car?")]
-    assert [c.rpartition(": ")[2] for c in asked] == (["c; p."] if "chunk" in refused else [])
+        assert next(command for command in commands(judged) if "deploy.yml" in command).endswith(allow)
+    assert [c.rpartition(": ")[2] for c in judged["cautions"] if "rover_allow" in c] == asked
 
 
-def test_recomputed_actions_and_throttle_beyond_the_limit_are_said(demo):
+def test_what_weakens_a_verdict_is_said(demo):
     demo["load"]["recordings"]["recomputed"] = "the actions of 5 of 6 episodes were recomputed"
     demo["compare"]["action_range"]["throttle"] = [0.0, 0.27]
     demo["load"]["steering"] = {"side": "left", "mirrored": [], "denied": True}
-    said = "\n".join(judge(demo)["cautions"])
-    assert (
-        "The actions of 5 of 6 episodes were recomputed." in said and "throttle up to 0.27" in said and "0.2:" in said
-    )
-    assert "turns left, and their car's file says otherwise: is the camera's picture mirrored?" in said
+    for found in (demo["compare"]["fp32"], *demo["compare"]["modes"].values()):
+        found |= {"hits": None, "trials": None}
+        if "throttle_mae_pct" in found:
+            found["throttle_mae_pct"] = None
+    judged = judge(demo)
+    assert judged["deploy"] == "static" and "throttle" not in judged["why"][0]
+    assert "deploy.yml" in commands(judged)[0] and "drive.yml" in commands(judged)[2]
+    for part in ("5 of 6 episodes", "throttle up to 0.27", "mirrored?", "Nobody drove"):
+        assert part in "\n".join(judged["cautions"])
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
@@ -199,7 +190,7 @@ def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
 def test_a_promise_that_no_pi_can_keep_is_named(demo):
     demo["benchmark"]["artifacts"]["static"]["floor_ms"] = 48.8
     judged = judge(demo)
-    assert "on a Pi 5 at the very best" in judged["failed"][0]["words"]
+    assert judged["failed"][0]["gate"] == "static floor_ms"
     assert judged["deploy"] == "static" and "deploy.yml" in commands(judged)[1]  # it drives all the same
 
 
@@ -208,16 +199,9 @@ def test_counted_instructions_go_before_times_of_a_workstation(demo):
     demo["arm"] = {"artifacts": {f"policy_{mode}": {"instructions_g": g} for mode, g in counts.items()}}
     judged = judge(demo)
     assert judged["deploy"] == "mixed" and judged["timing"] == v.COUNTED
-    assert row(judged, "static")["because"] == "needs 1.8 times the instructions of mixed INT8"
+    assert because(judged, "static") == "needs 1.8 times the instructions of mixed INT8"
     demo["quantize"]["modes"]["mixed"]["float_blocks"] = []
     assert judge(demo)["deploy"] == "static"
-
-
-def test_times_of_a_busy_machine_are_said_to_be_rough(demo):
-    timed = demo["benchmark"]["artifacts"]["fp32"]
-    for times, said in ((1.5, False), (3.0, True)):
-        timed["latency_p95_ms"] = times * timed["latency_p50_ms"]
-        assert any("was busy" in line for line in judge(demo)["cautions"]) == said
 
 
 def test_on_a_busy_machine_the_least_times_are_compared(demo):
@@ -230,33 +214,12 @@ def test_on_a_busy_machine_the_least_times_are_compared(demo):
     assert judge(demo)["deploy"] == "fp32"  # nothing tells that the machine was busy
     benchmark["cpu_pct"], benchmark["cpu_per_core_pct"] = 47.0, [100.0, 99.9]
     judged = judge(demo)
-    assert judged["deploy"] == "static" and row(judged, "static")["times_faster"] > 3
-    assert any("the least of each, measured here" in line for line in judged["why"])
-    assert any("busy" in line and "other programs had 53 % of it" in line for line in judged["cautions"])
-    assert "times as long as static INT8" in row(judged, "fp32")["because"]
+    assert judged["deploy"] == "static" and judged["compared"] == "least ms"
+    assert any("busy" in line and "53 %" in line for line in judged["cautions"])
     benchmark["cpu_per_core_pct"] = [100.0] * 64  # of a machine of which this process may use two: nobody can tell
     assert judge(demo)["deploy"] == "fp32"
-
-
-def test_what_does_more_work_is_not_called_faster(demo):
-    timed = demo["benchmark"]["artifacts"]
-    timed["mixed"]["latency_p50_ms"] = 0.8 * timed["static"]["latency_p50_ms"]  # by chance, on a busy machine
-    demo["quantize"]["modes"]["mixed"]["float_blocks"] = ["encoder.0.attention"]
-    demo.pop("arm", None)
-    judged = judge(demo)
-    assert judged["deploy"] == "static" and "are chance" in row(judged, "mixed")["because"]
-    assert row(judged, "mixed")["times_faster"] == row(judged, "static")["times_faster"]
-
-
-def test_nobody_who_drove_and_an_action_that_is_not_judged_are_said(demo):
-    for found in (demo["compare"]["fp32"], *demo["compare"]["modes"].values()):
-        found |= {"hits": None, "trials": None}
-        if "throttle_mae_pct" in found:
-            found["throttle_mae_pct"] = None
-    judged = judge(demo)
-    assert judged["deploy"] == "static" and "throttle" not in judged["why"][0]
-    assert any("Nobody drove" in line for line in judged["cautions"])
-    assert "deploy.yml" in commands(judged)[0] and "drive.yml" in commands(judged)[2]
+    benchmark["artifacts"]["fp32"]["latency_p95_ms"] = 3 * benchmark["artifacts"]["fp32"]["latency_p50_ms"]
+    assert any("p95 is 3.0 times" in line for line in judge(demo)["cautions"])
 
 
 def test_the_real_sample_is_too_little_to_be_sure(demo, tmp_path):
@@ -264,53 +227,37 @@ def test_the_real_sample_is_too_little_to_be_sure(demo, tmp_path):
     sample = real_episode()
     copied = tmp_path / sample.name
     shutil.copytree(sample, copied)
-    with pytest.raises(EpisodeError) as refused:
+    with pytest.raises(EpisodeError):
         split(load_recordings(tmp_path))
-    assert "record" in refused.value.remedy
     picture = sorted((sample / "frames").glob("*.jpg"))[0]
     (copied / "frames").mkdir(exist_ok=True)
     for k in range(1, 177):
         shutil.copyfile(picture, copied / f"frames/frame_{k:06d}.jpg")
     recordings = load_recordings(tmp_path, chunk=8)
     demo["load"] |= {"recordings": recordings.summary(), "split": split(recordings).episodes}
-    caution = judge(demo)["cautions"][0]
-    assert (
-        "of 1 episode, which were also used to calibrate: too few" in caution
-        and "Record some 20 drives more" in caution
-    )
+    assert "1 episode, which were also used to calibrate: too few" in judge(demo)["cautions"][0]
 
 
 def test_odd_frames_are_named(demo):
     """An error that comes from a few frames is no reason to train with INT8's rounding: on such it repaired nothing."""
-    usual, odd = (
-        {"steering_mae_pct": 0.21, "throttle_mae_pct": 0.59},
-        {"steering_mae_pct": None, "throttle_mae_pct": 7.84},
-    )
-    demo["quantize"]["odd"] = {
-        "share_pct": 3.5,
-        "block": "backbone.layer4",
-        "times": 235.7,
-        "episodes": {"a": 1, "b": 1},
-        "rows": [0, 3],
-        "errors": {"usual": usual, "odd": odd},
-    }
-    said = (
-        "In 3.5 % of the frames (a, b, frame 3 or earlier) backbone.layer4 answers 236 times more than usual: what is "
-        "special there? Static INT8 is off by throttle 7.84 % on them, by steering 0.21, throttle 0.59 % on the others."
-    )
-    assert said in judge(demo)["cautions"]
-    demo["quantize"]["odd"]["rows"] = [0, 90]
-    assert any("(a, b) backbone.layer4" in line for line in judge(demo)["cautions"])
-    for mode in ("static", "mixed"):
-        miss(demo, mode, 2.8)
+    odd = {"steering_mae_pct": None, "throttle_mae_pct": 7.84}
+    errors = {"usual": {"steering_mae_pct": 0.21, "throttle_mae_pct": 0.59}, "odd": odd}
+    where = {"block": "backbone.layer4", "times": 235.7, "episodes": {"a": 1, "b": 1}, "rows": [0, 3]}
+    demo["quantize"]["odd"] = {"share_pct": 3.5, "errors": errors} | where
+    miss(demo, 2.8, "static", "mixed")
     judged = judge(demo)
+    (said,) = (line for line in judged["cautions"] if "backbone.layer4" in line)
+    for part in ("3.5 %", "(a, b, frame 3 or earlier)", "236 times", "throttle 7.84 %", "steering 0.21, throttle 0.59"):
+        assert part in said
     remedies = " ".join(judged["failed"][0]["remedies"])
     assert "--qat" not in remedies + " ".join(commands(judged)) and "leave out drives" in remedies
 
 
-def test_what_is_typed_next_is_the_student_that_will_be_there(demo):
-    """The trainer's format has no place for what LeRobot normalises: of such a policy only LeRobot's folder is left."""
-    for mode in ("static", "mixed"):
-        miss(demo, mode, 2.8)
-    demo["load"]["checkpoint"]["format"] = "lerobot"
-    assert "rover run runs/mine-qat/pretrained_model episodes --name mine-qat" in commands(judge(demo))
+def test_every_gate_of_the_repository_has_words():
+    names = {row["gate"] for row in check_gates({}, PARAMS["gates"]["original"])}
+    for path in RESULTS.rglob("*.json"):
+        metrics = read_stage(path, None)["metrics"]
+        found = [*metrics.get("gates", []), *metrics.get("recommendation", {}).get("gates", [])]
+        names |= {row["gate"] for row in found if isinstance(row, dict)}
+    assert len(names) > 10 and not [name for name in names if "_" in gate_in_words(name)]
+    assert gate_in_words("policy_static_180x320.onnx simd_g") == "static INT8 180x320.onnx: SIMD instructions, 10^9"

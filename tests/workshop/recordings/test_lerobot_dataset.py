@@ -3,18 +3,14 @@
 import functools
 import io
 import json
-import math
 import os
 import re
 import shlex
 import shutil
-import struct
 import subprocess
 import sys
 from dataclasses import replace
-from fractions import Fraction
 
-import av
 import numpy as np
 import pandas
 import pyarrow
@@ -26,8 +22,7 @@ from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_fr
 from pyarrow import compute, parquet
 
 from rover_lib.cli import main
-from rover_lib.onboard.errors import CheckpointError, EpisodeError
-from rover_lib.onboard.kinds import KindError
+from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -85,33 +80,21 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (info(codebase_version="v2.1"), "only v3 is read; convert it once by LeRobot's own `python -m lerobot."),
-        (info(codebase_version="v4.0"), "only v3 is known here"),
-        (info(codebase_version=3), "does not name a version"),
-        (info(fps=0), "does not give a number of frames per second"),
-        (info(features=[]), "its features are not objects with a dtype and a shape"),
-        ("{", "not readable as JSON"),
-        ("[" * 100_000, "not readable as JSON"),
-        ("[]", "does not name a version"),
-        (features(front=None), "has no camera, found"),
+        (info(codebase_version="v2.1"), "`python -m lerobot."),
+        (info(codebase_version="v4.0"), "only v3"),
+        (info(fps=0), "frames per second"),
+        (info(features=[]), "features"),
+        ("[" * 100_000, "JSON"),
+        ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
+        (features(front=None), "has no camera"),
         (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
-        (features(action=None), "its 'action' is missing or not a row of numbers"),
-        (
-            features(state={"dtype": "float32", "shape": [2, 2]}),
-            "its 'observation.state' is missing or not a row of numbers",
-        ),
-        (features(action=TWO), "'action' does not name its 2 numbers, found None"),
-        (features(state=TWO), "'observation.state' does not name its 2 numbers"),
-        (
-            features(action=TWO | {"names": {"a": ["steering"], "b": ["throttle"]}}),
-            "does not name its 2 numbers, found",
-        ),
-        (features(action=TWO | {"names": ["steering"]}), "has 2 numbers, their names are steering"),
-        (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
+        (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
+        (features(action=None), "not a row of numbers"),
+        (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
+        (features(action=TWO), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
+        (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
         (features(), "has no meta/tasks.parquet"),
-        ("version https://git-lfs.github.com/spec/v1", "info.json: a Git LFS pointer, not the file that it stands for"),
-        ("\ufeff" + json.dumps(info()), "begins with a byte order mark"),
     ],
 )
 def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
@@ -120,7 +103,7 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
 
 def test_a_folder_of_datasets_and_one_without_its_info_are_told_apart(tmp_path):
     written(tmp_path / "a", info())
-    with pytest.raises(KindError, match=r"holds a LeRobotDataset, and is none itself, found a; give that, as in .*/a$"):
+    with pytest.raises(RoverError, match="LeRobotDataset"):
         load_recordings(tmp_path)
     (tmp_path / "a/meta/info.json").unlink()
     (tmp_path / "a/data").mkdir()
@@ -129,14 +112,10 @@ def test_a_folder_of_datasets_and_one_without_its_info_are_told_apart(tmp_path):
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
     assert "has no camera 'left', found front" in refused(Source.of(written(tmp_path, info()), camera="left"))
-    assert "given twice, found front, front; name each once" in refused(Source.of(tmp_path, camera="front,front"))
-
-
-def test_no_camera_hides_another(tmp_path):
-    camera = info()["features"]["observation.images.front"]
-    root = written(tmp_path, features(**{"observation.front": camera}))
-    assert "has 2 cameras, found observation.images.front, observation.front; say what" in refused(root)
-    assert "has no camera 'front', found observation" in refused(Source.of(root, camera="front"))
+    assert "once each" in refused(Source.of(tmp_path, camera="front,front"))
+    root = written(tmp_path, features(**{"observation.front": info()["features"]["observation.images.front"]}))
+    assert "has 2 cameras" in refused(root), "none hides another"
+    assert "has no camera 'front'" in refused(Source.of(root, camera="front"))
     assert "has no meta/tasks.parquet" in refused(Source.of(root, camera="observation.front"))
 
 
@@ -266,31 +245,8 @@ def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
     assert result.exit_code == 0 and "steering (column 1)" in result.output
 
 
-def rows(kept):
-    """Leaves those of the table's rows, in that order, and says in meta/info.json as many episodes."""
-
-    def change(path):
-        table = pandas.read_parquet(path)
-        left = table.iloc[kept]
-        left.to_parquet(path)
-        edit(path.parents[3] / "meta/info.json", lambda c: c.update(total_episodes=len(left)))
-
-    return change
-
-
-DATA = "data/chunk-000/file-000.parquet"
-VIDEO = "videos/observation.images.cam_front/"
-MERGED = [  # what LeRobot 0.4.0 wrote when it merged datasets: one change for each thing that is then wrong
-    ((f"{VIDEO}to_timestamp", [0.4, 1.05, 1.65]), "found 1 of 3 episodes; the part of episode 0 is not as long as it"),
-    (
-        (f"{VIDEO}from_timestamp", [0.0, 0.0, 1.05], f"{VIDEO}to_timestamp", [0.5, 0.55, 1.65]),
-        "the part of episode 1 overlaps that of episode 0",
-    ),
-    (
-        (f"{VIDEO}from_timestamp", [0.0, 0.5, 5.0], f"{VIDEO}to_timestamp", [0.5, 1.05, 5.6]),
-        "the part of episode 2 ends after the video",
-    ),
-]
+DATA, EPISODES_AT = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+VIDEO, CAM = "videos/observation.images.cam_front/", "observation.images.cam_front"
 
 
 def columns(*changes):
@@ -298,8 +254,7 @@ def columns(*changes):
 
     def change(path):
         table = pandas.read_parquet(path)
-        table = table.assign(**dict(zip(changes[::2], changes[1::2], strict=True)))
-        table.to_parquet(path)
+        table.assign(**dict(zip(changes[::2], changes[1::2], strict=True))).to_parquet(path)
 
     return change
 
@@ -325,133 +280,48 @@ def later(path):
     table.assign(timestamp=(table["timestamp"] + 2).astype("float32")).to_parquet(path)
 
 
-CAM = "observation.images.cam_front"
-
-
-def add(path, name, dtype):
-    """Adds a column of zeros, and its feature."""
+def repaint(path):
+    """Makes the second frame's picture smaller."""
     table = parquet.read_table(path)
-    zeros = pyarrow.array(np.zeros(len(table), dtype))
-    parquet.write_table(table.append_column(name, zeros).replace_schema_metadata(None), path)
-    feature = {"dtype": dtype, "shape": [1], "names": None}
-    edit(path.parents[2] / "meta/info.json", lambda c: c["features"].update({name: feature}))
-
-
-def repainted(paint):
-    """Changes the second frame's picture: of another size, or of other colours."""
-
-    def change(path):
-        table = parquet.read_table(path)
-        pictures, at, packed = table.column(CAM).to_pylist(), table.column_names.index(CAM), io.BytesIO()
-        paint(Image.open(io.BytesIO(pictures[1]["bytes"]))).save(packed, "PNG")
-        pictures[1]["bytes"] = packed.getvalue()
-        parquet.write_table(table.set_column(at, CAM, pyarrow.array(pictures, table.schema.field(CAM).type)), path)
-
-    return change
-
-
-def film(path, frames, fps):
-    """Cuts the video to that many frames; a shorter one gets its last frame again and again."""
-    with av.open(path) as source:
-        pictures = [f.to_ndarray(format="rgb24") for f in source.decode(video=0)]
-    with av.open(path, "w") as target:
-        stream = target.add_stream("libx264", rate=Fraction(fps), width=SIZE[1], height=SIZE[0], pix_fmt="yuv420p")
-        for picture in (pictures + pictures[-1:] * frames)[:frames]:
-            target.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        target.mux(stream.encode())
-
-
-def turned(path):
-    """Writes a film, and into its header that it is to be shown turned by a quarter."""
-    film(path, 33, FPS)
-    data = bytearray(path.read_bytes())
-    matrix = data.index(b"tkhd") + 44
-    data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, SIZE[0] << 16, 0, 1 << 30)
-    path.write_bytes(data)
+    pictures, at, packed = table.column(CAM).to_pylist(), table.column_names.index(CAM), io.BytesIO()
+    Image.open(io.BytesIO(pictures[1]["bytes"])).resize((64, 36)).save(packed, "PNG")
+    pictures[1]["bytes"] = packed.getvalue()
+    parquet.write_table(table.set_column(at, CAM, pyarrow.array(pictures, table.schema.field(CAM).type)), path)
 
 
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def said(**changes):
+    return lambda path: edit(path, lambda content: content.update(changes))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "file", "damage", "says"),
     [
-        ("image", "data/chunk-000/file-000.parquet", cut, "LeRobot cannot read it"),
-        ("image", "data/chunk-000/file-000.parquet", lambda p: p.unlink(), "has no data/*/*.parquet"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", cut, "LeRobot cannot read it"),
-        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", cut, "cannot be decoded"),
-        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4", lambda p: p.unlink(), "mp4: not there"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", rows(slice(2)), "2 episodes of 21 frames beside 3 of 33"),
-        ("video", "meta/episodes/chunk-000/file-000.parquet", rows([1, 0, 2]), "do not belong together"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(fps=30)), "30 frames a second, but 30 frames"),
-        ("image", "meta/info.json",
-         lambda p: edit(p, lambda c: c["features"]["action"].update(shape=[3])), "has 3 numbers, their names are"),
-        ("image", "meta/info.json",
-         lambda p: edit(p, lambda c: c["features"]["action"].update(shape=[3], names=["a", "b", "c"])),
-         "LeRobot cannot read it (TypeError: Couldn't cast array"),
-        ("image", "meta/info.json",
-         lambda p: edit(p, lambda c: c["features"]["observation.images.cam_front"].update(shape=[36, 64, 3])),
-         "has another shape than meta/info.json says"),
-        *(("image", "data/chunk-000/file-000.parquet", column(name), f"has no column {name}, found ")
-          for name in ("action", "timestamp", "observation.images.cam_front")),
-        ("image", "meta/info.json",
-         lambda p: edit(p, lambda c: c["features"].update(intervention={"dtype": "bool", "shape": [1], "names": None})),
-         "has no column intervention, found "),
-        ("image", "data/chunk-000/file-000.parquet", column("observation.state", [0.1, np.inf]),
-         "throttle of 'observation.state' is inf in frame 0 and 0 more, which cannot have been recorded"),
-        # LeRobot would list them all, until no memory is left
-        ("image", "meta/info.json",
-         lambda p: edit(p, lambda c: c.update(total_episodes=10**12)), "says 1000000000000 episodes, found 3 in meta/"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", column("length", 10**12), "do not belong together"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/chunk_index", None),
-         "where the files of episode 0 lie cannot be read (TypeError"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.pop("data_path")), "has no 'data_path'"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", column("data/file_index", 7),
-         "file-007.parquet: not there, and episode 0 is in it"),
-        *(("video", "meta/episodes/chunk-000/file-000.parquet", columns(*change), says)
-          for change, says in MERGED),
-        ("video", "videos/observation.images.cam_front/chunk-000/file-000.mp4",
-         lambda p: shutil.copy(p, p.with_name("file-009.mp4")), "file-009.mp4, which no episode uses"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=32)), "says 32 frames, found 33"),
-        *(("video", "data/chunk-000/file-000.parquet", column(*change), says)
-          for change, says in ((("index", 5), "not in their order, found index 5 in row 0"),
-                               (("frame_index", 1), "not in their order, found frame_index 1 in row 0"))),
-        ("video", "data/chunk-000/file-000.parquet", later, "times of an episode begin at 0, found 2 s in episode 0"),
-        ("image", "meta/tasks.parquet",
-         lambda p: pandas.DataFrame({"number": [0]}, index=["drive"]).to_parquet(p), "cannot be read (KeyError"),
-        # LeRobot takes the row of that number, also the last for -1, and shows another task's name
-        *(("image", "meta/tasks.parquet", lambda p, table=table: pandas.DataFrame(table[0], table[1]).to_parquet(p),
-           "meta/tasks.parquet and the frames in data do not belong together, found tasks 0 to 2 beside")
-          for table in (({"task_index": [2, 0, 1]}, ["a", "b", "c"]), ({"task_index": [0, 1]}, ["a", "b"]),
-                        ({"task_index": [0, 1, 2], "task": ["a", "b", "c"]}, None))),
-        ("image", "data/chunk-000/file-000.parquet", column("task_index", -1), "found tasks -1 to 2 beside"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(total_episodes=2)), "says 2 episodes, found"),
-        ("image", "meta/episodes/chunk-000/file-000.parquet", column("dataset_to_index", 33),
-         "meta/episodes gives episode 0 the frames 0 to 33, found 0 to 10 in data"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"]["action"].update(dtype="bool")),
-         "its 'action' are no numbers by meta/info.json, found 'bool'"),
-        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"].pop("index")),
-         "has columns that meta/info.json does not know: index"),
-        ("image", "data/chunk-000/file-000.parquet", lambda p: add(p, "intervention", "int64"),
-         "its 'intervention' is not a yes or no for each frame, found 'int64' of shape [1]"),
-        *(("image", "data/chunk-000/file-000.parquet", repainted(change), f"(72, 128, 3), found {found}")
-          for change, found in ((lambda i: i.resize((64, 36)), "(36, 64, 3)"),
-                                (lambda i: i.convert("L"), "(72, 128, 1)"),
-                                (lambda i: i.convert("RGBA"), "(72, 128, 4)"))),
-        ("video", "data/chunk-000/file-000.parquet", column("timestamp", 0.002),
-         "1 frames have another time than their picture in the video, found frame 0 is 2.00 ms off"),
-        ("video", f"{VIDEO}chunk-000/file-000.mp4", turned, "is to be shown turned by -90 degrees"),
-        ("image", "data/chunk-000/file-000.parquet", column("observation.state", [30.0, 0.1]),
-         "steering of 'observation.state' is 30 in frame 0 and 0 more, a rover's lies from -1 to 1"),
-        ("image", "data/chunk-000/file-000.parquet", lambda p: shutil.copy(p, p.with_name("episode_000000.parquet")),
-         "says v3, and data/chunk-000/episode_000000.parquet is of v2.1; it was converted by half"),
-        ("video", "meta/info.json",
-         lambda p: edit(p, lambda c: c["features"][CAM].update(info={"is_depth_map": True})), "is not a colour camera"),
-        *(("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p, a=args: film(p, *a), says)
-          for args, says in (((32, FPS), "has 32 frames, 20 a second, found 33 frames of 20"),
-                             ((33, FPS / 2), "has 33 frames, 10 a second, found 33 frames of 20"))),
+        ("image", DATA, cut, "LeRobot cannot read it"),
+        ("image", DATA, lambda p: p.unlink(), "has no data/*/*.parquet"),
+        ("image", DATA, lambda p: p.write_text("version https://git-lfs.github.com/spec/v1"), "Git LFS"),
+        ("image", EPISODES_AT, cut, "LeRobot cannot read it"),
+        ("video", f"{VIDEO}chunk-000/file-000.mp4", cut, "cannot be decoded"),
+        ("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p: p.unlink(), "LeRobot cannot read it"),
+        ("image", EPISODES_AT, column("data/file_index", 7), "cannot be read"),
+        # what LeRobot accepts without a word
+        ("image", EPISODES_AT, lambda p: pandas.read_parquet(p).iloc[[1, 0, 2]].to_parquet(p), "belong together"),
+        ("image", EPISODES_AT, column("dataset_to_index", 33), "belong together"),
+        ("image", DATA, column("index", 5), "not in their order, found index 5 in row 0"),
+        ("image", DATA, column("frame_index", 1), "not in their order, found frame_index 1 in row 0"),
+        ("image", DATA, later, "frames come at another rate"),
+        ("image", "meta/info.json", said(fps=30), "30 frames a second, but 30 frames"),
+        ("image", DATA, column("action"), "has no column action"),
+        ("image", DATA, column("observation.state", [0.1, np.inf]), "throttle of 'observation.state' is inf"),
+        ("image", DATA, column("observation.state", [30.0, 0.1]), "steering of 'observation.state' is 30"),
+        # what LeRobot 0.4.0 wrote when it merged datasets
+        ("video", EPISODES_AT, columns(f"{VIDEO}to_timestamp", [0.4, 1.05, 1.65]), "episode 0 is not as long as it"),
+        ("video", EPISODES_AT,
+         columns(f"{VIDEO}from_timestamp", [0.0, 0.0, 1.05], f"{VIDEO}to_timestamp", [0.5, 0.55, 1.65]), "overlaps"),
     ],
 )  # fmt: skip
 def test_damage_is_a_sentence(copied, kind, file, damage, says):
@@ -460,34 +330,21 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
     assert says in refused(root)
 
 
+@pytest.mark.slow
+def test_a_picture_of_another_size_or_without_its_bytes_is_a_sentence(copied):
+    root = copied()
+    repaint(root / DATA)
+    column(CAM, None)(root / DATA)
+    samples = load_recordings(root, CHUNK).samples
+    for sample, says in ((samples[0], "cannot be decoded"), (samples[1], "another shape")):
+        with pytest.raises(EpisodeError, match=says):
+            sample.frame_bgr()
+
+
 def edit(path, change):
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "file", "damage", "fault"),
-    [
-        *(("image", "meta/stats.json", lambda p, c=change: edit(p, c), ("odd_statistics", count, f"action's {first}"))
-          for change, count, first in (
-              (lambda c: c["action"].update(std=[math.nan, 1.0]), 1, "std"),
-              (lambda c: c["action"].update(std=None, max="a", min=[1, 1, 1]), 3, "min"),
-              (lambda c: c["action"].update(mean=[50.0, 50.0]), 1, "mean"),
-              (lambda c: c.pop("action"), 4, "min"))),
-        ("image", "meta/stats.json", lambda p: edit(p, lambda c: c[CAM].update(std=[[[math.nan]]], mean=[[[127.0]]])),
-         ("odd_statistics", 2, f"{CAM}'s mean is")),
-        ("image", "meta/stats.json", lambda p: p.unlink(), ("odd_statistics", 8, "observation.state's min is")),
-        ("video", f"{VIDEO}chunk-000/file-000.mp4", lambda p: film(p, 40, FPS),
-         ("more_frames", 7, "has 40 frames, 33 of them in data")),
-    ],
-)  # fmt: skip
-def test_what_only_lerobots_trainer_would_take_wrong_is_a_fault(copied, kind, file, damage, fault):
-    root = copied(kind)
-    damage(root / file)
-    (found,) = load_recordings(root, CHUNK).faults
-    assert (found.kind, found.count) == fault[:2] and found.note.startswith(fault[2]) and found.handled == "left out"
 
 
 def files_of_one_episode(root):
@@ -507,18 +364,14 @@ def files_of_one_episode(root):
     "change",
     [
         files_of_one_episode,
-        lambda r: edit(
-            r / "meta/info.json", lambda c: c.update(features=dict(reversed(c["features"].items())), fps=20.0)
-        ),
         lambda r: parquet.write_table((t := parquet.read_table(r / DATA)).select(t.column_names[::-1]), r / DATA),
-        lambda r: edit(r / "meta/info.json", lambda c: c["features"]["action"].update(dtype="float64")),
         lambda r: edit(r / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])),
         lambda r: edit(
             r / "meta/info.json",
             lambda c: c["features"]["action"].update(names={"motors": {"steering": 0, "throttle": 1}}),
         ),
     ],
-    ids=["files", "feature order", "column order", "float64", "CHW", "nested names"],
+    ids=["files", "column order", "CHW", "nested names"],
 )
 def test_what_is_arranged_otherwise_is_the_same(copied, datasets, change):
     root = copied()
@@ -528,14 +381,6 @@ def test_what_is_arranged_otherwise_is_the_same(copied, datasets, change):
     for ours, right in zip(found.samples, expected.samples, strict=True):
         assert np.array_equal(ours.chunk, right.chunk) and np.array_equal(ours.state, right.state)
         assert np.array_equal(ours.frame_bgr(), right.frame_bgr())
-
-
-@pytest.mark.slow
-def test_one_picture_that_is_not_there_is_a_sentence(copied):
-    root = copied()
-    column("observation.images.cam_front", None)(root / "data/chunk-000/file-000.parquet")
-    with pytest.raises(EpisodeError, match="are not in its tables"):
-        load_recordings(root, CHUNK).samples[0].frame_bgr()
 
 
 @pytest.mark.slow
@@ -555,9 +400,7 @@ def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, da
     )
     loaded, right = load(smaller, datasets()), load(trained, datasets())
     (note,) = loaded.checkpoint.report["notes"]
-    assert note.startswith(
-        "config.json says 128x36 for cam_front, and the recordings are 128x72: LeRobot never resizes"
-    )
+    assert "128x36" in note and "128x72" in note
     assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
     sample = right.recordings.samples[0]
     assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
@@ -648,10 +491,7 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     assert tiny.recorded_as(Layout(("front",), rate_hz=30.0)) is tiny
     wheels, ours = ("left", "right"), ("steering", "throttle")
     for layout in (Layout(("front",), wheels, wheels, 30.0), Layout(("front",), wheels, ours, 30.0)):
-        says = (
-            "whose state is steering, throttle, found recordings whose state is left, right; if they are the same, ren"
-        )
-        with pytest.raises(CheckpointError, match=says):
+        with pytest.raises(CheckpointError, match="state is left, right"):
             tiny.recorded_as(layout)
     twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
     with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):

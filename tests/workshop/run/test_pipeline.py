@@ -1,12 +1,11 @@
 """The pipeline once: what the command line makes is what a run makes."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 from policies import memory_samples
 
-from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
+from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.int8.observe import calibrate
@@ -42,15 +41,6 @@ def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
     modes = export_policies(tmp_path, tiny, policies, calibration, loaded.parts.choosing, recipe.parity)
     assert modes["static"]["content_hash"] == digest == content_hash(tmp_path / "policy_static.pt")
     assert modes["static"]["scheme"]["mode"] == "static" and modes["static"]["int8_modules"] > 0
-
-
-@pytest.mark.slow
-def test_fp32_needs_no_calibration(loaded, tmp_path):
-    recipe = replace(Recipe.of(params()), samples=2)
-    digest, warnings = make_artifact(loaded, tmp_path / "fp32.pt", recipe, fp32=True)
-    manifest = read_manifest(tmp_path / "fp32.pt")
-    assert (manifest["mode"], manifest["calibration"], warnings) == ("fp32", None, [])
-    assert digest == content_hash(tmp_path / "fp32.pt")
 
 
 def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(loaded, calibration, tmp_path, monkeypatch):

@@ -27,38 +27,37 @@ def written(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_statistics_that_changed_since_are_refused(written, tmp_path):
+def test_what_changed_since_is_refused(written, tmp_path):
     """Of the same weights: the plans of an artifact that is made now would be other ones than the run judged."""
     drives = record_drives(tmp_path / "episodes", frames=40)
     write_load(tmp_path, load(written(0.02), drives))
     assert open_run(tmp_path).checkpoint.config.action_unnorm.scale == pytest.approx((0.4, 0.02))
     written(0.03)
-    with pytest.raises(RoverError, match="not what notebook 01 loaded any more, found the same weights, and another"):
+    with pytest.raises(RoverError, match="not what notebook 01 loaded"):
         open_run(tmp_path)
-
-
-@pytest.mark.slow
-def test_recordings_that_now_name_their_numbers_otherwise_are_refused(written, tmp_path):
-    drives = record_drives(tmp_path / "episodes", frames=40)
-    write_load(tmp_path, load(written(0.02), drives))
+    written(0.02)
     stage = json.loads((tmp_path / "load.json").read_text())
     stage["metrics"]["recordings"]["layout"] = (
         "camera: the car's; state: throttle, steering; action: steering, throttle"
     )
     (tmp_path / "load.json").write_text(json.dumps(stage))
-    with pytest.raises(RoverError, match="says something else of its numbers"):
+    with pytest.raises(RoverError, match="says something else"):
+        open_run(tmp_path)
+    stage["metrics"] |= {"split": {}, "recordings": {}}
+    (tmp_path / "load.json").write_text(json.dumps(stage))
+    with pytest.raises(RoverError, match="other episodes"):
         open_run(tmp_path)
 
 
 @pytest.mark.parametrize(
     "change, says",
     [
-        ({"chunk": 257}, "steps in a plan must be from 1 to 256, found 257"),
-        ({"rate_hz": 2.0}, "steps of a plan in a second must be from 5 to 120, found 2"),
-        ({"image_sizes": ((8, 16),)}, "pixels a side must be from 16 to 8192, found 8"),
-        ({"cameras": ("left/right",)}, "the names of cameras must have 1 to 64 characters and no '/', found"),
-        ({"action_names": ("steering", "t" * 65)}, "the names of actions must have 1 to 64 characters"),
-        ({"state_names": tuple(f"joint{i}" for i in range(65))}, "states must be from 1 to 64, found 65"),
+        ({"chunk": 257}, "found 257"),
+        ({"rate_hz": 2.0}, "found 2"),
+        ({"image_sizes": ((8, 16),)}, "found 8"),
+        ({"cameras": ("left/right",)}, "names of cameras"),
+        ({"action_names": ("steering", "t" * 65)}, "names of actions"),
+        ({"state_names": tuple(f"joint{i}" for i in range(65))}, "found 65"),
     ],
 )
 def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
@@ -70,7 +69,7 @@ def test_what_no_artifact_may_hold_is_refused(change, says, tiny):
 def test_sizes_are_refused_before_any_recording_is_read(tiny, monkeypatch):
     """Plans of a million steps, in a file of a few megabytes, would fill the memory with the samples of a drive."""
     long = replace(tiny, config=replace(tiny.config, chunk=1_000_000))
-    monkeypatch.setattr(session, "load_checkpoint", lambda path: long)
+    monkeypatch.setattr(session, "load_checkpoint", lambda *_: long)
     monkeypatch.setattr(session, "load_recordings", lambda *given: pytest.fail("they were read"))
     with pytest.raises(CheckpointError, match=r"from 1 to 256, found 1e\+06"):
         load(long.path, "episodes")
@@ -78,6 +77,6 @@ def test_sizes_are_refused_before_any_recording_is_read(tiny, monkeypatch):
 
 def test_a_rate_of_the_recordings_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
     slow = replace(tiny, config=replace(tiny.config, rate_hz=2.0))
-    monkeypatch.setattr(session, "load_checkpoint", lambda path: slow)
+    monkeypatch.setattr(session, "load_checkpoint", lambda *_: slow)
     with pytest.raises(CheckpointError, match="from 5 to 120, found 2"):
         load(slow.path, record_drives(tmp_path / "episodes", frames=300))

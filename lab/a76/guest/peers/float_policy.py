@@ -7,13 +7,15 @@ import torch
 from planes import planes
 from torch import Tensor, nn
 
+from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 
 def float_policy(checkpoint: str) -> tuple[ACT, tuple[Tensor, Tensor]]:
     """Load the policy, (state (1, S), planes (1, 3, height, width)) -> (1, C, A), all float32, with example inputs."""
-    found = load_checkpoint(checkpoint)
+    # checked when it was run; there is no LeRobot for the engines' torch
+    found = load_checkpoint(checkpoint, checked=sha256_of(checkpoint))
     model = ACT(found.config, found.weights)
     # Only the normalisation of the images stays in the model: the planes are made outside of it.
     model.image_input = nn.ModuleList(pixels.norm for pixels in model.image_input)

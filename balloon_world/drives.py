@@ -1,0 +1,273 @@
+"""Drive policies through balloon worlds in virtual time: with late plans, pushes, decoys, and somebody who takes over.
+
+    driven = drive_in(policy, World(10_000, shoves=4), latency_s=0.15, settings=settings)
+    outcomes = drive_missing(artifact, questions, one_drive, "drives.jsonl", progress)
+
+The car's own loop drives: `onboard.drive.loop.drive` with its PolicyPilot, on a virtual clock. Only the camera and the
+planner's thread are replaced. Nothing waits, and no result depends on how fast this machine is.
+"""
+
+import json
+import math
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from balloon_world.trial import Trajectory, wilson_interval
+from balloon_world.world import RATE_HZ, CarState, World
+from rover_lib.onboard.car.camera import Frame
+from rover_lib.onboard.drive.loop import Until, drive
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot
+from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
+from rover_lib.onboard.errors import DriveFault, WorldError
+from rover_lib.onboard.policy.load import Policy, load_policy
+from rover_lib.onboard.stage import plain
+from rover_lib.workshop.progress import Progress, silent
+
+LATENCY_MOST_S = 5.0
+ROUNDING = 1e-6  # how far times may be rounded, in ticks
+SEED = 10_000  # of the first world that judges a policy
+
+K = TypeVar("K")
+P = TypeVar("P")
+V = TypeVar("V")
+Watch = Callable[[Order], bool]
+
+
+class TimedCar:
+    """A world, and the loop's camera, planner, clock and sleep in it. Only sleep() moves the time on.
+
+    Frames come at the ticks. The car is held until the first plan is there, like the car of `rover drive --world`.
+    """
+
+    wanted_hz = RATE_HZ
+
+    def __init__(self, world: World, policy: Any, latency_s: float, commanded: Commanded):
+        self.world, self.stop = world, threading.Event()
+        self.command: Order | None = None
+        self.plans: list[tuple[Plan, CarState]] = []
+        self._policy, self._latency_s, self._commanded = policy, latency_s, commanded
+        self._tick, self._looked_at = 0, -1  # the present tick, and the tick of the last frame that was planned from
+        self._coming: tuple[Plan, CarState] | None = None
+        self._think(ROUNDING)
+
+    def clock(self) -> float:
+        return self._tick / RATE_HZ
+
+    def sleep(self, seconds: float) -> None:
+        for _ in range(round(seconds * RATE_HZ)):
+            self._think(self._tick + 1 - ROUNDING)
+            if self.command:
+                self.world.step(self.command.steering, self.command.throttle, 1 / RATE_HZ)
+                if self.world.done:
+                    return self.stop.set()
+            self._tick += 1
+            self._think(self._tick + ROUNDING)
+
+    def latest(self) -> Frame:
+        # The loop only asks whether the camera is frozen or black, so nothing needs to be drawn for it.
+        return Frame(np.empty((0, 0, 3), np.uint8), self.clock(), self._tick + 1, 0, 255.0, 255.0)
+
+    @property
+    def asking_s(self) -> float:
+        return self.clock() - (self._coming[0].ready_s - self._latency_s) if self._coming else 0.0
+
+    def newest(self) -> Plan | None:
+        return self.plans[-1][0] if self.plans else None
+
+    def wait(self, timeout_s: float) -> Plan | None:
+        while not self.plans:
+            self.sleep(1 / RATE_HZ)
+        return self.newest()
+
+    def _think(self, until_tick: float) -> None:
+        """Do what Planner's thread does up to `until_tick`: when a plan is ready, begin one from the newest frame."""
+        now_s = self.clock()
+        while True:
+            if self._coming:
+                plan = self._coming[0]
+                if plan.ready_s * RATE_HZ > until_tick:
+                    return
+                self.plans.append(self._coming)
+                now_s, self._coming = max(now_s, plan.ready_s), None
+            if self._looked_at == self._tick:
+                return  # the planner waits for another frame
+            self._looked_at = self._tick
+            state = self._commanded.state(self.clock(), self._policy.rate_hz)
+            actions = self._policy.predict_unclipped(self.world.render(), state)
+            plan = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
+            self._coming = plan, self.world.state
+
+
+class WorldPilot(PolicyPilot):
+    """A pilot whose orders move the virtual car and are kept. watch: see `drive_in`."""
+
+    def __init__(self, car: TimedCar, commanded: Commanded, settings: Settings, rate_hz: float, watch: Watch | None):
+        camera_and_planner: Any = car
+        super().__init__(camera_and_planner, camera_and_planner, commanded, settings, rate_hz)
+        self.orders: list[Order] = []
+        self._car, self._watch = car, watch
+
+    def sent(self, at_s: float, order: Order) -> None:
+        super().sent(at_s, order)
+        self._car.command = order
+        self.orders.append(order)
+        if self._watch and self._watch(order):
+            self._car.stop.set()  # the drive ends after this tick
+
+
+class NoLog:
+    """A flight log that keeps nothing."""
+
+    start_s = 0.0
+
+    def tick(self, row: Any) -> None: ...
+
+    def event(self, text: str, **fields: Any) -> None: ...
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A drive through a world.
+
+    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by, or 'taken over'. trajectory: one
+    point per tick. orders: what was commanded at each tick. plans: each with the car's state when its frame was taken.
+    """
+
+    outcome: str
+    duration_s: float
+    trajectory: Trajectory
+    orders: list[Order]
+    plans: list[tuple[Plan, CarState]]
+
+
+def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> Driven:
+    """Drive through a world until it has ended.
+
+    policy: an artifact's Policy, or anything else with `rate_hz` and `predict_unclipped`. latency_s: from taking the
+    newest frame to having its plan; with 0 the plan is there within the same tick. watch: called with every order when
+    it is sent, before the car moves by it; if it returns true, somebody takes over and the drive ends after that tick.
+    Raises PolicyError for a plan that no car may be driven by, and WorldError for a latency that cannot be.
+    """
+    if not 0 <= latency_s <= LATENCY_MOST_S:
+        raise WorldError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=latency_s)
+    commanded = Commanded()
+    car = TimedCar(world, policy, latency_s, commanded)
+    pilot = WorldPilot(car, commanded, settings, policy.rate_hz, watch)
+    try:
+        drive(pilot, None, NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
+        outcome = str(world.outcome) if world.done else "taken over"
+    except DriveFault as fault:
+        if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
+            raise fault.__cause__ from None
+        outcome = "stopped"
+    return Driven(outcome, world.state.time_s, Trajectory.of(world), pilot.orders, car.plans)
+
+
+# --- many drives ------------------------------------------------------------------------------------------------------
+
+
+def load_for_cores(artifact: Path, most: int) -> list[Policy]:
+    """Load a policy of one thread for each core, `most` at most.
+
+    One policy on all cores would be slower: once torch has a second thread, it spins between inferences, which costs
+    several times what it gains for a small policy.
+    """
+    return [load_policy(artifact, threads=1) for _ in range(min(os.cpu_count() or 1, most))]
+
+
+def everywhere(policies: Sequence[P], asked: Sequence[K], do: Callable[[P, K], V]) -> Iterator[tuple[K, V]]:
+    """Call do(policy, question) for each question on a thread for each policy; yield (question, answer) when ready.
+
+    policies: the same policy, loaded once for each thread. Answers do not depend on how many there are.
+    """
+    free: queue.SimpleQueue[P] = queue.SimpleQueue()
+    for policy in policies:
+        free.put(policy)
+
+    def one(question: K) -> tuple[K, V]:
+        policy = free.get()
+        try:
+            return question, do(policy, question)
+        finally:
+            free.put(policy)
+
+    with ThreadPoolExecutor(max(len(policies), 1)) as pool:
+        running = [pool.submit(one, question) for question in asked]
+        try:
+            for future in as_completed(running):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read the rows of a file. A line that is torn, because a process was killed, is left out."""
+    rows = []
+    for line in path.read_text().splitlines() if path.is_file() else ():
+        with suppress(ValueError):
+            rows.append(json.loads(line))
+    return rows
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a row to a file, after whatever a killed process left of the last one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.write("\n" + json.dumps(plain(row)) + "\n")
+
+
+def drive_missing(
+    artifact: Path,
+    asked: Sequence[tuple[str, int]],
+    one: Callable[[Policy, tuple[str, int]], Mapping[str, Any]],
+    path: Path,
+    progress: Progress = silent,
+    desc: str = "driving",
+) -> dict[tuple[str, int], dict[str, Any]]:
+    """Return a row for each (how, seed) that is asked for.
+
+    Rows that are in the file are not driven again, and each new one is there as soon as its drive has ended. one: makes
+    the drive, and returns what its row says of it.
+    """
+    kept = {(row["how"], row["seed"]): row for row in read_rows(path)}
+    missing = [each for each in asked if each not in kept]
+    if missing:
+        driven = everywhere(load_for_cores(artifact, len(missing)), missing, one)
+        for (how, seed), found in progress(driven, desc=desc, total=len(missing)):
+            kept[how, seed] = {"how": how, "seed": seed, **found}
+            append_row(path, kept[how, seed])
+    return {each: kept[each] for each in asked}
+
+
+def count_hits(outcomes: Mapping[int, str], key: str = "wilson") -> dict[str, Any]:
+    """Return hits, trials, Wilson's 95 % interval and the missed seeds of outcomes by seed."""
+    missed = [seed for seed, outcome in sorted(outcomes.items()) if outcome != "hit"]
+    hits = len(outcomes) - len(missed)
+    low, high = wilson_interval(hits, len(outcomes))
+    return {"hits": hits, "trials": len(outcomes), f"{key}_low": low, f"{key}_high": high, "missed": missed}
+
+
+def sign_test(only_one: int, only_other: int) -> float:
+    """Return p: how likely chance alone divides the worlds that only one of two policies hits at least as unevenly.
+
+    This is the exact two-sided sign test on discordant pairs (McNemar's exact test); p is 1 if there are none.
+    """
+    n, fewer = only_one + only_other, min(only_one, only_other)
+    return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
+
+
+def pair_worlds(missed: Sequence[int], others_missed: Sequence[int]) -> tuple[int, int, float]:
+    """Compare two policies in the same worlds: how many only the one hit, how many only the other, and the sign test's
+    p. missed: the seeds that each did not hit.
+    """
+    only, only_other = len({*others_missed} - {*missed}), len({*missed} - {*others_missed})
+    return only, only_other, sign_test(only, only_other)

@@ -1,1 +1,0 @@
-"""Does static INT8 hold for policies that nobody tuned it for?"""

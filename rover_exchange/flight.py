@@ -1,0 +1,114 @@
+"""Draw a flight log: what was commanded, what the pins did, how old the plans were, how late the loop was.
+
+flight_figure(read_log("flight.log")).savefig("flight.log.png")
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rover_lib.onboard.car.host import THROTTLED_BITS
+from rover_lib.onboard.car.pwm import Channel
+from rover_lib.onboard.car.servo_link import State
+from rover_lib.onboard.drive.flight_log import Flight
+from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, NOW_BITS, RED, SLATE, new_figure
+
+STATES = {
+    State.MANUAL.value: ("human", GREY),
+    State.AUTONOMOUS.value: ("host", SLATE),
+    State.STOPPED.value: ("nobody, stopped", RED),
+    "": ("not known", "#F2F2F2"),
+}
+HEIGHTS = {"driven by": 0.4, "steering": 1.6, "throttle": 1.6, "plan (ms)": 1.6, "late (ms)": 1.3, "°C": 0.9}  # inches
+EVENTS_LISTED = 14
+TEXT_LENGTH = 105
+
+
+def flight_figure(flight: Flight) -> Figure:
+    """Draw one drive: panels over the same seconds, a dotted line for each event, and below them the last events."""
+    ticks, machine, t_s = flight.ticks, flight.machine, flight.ticks["t_s"]
+    listed = flight.events[-EVENTS_LISTED:]  # the last ones say why it ended
+    height_in = sum(HEIGHTS.values()) + 3.4 + 0.19 * len(listed)
+    fig, axes = new_figure(len(HEIGHTS), height_in=height_in, height_ratios=[*HEIGHTS.values()], sharex=True)
+    who, steering, throttle, plan, late, processor = axes[:, 0]
+    _draw_who(who, ticks)
+    _draw_pulses(steering, flight.car.pwm.steering, ticks, COLOURS["steering"])
+    _draw_pulses(throttle, flight.car.pwm.throttle, ticks, COLOURS["throttle"])
+    if (ticks["fade"] < 1).any():
+        # The area hangs from the top: its share of the height is the share of the throttle that is taken away.
+        options = {"step": "post", "transform": throttle.get_xaxis_transform(), "color": RED, "alpha": 0.18, "lw": 0}
+        throttle.fill_between(t_s, ticks["fade"], 1, label="faded for the plan's age", **options)
+    _draw_plan(plan, ticks, flight.header.get("drive", {}))
+    late.plot(t_s, ticks["late_ms"], ".", color=SLATE, ms=2.5, label="lateness of a command")
+    _draw_processor(processor, machine)
+    for ax, name in zip(axes[:, 0], HEIGHTS, strict=True):
+        ax.set_ylabel(name, fontsize=10)
+        for event in flight.events:
+            ax.axvline(event.t_s, color=BLACK, lw=0.8, ls=":", zorder=0.5)
+        if ax.get_legend_handles_labels()[0]:  # above the axes, where no line can run through it
+            ax.legend(loc="lower left", bbox_to_anchor=(0, 0.97), ncols=4, frameon=False, fontsize=9)
+    times_s = [t_s, machine["t_s"], np.array([e.t_s for e in flight.events])]
+    end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
+    start_s = float(t_s[0]) if len(t_s) else 0.0  # events before the first tick are listed, not drawn
+    axes[-1, 0].set_xlim(max(0.0, start_s - 0.02 * (end_s - start_s)), end_s)
+    axes[-1, 0].set_xlabel("time since the start (s)", fontsize=10)
+    fig.align_ylabels(axes[:, 0])
+    fig.suptitle(f"{flight.path.name}: {flight.header.get('start', 'start not known')}", fontsize=11)
+    lines = [f"{event.t_s:7.2f} s   {str(event)[:TEXT_LENGTH]}" for event in listed]
+    if earlier := len(flight.events) - len(listed):
+        lines.insert(0, f"{earlier} earlier events: rover log --json lists them")
+    text = "\n".join(lines).replace("$", r"\$")  # no formula
+    fig.supxlabel(text, fontsize=9, x=0.01, ha="left", linespacing=1.4)
+    return fig
+
+
+def _draw_who(ax: Axes, ticks: Mapping[str, np.ndarray]) -> None:
+    """Draw who drove, as coloured bands."""
+    for state, (label, colour) in STATES.items():
+        if (driven := ticks["state"] == state).any():
+            ax.fill_between(ticks["t_s"], 0, 1, where=driven, step="post", color=colour, lw=0, label=label)
+    ax.set_yticks([])
+    ax.set_ylim(0, 1)
+
+
+def _draw_pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour: str) -> None:
+    """Draw one channel's pulses, commanded and on the pin. The axis on the right shows the same lines as actions."""
+    t_s, commanded, pins = ticks["t_s"], ticks[f"{channel.name}_us"], ticks[f"pins_{channel.name}_us"]
+    neutral_us = channel.pulse_us(0.0)
+    ax.plot(t_s, commanded, color=colour, lw=2.2, alpha=0.7, label="commanded, us", drawstyle="steps-post")
+    ax.plot(t_s, pins, color=BLACK, lw=0.9, label="the Arduino's pin", drawstyle="steps-post")
+    ax.axhline(neutral_us, color=GREY, lw=0.8, ls="--", label=f"neutral, {neutral_us} us")
+    known = np.concatenate([commanded, pins, [neutral_us]])
+    low, high = np.nanmin(known), np.nanmax(known)
+    room = max(0.08 * (high - low), 6)  # or the noise of a standing car would fill the panel
+    ax.set_ylim(low - room, high + room)
+    scale = (lambda us: (us - neutral_us) / channel.us_per_unit, lambda a: neutral_us + a * channel.us_per_unit)
+    ax.secondary_yaxis("right", functions=scale).set_ylabel("action", fontsize=10)
+
+
+def _draw_plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, Any]) -> None:
+    t_s, plans = ticks["t_s"], ticks["plan"]
+    ax.plot(t_s, ticks["plan_age_ms"], color=SLATE, lw=1.1, label="age of the plan")
+    _, first = np.unique(plans, return_index=True)
+    first = first[plans[first] > 0]
+    ax.plot(t_s[first], ticks["latency_ms"][first], ".", color=BLACK, ms=4, label="latency of each")
+    for key, colour, label in (("fade_s", MIST, "fades from"), ("stop_s", RED, "stopped from")):
+        value = drive.get(key)
+        if isinstance(value, (int, float)):
+            ax.axhline(1000 * value, color=colour, lw=1.2, ls="--", label=f"{label} {1000 * value:g} ms on")
+    ax.set_ylim(0, None)
+
+
+def _draw_processor(ax: Axes, machine: Mapping[str, Any]) -> None:
+    """Draw the processor's temperature, empty on a machine without a sensor, and when the machine was throttled."""
+    t_s, celsius = machine["t_s"], machine["temperature_c"]
+    if np.isfinite(celsius).any():
+        ax.plot(t_s, celsius, color=RED, lw=1.4, label="processor")
+    bits = np.array([int(v or "0", 16) & NOW_BITS for v in machine["throttled"]], int)
+    if bits.any():
+        names = [name for bit, name in THROTTLED_BITS.items() if (bits >> bit & 1).any()]
+        options: dict[str, Any] = {"step": "post", "transform": ax.get_xaxis_transform()}
+        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), color=RED, alpha=0.4, lw=0, **options)

@@ -1,0 +1,161 @@
+"""Write a kit as a folder: networks, calibration set, model scripts, and kit.json, by which compile.py works."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import onnx
+from numpy.lib.format import open_memmap
+
+from rover_exchange.hailo.networks import Network, networks
+from rover_lib.onboard.artifact.manifest import Artifact, largest_tolerance
+from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.params import params
+from rover_lib.workshop.act import ACT, ActConfig, inputs_of, parameters_by_block, zero_colour
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.run.pipeline import Recipe
+from rover_lib.workshop.run.session import Opened
+
+LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transformers (vit_small.alls, deit_base.alls)
+# The chip's answers may be this many times as far from FP32 as what is allowed to torch's INT8. The chip rounds in
+# other places, and nobody knows by how much; a HEF that computes something else is hundreds of times as far off.
+STATIC_TIMES = 2.5
+COPIED = ("KIT.md", "compile.py")
+
+
+def write_kit(
+    loaded: Opened, run_dir: Path | str, out: Path | str, *, samples: int = LEAST_SAMPLES, progress: Progress = silent
+) -> None:
+    """Write the kit of a run to the new folder `out`.
+
+    loaded: what the run was made of. run_dir: the run's folder, with its artifacts. samples: how many frames the
+    calibration set has. Raises QuantizeError if `out` exists or too few frames were recorded, and
+    ArtifactError without the run's artifacts. After an error nothing of the kit is left.
+    """
+    out = Path(out)
+    if out.exists() or out.is_symlink():
+        raise QuantizeError(f"{out}: exists already", remedy="give a folder that does not")
+    chosen, _ = Recipe.of(params(), samples).choose(loaded.parts.calibration)
+    if len(chosen) < samples:
+        raise QuantizeError(
+            f"a calibration set of {samples} frames is wanted, {len(chosen)} are usable for it",
+            remedy="record more; or say --samples, and expect more of an error",
+        )
+    policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
+    front, whole, rest = networks(policy)
+    described = {}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
+        folder = Path(temporary) / out.name
+        folder.mkdir()
+        manifest = _manifest(Path(run_dir), samples, folder)
+        onnx.save(rest, folder / "transformer.onnx")
+        for name, network in (("backbone", front), ("whole", whole)):
+            onnx.save(network.model, folder / f"{name}.onnx")
+            (folder / f"{name}.alls").write_text(model_script(name, network, policy.config, samples))
+            described[name] = _describe(policy, name, network)
+        for name in COPIED:
+            shutil.copyfile(Path(__file__).with_name(name), folder / name)
+        write_calibration(policy, chosen, folder, progress)
+        content = {"schema": 1, "networks": described, "manifest": manifest}
+        (folder / "kit.json").write_text(json.dumps(content, indent=1))
+        folder.rename(out)
+
+
+def write_calibration(policy: ACT, samples: Sequence[Sample], folder: Path, progress: Progress) -> None:
+    """Write calibration_<input>.npy: frames (n, height, width, 3) uint8 RGB, normalised states (n, 1, 1, S) float32."""
+    config = policy.config
+    shapes = {"state": (1, 1, len(config.state_names))}
+    shapes |= {f"frame_{name}": (*size, 3) for name, size in zip(config.cameras, config.image_sizes, strict=True)}
+    arrays = [
+        open_memmap(
+            folder / f"calibration_{name}.npy",
+            "w+",
+            np.float32 if name == "state" else np.uint8,
+            (len(samples), *shape),
+        )
+        for name, shape in shapes.items()
+    ]
+    for i, sample in enumerate(progress(samples, desc="calibration set")):
+        state, *frames = inputs_of(sample, config)
+        for array, value in zip(arrays, [policy.state_norm(state), *frames], strict=True):
+            array[i] = value.numpy()
+    for array in arrays:
+        array.flush()
+
+
+def model_script(name: str, network: Network, config: ActConfig, samples: int) -> str:
+    """Return the .alls file of a network. Comments in it give its sources; zoo means hailo_model_zoo."""
+    lines = [f"# {name}; compiled by nobody yet"]
+    layers = {of: f"{name}/input_layer{i}" for i, of in enumerate(network.inputs, 1)}  # as the parser numbers them
+    for i, (camera, norm) in enumerate(zip(config.cameras, config.image_norm, strict=True), 1):
+        mean = [round(v, 6) for v in zero_colour(norm)]
+        std = [round(255 / s, 6) for s in norm.scale]
+        layer = f", {layers[f'frame_{camera}']}" if len(layers) > 1 else ""
+        lines.append(f"normalization{i} = normalization({mean}, {std}{layer})")
+    lines += [
+        f"model_optimization_config(calibration, batch_size=8, calibset_size={samples})",
+        "# 0 needs no GPU (zoo: detr_resnet_v1_18_bn, vit_small); with one, try optimization_level=2",
+        "model_optimization_flavor(optimization_level=0, compression_level=0)",
+        "pre_quantization_optimization(equalization, policy=enabled)  # zoo: detr_resnet_v1_18_bn, vit_small",
+        "quantization_param({output_layer*}, precision_mode=a16_w16)  # zoo: detr_resnet_v1_18_bn",
+    ]
+    if name == "whole":
+        lines += [
+            "# zoo: vit_small, deit_base; of their sums, only those before a LayerNormalization have 16 bits",
+            "pre_quantization_optimization(ew_add_fusing, policy=disabled)",
+            "pre_quantization_optimization(matmul_correction, layers={matmul*}, correction_type=zp_comp_block)",
+            "model_optimization_config(negative_exponent, layers={*}, rank=0)",
+            "quantization_param({ew_add*}, precision_mode=a16_w16)",
+            "# the state, which is small beside what it stands for (zoo: clip_vit_b_16_text_encoder)",
+            f"quantization_param({layers['state']}, precision_mode=a16_w16)",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _describe(policy: ACT, name: str, network: Network) -> dict[str, Any]:
+    """Return what kit.json says of a network. "hailo" is for the rover's engine, with shapes as HailoRT gives them."""
+    config, parameters = policy.config, parameters_by_block(policy)
+    if name == "whole":
+        on_chip = set(parameters)
+        shapes = [[1, config.chunk, len(config.action_names)]]
+        around = {"state": config.state_norm, "actions": config.action_unnorm}
+    else:
+        on_chip = {block for block in parameters if block.startswith("backbone") or block == "image_project"}
+        shapes = [[*config.grid(*size), config.dim] for size in config.image_sizes]
+        around = {"state": None, "actions": None}
+    return {
+        "inputs": network.inputs,
+        "end_nodes": list(network.outputs.values()),
+        # Weights that are not on the chip stay in float.
+        "weights_mb": sum(n if block in on_chip else 4 * n for block, n in parameters.items()) / 1e6,
+        "hailo": {
+            "network": name,
+            "outputs": dict(zip(network.outputs, shapes, strict=True)),
+            "original_names": network.outputs,
+            **{key: affine and asdict(affine) for key, affine in around.items()},
+        },
+    }
+
+
+def _manifest(run_dir: Path, samples: int, folder: Path) -> dict[str, Any]:
+    """Return the manifest of what compile.py packs, without what depends on the network, and write parity.npz.
+
+    Both come from the run's FP32 artifact, and how far the chip may be off from its static INT8.
+    """
+    with Artifact(run_dir / "policy_fp32.pt") as fp32, Artifact(run_dir / "policy_static.pt") as static:
+        np.savez_compressed(folder / "parity.npz", allow_pickle=False, **fp32.parity)
+        manifest, allowed = fp32.manifest, static.manifest["parity"]["tolerance"]
+    parity = {
+        "tolerance": {a: min(STATIC_TIMES * most, largest_tolerance("static", a)) for a, most in allowed.items()},
+        "reason": f"the chip is INT8: {STATIC_TIMES:g} times what torch's INT8 may be off",
+    }
+    calibration = {"samples": samples, "observer": "Hailo's compiler"}
+    engine = {"mode": "static", "scheme": "affine", "engine": "hailo"}
+    return manifest | engine | {"calibration": calibration, "parity": parity}

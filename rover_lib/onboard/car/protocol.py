@@ -1,0 +1,150 @@
+"""The lines between host and Arduino, by the protocol of firmware/README.md: what they say, and how it is checked."""
+
+import re
+import zlib
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from rover_lib.onboard.car.pwm import Pulses
+
+PROTOCOL_VERSION = 4
+LINE_MAX = 128  # bytes of a line from the Arduino
+SEQUENCES = 1 << 32
+
+
+class State(Enum):
+    """Who drives."""
+
+    MANUAL = "M"  # the human's transmitter
+    AUTONOMOUS = "A"  # the host
+    STOPPED = "S"  # nobody: neutral until the host arms again or the human moves a stick
+
+
+REASONS = {
+    "r": "after a reset",
+    "h": "the human moved a stick",
+    "a": "armed by the host",
+    "t": "no valid command for 150 ms",
+    "p": "the host paused again and again",
+    "s": "the transmitter's signal was lost",
+    "n": "the host asked for neutral",
+}
+RESULTS = {
+    "-": "no command yet",
+    "k": "done",
+    "i": "ignored: not for who drives now",
+    "r": "out of range",
+    "o": "an old command, or one for another start of the Arduino",
+    "l": "late: it had waited in the link",
+    "e": "refused: too long ago since somebody asked for it",
+    "c": "refused: the Arduino was not told of this car since its reset",
+    "s": "refused: the transmitter gives no signal",
+    "t": "refused: the throttle stick is not at rest",
+    "w": "refused: nobody has just wiggled the steering stick",
+}
+MISSING = {  # what the Arduino still needs before it can be armed, and what the human does about it
+    "s": "switch the transmitter on",
+    "t": "let go of the throttle stick",
+    "w": "move the steering stick far to both sides within 3 s and let go of it for a second, without any throttle",
+    "-": "nothing is missing",
+}
+RESETS = {"p": "power-on", "e": "reset pin", "b": "brown-out", "w": "watchdog", "-": "unknown"}
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What the Arduino says after each reset, and when asked.
+
+    boot: number of this start, 0 to 65535. sequence: of the last command that it accepted as new. car: the id of the
+    car that it drives its pins for.
+    """
+
+    protocol: int
+    firmware: str
+    boot: int
+    sequence: int
+    reset: str  # a value of RESETS
+    car: int = 0
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """One status of the Arduino. Pulses and periods are whole microseconds; None means "no pulse", and 0 never does.
+
+    host_s: time.monotonic() (or the link's clock) when the whole line had arrived here. uptime_ms: the Arduino's clock,
+    which wraps at 2^32. sequence: of the last command that it accepted as new. result: what became of the last command,
+    a key of RESULTS. missing: what is missing before the car can be armed, a key of MISSING. steering_us, throttle_us:
+    the pulses on its pins. cap_us: the pulse of the most throttle that the host gets; with reverse, the same distance
+    from neutral limits it there. receiver_*: the transmitter's pulses. The last four are counters, which stop at 65535:
+    lines that were no command; replayed or late commands, and those for another start; pulses out of range; bytes lost.
+    """
+
+    host_s: float
+    boot: int
+    uptime_ms: int
+    sequence: int
+    result: str
+    state: State
+    reason: str  # why the state is what it is, a key of REASONS
+    missing: str
+    steering_us: int
+    throttle_us: int
+    cap_us: int
+    receiver_steering_us: int | None
+    receiver_steering_period_us: int | None
+    receiver_throttle_us: int | None
+    receiver_throttle_period_us: int | None
+    bad_lines: int
+    old_commands: int
+    out_of_range: int
+    lost_bytes: int
+
+    @property
+    def pulses(self) -> Pulses:
+        """What goes to the servos."""
+        return Pulses(self.steering_us, self.throttle_us)
+
+    @property
+    def why(self) -> str:
+        """Who drives and why, in words."""
+        return f"{self.state.name.lower()}: {REASONS[self.reason]}"
+
+
+def frame(body: str) -> bytes:
+    """Return the line for a body: the body, its CRC-32 and the line feed."""
+    return f"{body}*{zlib.crc32(body.encode('ascii')):08X}\n".encode("ascii")
+
+
+_NUMBER = r"(0|[1-9][0-9]{0,9})"
+_PULSE = rf"(?:{_NUMBER} {_NUMBER}|- -)"
+_HELLO = re.compile(rf"<H {_NUMBER} (\S+)(?: {_NUMBER} {_NUMBER} ([pebw-]) {_NUMBER})?(?: .*)?", re.ASCII)
+_STATUS = re.compile(
+    rf"<S {_NUMBER} {_NUMBER} {_NUMBER} ([{''.join(RESULTS)}]) ([MAS]) ([{''.join(REASONS)}]) "
+    rf"([{''.join(MISSING)}]) {_NUMBER} {_NUMBER} {_NUMBER} {_PULSE} {_PULSE} {_NUMBER} {_NUMBER} {_NUMBER} {_NUMBER}",
+    re.ASCII,
+)
+
+
+def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
+    """Parse a line of the Arduino, without its line feed. Return None if it is garbled or not of the protocol."""
+    if len(line) > LINE_MAX or not line.startswith(b"<"):
+        return None
+    body, star, crc = line.rpartition(b"*")
+    if not star or crc != b"%08X" % zlib.crc32(body):
+        return None
+    try:
+        text = body.decode("ascii")
+    except UnicodeDecodeError:
+        return None
+    if found := _HELLO.fullmatch(text):
+        protocol, firmware, boot, sequence, reset, car = found.groups()
+        if int(protocol) == PROTOCOL_VERSION and boot is None:
+            return None
+        # In another protocol only the first two fields are sure to mean the same.
+        return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"], int(car or 0))
+    if not (found := _STATUS.fullmatch(text)):
+        return None
+    boot, uptime, sequence, result, state, reason, missing, *numbers = found.groups()
+    values: list[Any] = [None if n is None else int(n) for n in numbers]  # the pattern says which may be None
+    return Telemetry(host_s, int(boot), int(uptime), int(sequence), result, State(state), reason, missing, *values)

@@ -1,0 +1,102 @@
+"""What a drive is given, and what is checked and opened before anything moves."""
+
+import contextlib
+import logging
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from rover_lib.onboard.artifact.manifest import car_of
+from rover_lib.onboard.car.camera import path_of
+from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.host import default_log
+from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.drive.watch import find_unfinished_drive
+from rover_lib.onboard.errors import CameraError
+from rover_lib.onboard.status_line import StatusLine
+
+
+class OtherCar(Protocol):
+    """A car to drive instead of the one at the options' camera and port, such as a simulated one."""
+
+    camera: str
+    port: str
+
+    def summary(self) -> dict[str, Any]:
+        """Return what happened to the car, for the drive's report."""
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """The options of `rover drive`.
+
+    hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
+    much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
+    throttle_limit, blend_ticks, ensemble: replace the values of params.yml. threads: of the policy; None: all cores but
+    one. log_file: None: the user's. service: run as a systemd service, disarmed until a human arms it. film: the camera
+    may be recorded pictures (a folder, a FIFO, an .mjpeg), which do not show where the car is. latency_ms: make each
+    plan take at least this long, for comparisons. view: the socket of a view; None: the user's.
+    """
+
+    artifact: Path
+    camera: str = "0"
+    port: str = ""
+    hz: float = 30.0
+    dry_run: bool = False
+    record: Path | None = None
+    record_mb: float | None = None
+    max_seconds: float | None = None
+    ticks: int | None = None
+    throttle_limit: float | None = None
+    blend_ticks: int | None = None
+    ensemble: float | None = None
+    threads: int | None = None
+    log_file: Path | None = None
+    service: bool = False
+    film: bool = False
+    latency_ms: float = 0.0
+    view: Path | None = None
+
+
+def check_no_film(camera: str) -> None:
+    """Raise CameraError for pictures that do not come from a camera's device."""
+    path = path_of(camera)
+    if path.exists() and not path.is_char_device():
+        raise CameraError(
+            f"{camera}: recorded pictures know nothing of where the car is",
+            remedy="give the camera's /dev/videoN, or --film if this is no real car",
+        )
+
+
+def another_car(manifest: dict[str, Any], this: Car) -> str:
+    """Return a warning if an artifact was calibrated for another car than this one, else "". It may drive all the same.
+
+    An artifact that names no car is for the car of the original recordings.
+    """
+    meant = car_of(manifest)
+    if meant.drives_like(this):
+        return ""
+    return (
+        f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: it has not seen what this one "
+        "does; see that the way is free"
+    )
+
+
+@contextlib.contextmanager
+def open_flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
+    """Open a flight log whose events are also lines on the terminal, above the report's status."""
+    (max_bytes, keep), path = log_limits(), options.log_file or default_log()
+    header: dict[str, Any] = {"artifact": str(options.artifact), "hz": options.hz, **vars(settings)}
+    if not (car := this_car()).drives_like(Car()):
+        header["car"] = car.description()
+    with StatusLine(lambda: report.status, sys.stderr) as status:
+        logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status], force=True)
+        unfinished = find_unfinished_drive(path)
+        with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
+            if unfinished:
+                log.event(unfinished, level=logging.WARNING)
+            yield log

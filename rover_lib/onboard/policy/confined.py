@@ -1,0 +1,90 @@
+"""Load artifacts only in a process that has confined itself: whoever made them, they cannot do harm there.
+
+    metrics = run_confined(time_artifacts, paths={"static": "policy_static.pt"}, ...)     # in a process of its own
+    policies = load_confined(paths, threads=3)                                            # in time_artifacts
+
+`rover drive` has a process with a protocol of its own, for speed (see drive/inference.py).
+"""
+
+import importlib
+import json
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.artifact.engines import UNCONFINED
+from rover_lib.onboard.artifact.manifest import Artifact
+from rover_lib.onboard.errors import PolicyError, RoverError
+from rover_lib.onboard.policy.confine import confine, memory_mb
+from rover_lib.onboard.policy.load import Policy, import_engine, load_policy
+from rover_lib.onboard.stage import plain
+
+_log = logging.getLogger("rover")
+
+
+def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None, **arguments: Any) -> Any:
+    """Call a function of a module in a new process, and return what it returned there.
+
+    function: calls load_confined(), and so confines its process. Its arguments and its result are of JSON's types; a
+    pickle as the answer of a process that is not trusted could run anything here. Raises the function's RoverError
+    as a PolicyError, and PolicyError if the process ends otherwise or takes longer than timeout_s.
+    """
+    command = [sys.executable, "-m", __name__, function.__module__, function.__qualname__, json.dumps(plain(arguments))]
+    what = f"the process of {function.__qualname__}"
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        raise PolicyError(f"{what} took longer than {timeout_s:g} s") from None
+    try:
+        result, error = json.loads(done.stdout)
+        if error:
+            error = {"what": str(error["what"]), "found": error["found"], "remedy": str(error["remedy"])}
+    except (ValueError, LookupError, TypeError):
+        raise PolicyError(f"{what} ended ({done.returncode})", remedy="is there enough memory?") from None
+    if error:
+        raise PolicyError(**error)
+    return result
+
+
+def load_confined(
+    paths: Mapping[str, Path | str], *, threads: int, spare_mb: float = 0
+) -> tuple[dict[str, Policy], dict[str, Artifact]]:
+    """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
+
+    threads: of the engines. spare_mb: memory that the process needs besides. Logs a warning if the kernel confines
+    nothing. Raises ArtifactError as load_policy() does.
+    """
+    artifacts = {name: Artifact(path) for name, path in paths.items()}
+    with ExitStack() as unless_all_are_loaded:
+        for artifact in artifacts.values():
+            unless_all_are_loaded.enter_context(artifact)
+        reasons = [UNCONFINED[engine] for engine in map(import_engine, artifacts.values()) if engine in UNCONFINED]
+        limit_mb = spare_mb + sum(memory_mb(path, threads) for path in paths.values())
+        if reason := reasons[0] if reasons else confine(limit_mb):
+            _log.warning("not confined: %s", reason)
+        policies = {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}
+        unless_all_are_loaded.pop_all()
+    return policies, artifacts
+
+
+def main(module: str, name: str, arguments: str) -> None:
+    """Run as the program that run_confined() starts: print the function's result, or its error, as JSON."""
+    answers = os.dup(1)
+    os.dup2(2, 1)  # whatever else is printed is no answer
+    result, refusal = None, None
+    try:
+        result = getattr(importlib.import_module(module), name)(**json.loads(arguments))
+    except RoverError as error:
+        found = None if error.found is None else str(error.found)
+        refusal = {"what": error.what, "found": found, "remedy": error.remedy}
+    with os.fdopen(answers, "w") as file:
+        json.dump(plain([result, refusal]), file)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,126 @@
+"""The shape of one ACT policy, and LeRobot's own policy of that shape."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
+
+if TYPE_CHECKING:
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+# (block, convolutions per block, blocks per stage, channels out of layer4), from torchvision.models.resnet
+BACKBONES = {
+    "resnet18": ("basic", (2, 2, 2, 2), 512),
+    "resnet34": ("basic", (3, 4, 6, 3), 512),
+    "resnet50": ("bottleneck", (3, 4, 6, 3), 2048),
+}
+ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
+EMBEDDINGS = {
+    "encoder_1d_feature_pos_embed": "one constant with the image's sinusoidal positions; never looked up by index",
+    "decoder_pos_embed": "a constant; with the first decoder layer's self-attention and query computed from it once",
+}
+
+
+def backbone_blocks(backbone: str) -> list[str]:
+    """Return LeRobot's names of a backbone's residual blocks, in the order in which data passes them."""
+    _, depths, _ = BACKBONES[backbone]
+    return [f"backbone.layer{stage}.{block}" for stage, depth in enumerate(depths, 1) for block in range(depth)]
+
+
+@dataclass(frozen=True)
+class Affine:
+    """x * scale + shift, per channel. All of LeRobot's normalisation modes have this form."""
+
+    scale: tuple[float, ...]
+    shift: tuple[float, ...]
+
+
+def imagenet() -> Affine:
+    """Return the normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
+    return Affine(
+        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
+    )
+
+
+@dataclass(frozen=True)
+class ActConfig:
+    """The shape of one policy. `checkpoint` makes it, and checks it against the weights."""
+
+    cameras: tuple[str, ...] = ("cam_front",)
+    image_sizes: tuple[tuple[int, int], ...] = ((360, 640),)  # (height, width), one per camera
+    state_names: tuple[str, ...] = ("steering", "throttle")
+    action_names: tuple[str, ...] = ("steering", "throttle")
+    chunk: int = 32
+    dim: int = 512
+    heads: int = 8
+    feedforward: int = 3200
+    encoder_layers: int = 4
+    decoder_layers: int = 7
+    latent: int = 32
+    vae_layers: int = 4  # 0 if it was trained without a VAE
+    backbone: str = "resnet18"
+    dilation: bool = False
+    pre_norm: bool = False
+    activation: str = "relu"
+    rate_hz: float = 30.0  # steps of a plan in a second
+    image_norm: tuple[Affine, ...] = field(default_factory=lambda: (imagenet(),))  # of pixels in [0, 1]
+    state_norm: Affine | None = None
+    sees_state: bool = True  # False: it was trained without a state; what is given as one is not looked at
+    action_unnorm: Affine | None = None
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Return (h, w) of the feature map for a picture of this size."""
+        stride = 16 if self.dilation else 32
+        return -(-height // stride), -(-width // stride)
+
+
+def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
+    """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
+
+    weights: all of them, by LeRobot's names without the leading `model.`; copied, as float32. None: random ones, which
+    take most of the time. Empty: none, on torch's meta device.
+    """
+    # Imported here, because it takes seconds, and code that only quantizes or exports does not need it.
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    cameras = zip(c.cameras, c.image_sizes, strict=True)
+    inputs = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, *size)) for name, size in cameras}
+    state = PolicyFeature(FeatureType.STATE, (len(c.state_names),))
+    config = ACTConfig(
+        input_features=inputs | ({"observation.state": state} if c.sees_state else {}),
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(c.action_names),))},
+        device="cpu",
+        chunk_size=c.chunk,
+        n_action_steps=c.chunk,
+        vision_backbone=c.backbone,
+        pretrained_backbone_weights=None,
+        replace_final_stride_with_dilation=c.dilation,
+        pre_norm=c.pre_norm,
+        dim_model=c.dim,
+        n_heads=c.heads,
+        dim_feedforward=c.feedforward,
+        feedforward_activation=c.activation,
+        n_encoder_layers=c.encoder_layers,
+        n_decoder_layers=c.decoder_layers,
+        use_vae=c.vae_layers > 0,
+        latent_dim=c.latent,
+        n_vae_encoder_layers=max(c.vae_layers, 1),
+    )
+    if weights is None:
+        return ACTPolicy(config)
+    with torch.device("meta"):
+        policy = ACTPolicy(config)
+    if weights:
+        policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
+    return policy
+
+
+def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
+    """Return the name and shape of every weight that LeRobot's ACT of this config has."""
+    return {name: tuple(w.shape) for name, w in lerobot_act(c, {}).model.state_dict().items()}

@@ -1,0 +1,235 @@
+"""Read the controls of a recording: what the transmitter's pulses meant, and when they were measured."""
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from rover_lib.onboard.car.pwm import Channel, PwmCalibration
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.recording.episode import (
+    BURST_MIN,
+    CONTROL_FIELDS,
+    arduino_step_s,
+    driver_of,
+    find_backlog,
+    no_pulse,
+    number_of,
+)
+from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, OLD, Formula
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Fault, relative
+from rover_lib.workshop.untrusted import quote
+
+FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
+Item = TypeVar("Item")
+
+
+@dataclass
+class Faults:
+    """Counts faults by file and kind, and keeps the note of the first."""
+
+    root: Path
+    counted: dict[tuple[str, str], list] = field(default_factory=dict)
+
+    def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
+        if count:
+            entry = self.counted.setdefault((relative(path, self.root), kind), [0, note])
+            entry[0] += count
+
+    def listed(self) -> tuple[Fault, ...]:
+        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
+
+
+@dataclass(frozen=True)
+class Control:
+    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured, and its
+    pulse, in microseconds, then is NaN.
+    """
+
+    system_s: float
+    arduino_s: float
+    actions: tuple[float | None, float | None]
+    driver: str
+    pulses_us: tuple[float, ...]
+
+
+def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -> tuple[list[Control], dict]:
+    """Return the usable readings, ordered by system time, and by channel the formula that its actions followed, if it
+    was another than the car's, and they were recomputed.
+
+    Raises EpisodeError if a channel's actions follow no formula of its pulses.
+    """
+    read: list[tuple[int, dict[str, float], list[str], str]] = []
+    for i, row in enumerate(rows):
+        if not isinstance(row, dict):
+            faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
+            continue
+        lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
+        wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
+        values = {n: number for n in wanted if (number := number_of(row.get(n))) is not None}
+        if bad := [name for name in wanted if name not in values]:
+            faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
+            continue  # the recorder did not write such a row, so nothing in it can be trusted
+        if nan := [name for name, value in values.items() if math.isnan(value)]:
+            faults.add(path, "not_finite", f"control {i}: {nan[0]} is {quote(row.get(nan[0]))}")
+        if "system_timestamp" in nan:
+            continue  # without a time it cannot be the action of a frame
+        for name in lost:
+            faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
+        if (driver := driver_of(row)) is None:
+            faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
+            continue
+        read.append((i, values, lost, driver))
+    pairs = {}
+    formulas = {}
+    for name in ACTION_NAMES:
+        rows_of = {i: values for i, values, lost, _ in read if name not in lost}
+        recorded, meant, formula = _read_actions(pwm.channel(name), rows_of, path, faults)
+        pairs[name] = recorded, meant
+        if formula:
+            formulas[name] = formula
+    # Too few readings to show a formula are of older firmware too, if the other channel's are.
+    actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
+    controls = []
+    for i, values, _, driver in read:
+        pair = actions["steering"].get(i), actions["throttle"].get(i)
+        pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
+        times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
+        controls.append(Control(*times_s, pair, driver, pulses))
+    went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
+    return in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
+
+
+def _read_actions(
+    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
+) -> tuple[dict[int, float], dict[int, float], Formula | None]:
+    """Return one channel's recorded actions by the number of their control, those that their pulses mean, and the
+    older formula that the recorded ones follow, if they do. Those that were not measured are left out.
+
+    Raises EpisodeError if they follow neither that one nor the car's.
+    """
+    name, old = channel.name, OLD[channel.name]
+    recorded, meant, duties_pct = {}, {}, {}
+    for i, values in rows.items():
+        action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
+        if any(math.isnan(v) for v in (action, pulse_us, period_us)):
+            continue  # the caller has counted it, with the field's name
+        expected = channel.action(pulse_us, period_us)
+        if expected is None:
+            kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
+            note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
+            faults.add(path, f"{name}_{kind}", note)
+            continue
+        recorded[i], meant[i] = action, expected
+        duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
+    _refuse_other_pulses(channel, rows, duties_pct)
+    # Firmware may have been changed within a recording, so only what disagrees must follow the older formula.
+    wrong = [i for i in recorded if abs(recorded[i] - meant[i]) > EXACT]
+    follows_old = old.is_followed(np.array([recorded[i] for i in wrong]), np.array([duties_pct[i] for i in wrong]))
+    unlike = len(recorded) >= LEAST_READINGS and len(wrong) > (1 - FOLLOWS) * len(recorded)
+    if not follows_old and not unlike:
+        return recorded, meant, None
+    seen = f"control {wrong[0]}: {recorded[wrong[0]]:g} recorded, its pulse says {meant[wrong[0]]:.4f}"
+    if not follows_old:
+        raise EpisodeError(
+            f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither {old} nor "
+            f"{Formula.of(channel)}, this car's",
+            found=seen,
+            remedy="correct them, say in metadata.car which car it is, or record again",
+        )
+    note = f"recorded as {old} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
+    faults.add(path, f"{name}_recomputed", note, len(wrong))
+    return meant, meant, old
+
+
+def _refuse_other_pulses(channel: Channel, rows: dict[int, dict[str, float]], duties_pct: dict[int, float]) -> None:
+    """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
+    (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
+    pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
+    far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
+    if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
+        row = rows[far[0]]
+        raise EpisodeError(
+            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us",
+            found=f"control {far[0]}: {row[f'{channel.name}_raw_us']:g} us of {row[f'{channel.name}_period_us']:g} us",
+            remedy="write pulses and periods in microseconds, or say which car it is in metadata.car",
+        )
+
+
+def _take(
+    channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
+) -> dict[int, float]:
+    """Return the actions of one channel, as recorded, or where pulses deny them, as these mean them if `recompute`."""
+    name = channel.name
+    for i, action in list(recorded.items()):
+        if recompute and abs(action - meant[i]) > EXACT:
+            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; recomputed from the pulses"
+            faults.add(path, f"{name}_recomputed", note)
+            recorded[i] = meant[i]
+        elif not channel.low <= action <= channel.high:
+            faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
+            del recorded[i]
+        elif abs(action - meant[i]) > EXACT:
+            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; taken as recorded"
+            faults.add(path, f"{name}_disagrees_with_pulse", note)
+    return recorded
+
+
+def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Control]:
+    """Give the controls of a serial burst the times at which they were measured, or drop them."""
+    late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
+    placed: list[Control] = []
+    moved = dropped = 0
+    farthest_s = 0.0
+    end = len(controls)
+    while end:
+        # A burst and the live control that ends it: late[start..end-2] are true, late[end-1] is not.
+        start = end - 1
+        while start and late[start - 1]:
+            start -= 1
+        run, end = controls[start:end], start
+        placed.append(run[-1])
+        if len(run) - 1 < BURST_MIN:
+            placed.extend(reversed(run[:-1]))
+            continue
+        for k in range(len(run) - 2, -1, -1):
+            control, after = run[k], run[k + 1]
+            step_s = arduino_step_s(control.arduino_s, after.arduino_s)
+            if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
+                dropped += k + 1
+                break
+            time_s = placed[-1].system_s - step_s
+            farthest_s = max(farthest_s, control.system_s - time_s)
+            placed.append(replace(control, system_s=time_s))
+            moved += 1
+    faults.add(
+        path, "serial_burst", f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived", moved
+    )
+    faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
+    return sorted(placed, key=lambda c: c.system_s)
+
+
+def in_order(timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: Faults) -> list[Item]:
+    """Sort the items by time, keeping the order of equal times, and count the steps back in time.
+
+    If the clock was set back, everything from there on is left out. timed: (time in seconds, item), in the file's
+    order. went_on: for each item but the first, whether it was made after the one before it, whatever their times say.
+    """
+    times_s = [time_s for time_s, _ in timed]
+    end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
+    note = f"the clock was set back at {what} {end}; from there on, times may be those of other moments"
+    faults.add(path, f"clock_set_back_at_{what}", note, len(timed) - end)
+    back = sum(b < a for a, b in pairwise(times_s[:end]))
+    faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", back)
+    return [item for _, item in sorted(timed[:end], key=lambda pair: pair[0])]
+
+
+def _was_set_back(times_s: list[float], i: int) -> bool:
+    """Whether the two times before `i` are both later than those at `i` and `i + 1`.
+
+    A single wrong time does not mean that the clock was set back.
+    """
+    return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])

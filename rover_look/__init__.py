@@ -1,1 +1,0 @@
-"""Look at a drive afterwards: its figure, its film, its replay, its MCAP file."""

@@ -1,0 +1,166 @@
+"""The car's loop in virtual time: against the expert, the arithmetic of plans' ages, and itself."""
+
+import copy
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from balloon_world import drives
+from balloon_world.drives import drive_in, drive_missing, pair_worlds, sign_test
+from balloon_world.latency import beside_path
+from balloon_world.world import World, expert
+from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.errors import PolicyError, WorldError
+from rover_lib.onboard.params import params
+
+SETTINGS = Settings.of(params()["drive"])
+CURVE = 10_003  # the balloon is 23 degrees aside
+
+
+class Seen(World):
+    """A policy is shown the world itself, not a picture of it: nothing is drawn, and the expert can plan."""
+
+    def render(self):
+        return copy.copy(self)
+
+
+class Foresees:
+    """Plans what the expert will do, and knows what it will see then. fails_at: the plan that is not finite."""
+
+    rate_hz, chunk = 30.0, 32
+
+    def __init__(self, fails_at=0):
+        self.shown = []  # (time of the frame, state, state of the car in it)
+        self.fails_at = fails_at
+
+    def predict_unclipped(self, world, state):
+        assert state.dtype == np.float32
+        self.shown.append((world.state.time_s, state, world.state))
+        world.trajectory, world.outcome = [], None
+        plan = []
+        for _ in range(self.chunk):
+            plan.append(expert(world))
+            if not world.done:
+                world.step(*plan[-1])
+        return np.array(plan, np.float32) * (math.nan if len(self.shown) == self.fails_at else 1)
+
+
+def late(seconds, pushes=0, policy=None, **settings):
+    return drive_in(policy or Foresees(), Seen(CURVE, pushes), seconds, replace(SETTINGS, **settings))
+
+
+def ages_in_ticks(drive):
+    return [round(30 * o.age_s, 6) for o in drive.orders]
+
+
+def test_without_latency_the_loop_does_what_the_expert_does():
+    world = World(CURVE)
+    while not world.done:
+        world.step(*expert(world))
+    drive = late(0.0)
+    assert drive.outcome == world.outcome == "hit"
+    assert np.allclose(drive.trajectory.x_m, [s.x_m for s in world.trajectory], atol=1e-5)
+    assert np.allclose(drive.trajectory.y_m, [s.y_m for s in world.trajectory], atol=1e-5)
+    assert beside_path(drive, late(0.0, compensate=False)) == 0  # nothing to compensate
+    assert beside_path(late(0.0, pushes=3), drive) > 0.01
+
+
+@pytest.mark.parametrize("seconds", [0.075, 0.3])
+def test_compensation_keeps_the_car_nearer_to_the_path_without_latency(seconds):
+    path = late(0.0)
+    assert abs(path.trajectory.y_m[-1]) > 0.5  # a curve indeed
+    assert beside_path(late(seconds), path) < 0.7 * beside_path(late(seconds, compensate=False), path)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "first", "ages"),
+    [
+        (0.0, 0, {0}),
+        (0.030, 1, {1}),
+        # ready 2.25 ticks after a look at frame 0, which is driven from tick 3 on; the next look is at frame 2, at once
+        (0.075, 3, {3, 4, 5}),
+        (0.3, 9, set(range(9, 18))),
+    ],
+)
+def test_ages_of_plans_are_those_of_the_planner(seconds, first, ages):
+    found = ages_in_ticks(late(seconds))
+    assert found[0] == first and set(found) == ages
+
+
+def test_the_newest_frame_is_looked_at_as_soon_as_a_plan_is_ready():
+    drive = late(0.15)
+    looked_at = [round(30 * captured.captured_s) for captured, _ in drive.plans]
+    assert looked_at[:7] == [0, 4, 9, 13, 18, 22, 27]  # every 4.5 ticks; every other time that frame is half a tick old
+    assert [30 * plan.latency_s for plan, _ in drive.plans[:4]] == pytest.approx([4.5, 5, 4.5, 5])
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.3])
+def test_the_state_is_the_command_before_the_frame(seconds):
+    policy = Foresees()
+    late(seconds, policy=policy)
+    assert len(policy.shown) > 5 and any(state.any() for _, state, _ in policy.shown)
+    for _, state, car in policy.shown:
+        assert state.tolist() == pytest.approx([car.steering_command, car.throttle_command], abs=1e-6)
+
+
+def test_a_plan_that_grows_too_old_stops_the_car(monkeypatch):
+    drive = late(0.6)
+    ages, throttles = ages_in_ticks(drive), [o.throttle for o in drive.orders]
+    assert (drive.outcome, ages) == ("stopped", list(range(18, 30)))  # the limit of 1 s is 30 ticks
+    assert throttles[-1] < 0.15 * max(throttles)  # it had faded before
+    never = late(5.0)
+    assert (never.outcome, never.orders, never.duration_s) == ("stopped", [], 0.0)
+    monkeypatch.setattr(Foresees, "chunk", 12)
+    assert ages_in_ticks(late(0.3)) == [9, 10, 11]  # a chunk that ends sooner than the limit stops the car there
+
+
+def test_a_policy_that_fails_is_not_a_car_that_was_stopped():
+    with pytest.raises(PolicyError, match="plan 4"):
+        late(0.15, policy=Foresees(fails_at=4))
+
+
+@pytest.mark.parametrize("seconds", [-0.1, math.nan, 6.0])
+def test_a_latency_that_cannot_be_is_refused(seconds):
+    with pytest.raises(WorldError, match="latency"):
+        late(seconds)
+
+
+def test_a_kill_costs_the_drives_that_had_not_ended(tmp_path, monkeypatch):
+    """Drives run on a thread for each policy, and their results do not depend on how many there are."""
+    monkeypatch.setattr(drives, "load_for_cores", lambda artifact, most: ["a policy", "a policy"])
+    asked, driven, path = [(how, seed) for how in ("alone", "pushed") for seed in range(4)], [], tmp_path / "d.jsonl"
+
+    def one(policy, each):
+        driven.append(each)
+        return {"outcome": f"{each[0]} {each[1]}"}
+
+    def dies(items, desc, total):
+        for i, item in enumerate(items):
+            if i == 3:
+                raise KeyboardInterrupt
+            yield item
+
+    with pytest.raises(KeyboardInterrupt):
+        drive_missing(None, asked, one, path, dies)
+    with path.open("a") as file:
+        file.write('\n{"how": "alone", "se')  # and tears a line
+    driven.clear()
+    found = drive_missing(None, asked, one, path)
+    assert len(driven) == 8 - 3 and list(found) == asked
+    assert all(row["outcome"] == f"{how} {seed}" for (how, seed), row in found.items())
+    driven.clear()
+    assert drive_missing(None, asked, one, path) == found and not driven
+
+
+@pytest.mark.parametrize(("one", "other"), [(0, 0), (0, 1), (3, 3), (0, 6), (2, 9)])
+def test_the_sign_test_is_of_coins_that_fall_as_unevenly(one, other):
+    n = one + other
+    uneven = [sum(coins) for coins in product((0, 1), repeat=n) if abs(2 * sum(coins) - n) >= abs(one - other)]
+    assert sign_test(one, other) == pytest.approx(len(uneven) / 2**n, abs=1e-12)
+
+
+def test_pairs_are_of_the_same_worlds():
+    assert pair_worlds([3, 4, 5, 6, 7], [0, 1, 2, 3]) == (3, 4, sign_test(3, 4))

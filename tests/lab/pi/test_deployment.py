@@ -1,0 +1,59 @@
+"""What a deployment to an emulated Pi makes of what it sees, without a Pi: `make pi` has that."""
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from lab.pi import container, deployment, emulation, playbooks
+from lab.pi.emulation import EmulationError
+from rover_lib.onboard.stage import read_stage
+
+OUTPUT = """
+ok: [rover1]
+
+PLAY RECAP *********************************************************************
+rover1                     : ok=42   changed=20   unreachable=0    failed=0    skipped=7    rescued=0    ignored=0
+"""
+
+
+def test_a_play_says_how_much_changed_and_where_it_ended():
+    play = playbooks.Play(0, OUTPUT)
+    assert play.ok and play.changed == 20 and play.end == "ok: [rover1]"
+    assert not playbooks.Play(2, OUTPUT).ok
+    assert not playbooks.Play(0, "ERROR! the playbook could not be found").ok
+
+
+def test_the_inventory_is_the_users_with_another_rover(tmp_path):
+    text = playbooks.inventory(SimpleNamespace(name="rover7", port=2222, key=tmp_path / "key"))
+    assert "rover1.local" not in text and "rover7 ansible_host=127.0.0.1 ansible_port=2222" in text
+    assert "ansible_pipelining=true" in text and "ControlPersist" in text  # as in inventory.ini
+
+
+def test_pip_finds_packages_elsewhere_as_it_does_here():
+    told = "global.index-url='index:here/simple'\n:env:.find-links='/here'\nglobal.extra-index-url="
+    told += "'file:///here index:there/simple'\n:env:.default-timeout='180'\ninstall.user='yes'\n"
+    found = set(container.pip_settings(told, "proxy:3128").splitlines())
+    assert found >= {"index-url = index:here/simple", "extra-index-url = index:there/simple", "default-timeout = 180"}
+    assert "proxy = proxy:3128" in found and not any("/here" in x and "index" not in x for x in found)
+
+
+def test_it_begins_only_with_an_artifact_and_as_root(tmp_path, monkeypatch):
+    with pytest.raises(EmulationError, match="make demo"):
+        deployment.deploy_and_drive(tmp_path / "pi.json", tmp_path)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    with pytest.raises(EmulationError, match="use sudo"):
+        emulation.require()
+
+
+def test_what_fails_is_said_and_written(tmp_path):
+    said = []
+    report = deployment.Report(tmp_path / "pi.json", {"a.pt": "00"}, said.append)
+    report.gate("provision again", "changed=0", 0, True)
+    report.gate("rollback", "model a in use", "b", False)
+    with pytest.raises(EmulationError), report.step("deploy"):
+        raise EmulationError("no")
+    metrics = read_stage(tmp_path / "pi.json", "pi")["metrics"]
+    assert metrics["wrong"] == report.wrong and len(report.wrong) == 1
+    assert [gate["holds"] for gate in metrics["gates"]] == [True, False]
+    assert [(s["step"], s["ok"]) for s in metrics["steps"]] == [("deploy", False)] and "failed" in said[-1]

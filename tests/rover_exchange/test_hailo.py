@@ -1,0 +1,155 @@
+"""A kit for Hailo's compiler: its networks compute what the policy does, and compile.py takes them to an artifact.
+
+tests/onboard/policy/test_hailo_engine.py drives by such artifacts.
+"""
+
+import json
+import re
+import shutil
+import zipfile
+
+import hailo_standin
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from hailo_kit import FRAMES, normalised, opened
+from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+
+from rover_exchange.hailo import compile as hailo_compile
+from rover_exchange.hailo import kit as kits
+from rover_exchange.hailo.networks import networks
+from rover_lib.onboard.errors import ArtifactError, QuantizeError
+from rover_lib.workshop.act import ACT, ActConfig, Affine, imagenet, inputs_of
+
+
+@pytest.fixture
+def kit(hailo_kit, tmp_path, monkeypatch):
+    hailo_standin.install(monkeypatch)
+    return shutil.copytree(hailo_kit, tmp_path / "kit")
+
+
+def two_cameras() -> ACT:
+    """LeRobot's random weights, pre-norm and GELU; states, actions and each camera's colours normalised differently."""
+    sizes, names = {"cam_0": (72, 128), "cam_1": (64, 96)}, tuple("abcdef")
+    lerobot = lerobot_policy(
+        {f"observation.images.{c}": size for c, size in sizes.items()},
+        states=len(names),
+        actions=len(names),
+        **TINY,
+        pre_norm=True,
+        feedforward_activation="gelu",
+    )
+    state_norm, action_unnorm = (
+        Affine(tuple(s + 0.5 * i for i in range(len(names))), (0.1,) * len(names)) for s in (1.5, 0.3)
+    )
+    config = ActConfig(
+        cameras=tuple(sizes),
+        image_sizes=tuple(sizes.values()),
+        state_names=names,
+        action_names=names,
+        dim=TINY["dim_model"],
+        heads=TINY["n_heads"],
+        feedforward=TINY["dim_feedforward"],
+        encoder_layers=1,
+        decoder_layers=2,
+        vae_layers=1,
+        image_norm=(imagenet(), Affine((2.0,) * 3, (-1.0,) * 3)),
+        state_norm=state_norm,
+        action_unnorm=action_unnorm,
+        pre_norm=True,
+        activation="gelu",
+    )
+    return ACT(config, {name.removeprefix("model."): tensor for name, tensor in lerobot.state_dict().items()})
+
+
+def run(model: onnx.ModelProto, given: dict[str, np.ndarray]) -> list[np.ndarray]:
+    return onnxruntime.InferenceSession(model.SerializeToString()).run(None, given)
+
+
+@pytest.mark.slow
+def test_both_splits_in_onnx_runtime_are_the_policy():
+    policy, rng = two_cameras(), np.random.default_rng(0)
+    config = policy.config
+    frames = [torch.from_numpy(smooth_frame(rng, *size)) for size in config.image_sizes]
+    state = torch.from_numpy(rng.normal(size=(1, 6)).astype(np.float32))
+    with torch.inference_mode():
+        expected = policy(state, *frames).numpy()
+    pictures = {}  # as the model script normalises them: the definition, (pixel / 255 - mean) / std
+    for camera, norm, frame in zip(config.cameras, config.image_norm, frames, strict=True):
+        x = frame.permute(2, 0, 1)[None].double() / 255
+        x = x * torch.tensor(norm.scale)[:, None, None] + torch.tensor(norm.shift)[:, None, None]
+        pictures[f"frame_{camera}"] = x.float().numpy()
+    front, whole, rest = networks(policy)
+    features = zip(front.outputs, run(front.model, pictures), strict=True)
+    seen = {name: x[0].transpose(1, 2, 0) for name, x in features}
+    (split,) = run(rest, {"state": state.numpy(), **seen})
+    (actions,) = run(whole.model, {"state": policy.state_norm(state)[:, :, None, None].numpy(), **pictures})
+    assert expected.std() > 1e-2
+    for found in (split, policy.action_unnorm(torch.from_numpy(actions)).numpy()):
+        assert np.abs(found - expected).max() < 1e-5 * max(1, np.abs(expected).max())
+
+
+def test_networks_have_fixed_shapes_of_few_ranks(tiny):
+    checkpoint = normalised(tiny)
+    front, whole, _ = networks(ACT(checkpoint.config, checkpoint.weights))
+    for network in (front, whole):
+        inferred = onnx.shape_inference.infer_shapes(network.model, strict_mode=True).graph
+        for value in [*inferred.input, *inferred.output, *inferred.value_info]:
+            sizes = [d.dim_value for d in value.type.tensor_type.shape.dim]
+            assert all(sizes) and len(sizes) <= 4, value.name
+        assert all(len(shape) == 4 and shape[0] == 1 for shape in network.inputs.values())
+        onnx.checker.check_model(network.model, full_check=True)
+        ends = [node.op_type for node in network.model.graph.node if node.name in network.outputs.values()]
+        assert ends == ["Conv" if network is front else "Add"]
+
+
+@pytest.mark.parametrize("network", ["backbone", "whole"])
+def test_compiles_what_was_recorded_and_packs_it(kit, tiny, network):
+    config = normalised(tiny).config
+    hef = hailo_compile.compile_network(kit, "hailo8", network)
+    calibrated = hailo_standin.ClientRunner.calibrated
+    frames = next(v for v in calibrated.values() if v.dtype == np.uint8)
+    states = next((v for v in calibrated.values() if v.dtype == np.float32), None)
+    assert len(frames) == FRAMES and (states is None) == (network == "backbone")
+    for i, sample in enumerate(memory_samples(FRAMES)):
+        assert np.array_equal(frames[i], inputs_of(sample, config)[1].numpy())
+        wanted = sample.state * np.array([2, 3]) + np.array([0.1, -0.2])
+        assert states is None or np.allclose(states[i, 0, 0], wanted, atol=1e-6)
+    with zipfile.ZipFile(hailo_compile.pack(kit, "hailo8", network, hef)) as z:
+        assert z.read("archive/network.hef") == hef.read_bytes()
+        assert ("archive/model.onnx" in z.namelist()) == (network == "backbone")
+        manifest = json.loads(z.read("archive/extra/manifest.json"))
+    assert manifest["hailo"]["chip"] == "hailo8" and manifest["engine"] == "hailo"
+    assert set(manifest["parity"]["tolerance"].values()) == {2.5e-4}  # of what this kit's INT8 may be off
+
+
+def test_model_scripts_normalise_and_the_kit_lists_its_files(kit):
+    script = (kit / "backbone.alls").read_text()
+    mean, std = (json.loads(x) for x in re.search(r"normalization\((\[.*?\]), (\[.*?\])\)", script).groups())
+    norm = imagenet()  # pixel / 255 * scale + shift
+    assert np.allclose([-m / s for m, s in zip(mean, std, strict=True)], norm.shift, atol=1e-4)
+    assert np.allclose([255 / s for s in std], norm.scale, rtol=1e-5)
+    assert f"calibset_size={FRAMES}" in script
+    listed = (kit / "KIT.md").read_text().replace("<camera>", "cam_front")
+    assert all(path.name in listed for path in kit.iterdir() if path.name != "KIT.md")
+
+
+def test_other_names_of_inputs_are_refused(kit, monkeypatch):
+    monkeypatch.setattr(hailo_standin.ClientRunner, "first", 0)
+    with pytest.raises(SystemExit, match="input_layer1 for 'state'"):
+        hailo_compile.compile_network(kit, "hailo8", "whole")
+    assert not list(kit.glob("*.hef"))
+
+
+def test_too_few_frames_or_a_folder_that_exists_or_a_failure_leave_nothing(tiny, tmp_path, monkeypatch):
+    loaded = opened(normalised(tiny))
+    with pytest.raises(QuantizeError, match="1024 frames"):
+        kits.write_kit(loaded, tmp_path, tmp_path / "kit")
+    with pytest.raises(ArtifactError):
+        kits.write_kit(loaded, tmp_path / "no run", tmp_path / "kit", samples=FRAMES)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "link").symlink_to("gone")  # onto which no folder can be moved
+    with pytest.raises(QuantizeError, match="exists"):
+        kits.write_kit(loaded, tmp_path, tmp_path / "link", samples=FRAMES)

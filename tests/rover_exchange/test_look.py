@@ -1,0 +1,281 @@
+"""A past drive as a figure, as a film, and as MCAP, from its flight log and the pictures recorded with it."""
+
+import base64
+import csv
+import json
+from datetime import datetime
+
+import av
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from rover_exchange import film
+from rover_exchange.flight import flight_figure
+from rover_exchange.moments import began_s, moments_of
+from rover_lib.cli import main
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.host import Host
+from rover_lib.onboard.car.pwm import PwmCalibration
+from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_log
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.recording.episode import CONTROL_FIELDS
+
+SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10
+OTHER = Car.of(
+    {
+        "name": "another car",
+        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
+        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000},
+        "camera": {"field_of_view_deg": 120},
+        "wheelbase_m": 0.5,
+    }
+)
+
+
+class Pi(Host):
+    """A Pi that is warm and has too thin a cable."""
+
+    def temperature_c(self):
+        return 61.5
+
+    def throttled(self):
+        return "0x50005"
+
+
+class Pace:
+    """The clock of the log's ticks."""
+
+    now = 50.0
+
+    def __call__(self):
+        return self.now
+
+
+def drive(folder, *, recorded=True, pictures=True, car=None, host=None, events=1, seconds=SECONDS):
+    """Write a flight log and the episode that was recorded with it. Returns the log's path."""
+    header = {"hz": HZ, "fade_s": 0.5, "stop_s": 1.0} | ({"car": car.description()} if car else {})
+    path, clock, episode = folder / "flight.log", Pace(), folder / "episodes" / "episode_1"
+    with FlightLog(path, header=header, max_bytes=1_000_000, keep=1, clock=clock, host=host) as log:
+        for k in range(events):
+            log.event(f"event {k} for $5 and $6")
+        for k in range(round(seconds * HZ)):
+            clock.now = 50.0 + k / HZ
+            log.tick(Tick(k / HZ, 0.25, "A" if k < 50 else "M", "a", 0.5 * np.sin(k / 20), 0.05 + k / 2000, 1500,
+                          150 + k, 1500, 149 + k, 1 + k // 6, 150.0, 125.0, 0.9 if k > 20 else 1.0, k))  # fmt: skip
+        clock.now += 0.05
+        if recorded:
+            log.event(f"recorded: {episode}")
+    if pictures:
+        start = began_s(read_log(path))
+        (episode / "frames").mkdir(parents=True)
+        with (episode / "frame_data.csv").open("w", newline="") as file:
+            rows = csv.writer(file)
+            rows.writerow(["frame_id", "timestamp", "image_path"])
+            for k in range(round(SECONDS * PICTURES_HZ)):
+                name = f"frames/frame_{k:06d}.jpg"
+                cv2.imwrite(str(episode / name), np.full((90, 160, 3), 30 + 5 * k, np.uint8))
+                rows.writerow([k, start + k / PICTURES_HZ + 0.01, name])
+            rows.writerow([99, start + 0.5, "../../../secret.jpg"])
+            rows.writerows([[100, "nan", "frames/frame_000003.jpg"], [101, "inf", "frames/frame_000003.jpg"]])
+    return path
+
+
+def rover(*args):
+    return CliRunner().invoke(main, [str(a) for a in args])
+
+
+def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):
+    flight = read_log(drive(tmp_path))
+    found = moments_of(flight)
+    assert [round(m.t_s, 2) for m in found] == [round(k / PICTURES_HZ + 0.01, 2) for k in range(20)]
+    for k, moment in enumerate(found):
+        row = 3 * k  # the last tick before the picture
+        for name in ("t_s", "throttle", "steering", "throttle_us", "pins_throttle_us", "plan", "latency_ms"):
+            assert moment.tick[name] == pytest.approx(flight.ticks[name][row]), name
+        ahead = np.stack([flight.ticks["steering"], flight.ticks["throttle"]], axis=1)[row : row + HZ]
+        assert np.allclose(moment.ahead, ahead) and moment.missed == 0
+    assert found[-1].tick["state"] == "M" and found[5].event.endswith("event 0 for $5 and $6")
+
+
+def test_pictures_of_another_drive_or_a_damaged_list_are_refused(tmp_path):
+    flight = read_log(drive(tmp_path))
+    listed = tmp_path / "episodes/episode_1/frame_data.csv"
+    sound = listed.read_text()
+    listed.write_text("frame_id,timestamp,image_path\n1,1000,frames/frame_000001.jpg\n")
+    with pytest.raises(EpisodeError, match="none of its pictures"):
+        moments_of(flight)
+    listed.write_text(f"{sound}100,1,frames/frame\0.jpg\n")
+    with pytest.raises(EpisodeError, match="cannot be read"):
+        moments_of(flight)
+    flight.header.clear()
+    with pytest.raises(LogError, match="damaged"):
+        moments_of(flight)
+
+
+def test_the_path_and_the_bars_are_of_the_moment_and_of_its_car(tmp_path):
+    flight = read_log(drive(tmp_path, car=OTHER))
+    moment, frame = moments_of(flight)[10], np.full((90, 160, 3), 90, np.uint8)
+    moment.tick["steering"] = -0.5
+
+    def drawn(action, car=OTHER):
+        moment.ahead[:] = action
+        return film.draw_moment(moment, frame, car, 1 / HZ)
+
+    def path(picture):
+        return np.argwhere(picture[:360, :, 1].astype(int) > picture[:360, :, 0] + 15)
+
+    ahead = drawn([0.0, 0.09])
+    assert ahead.shape == (360 + film.PANEL, 640, 3)
+    assert path(ahead)[:, 0].min() > 125 and abs(path(ahead)[:, 1].mean() - 320) < 2  # below the horizon, straight on
+    assert path(drawn([0.6, 0.09]))[:, 1].mean() < 310  # to the left, as this car steers
+    assert not len(path(drawn([0.6, 0.0])))
+    bar = ahead[360 + 12, 84:265]  # steering fills half of a half of the bar
+    filled = np.flatnonzero((bar == film.FILL).all(axis=1))
+    assert len(filled) == pytest.approx(45, abs=3)
+    # Its pin stood at 1500 us, which is neutral for that car alone: the line is in the middle.
+    assert np.flatnonzero((bar == film.PIN).all(axis=1)).mean() == pytest.approx(90, abs=1)
+    assert not (drawn([0.0, 0.09], Car()) == ahead).all()
+
+
+@pytest.mark.slow
+def test_a_film_has_the_drives_pace_and_pictures(tmp_path):
+    log = drive(tmp_path)
+    for ending in ("mp4", "webp"):
+        done = rover("log", log, "--video", tmp_path / f"out.{ending}")
+        assert done.exit_code == 0 and not (tmp_path / "flight.log.png").exists(), done.output
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        images = [image.to_ndarray(format="rgb24") for image in container.decode(video=0)]
+    assert len(images) == 58 and images[0].shape == (360 + film.PANEL, 640, 3)
+    means = [image[5:60].mean() for image in images]  # above the horizon: each picture is lighter than the one before
+    assert abs(means[0] - 30) < 4 and 115 < means[-1] < 129 and np.all(np.diff(means) > -1)
+    with Image.open(tmp_path / "out.webp") as webp:
+        assert webp.n_frames == 10 and webp.width == 400 and webp.info["loop"] == 0
+
+
+@pytest.mark.parametrize(
+    ("made", "output", "word"),
+    [
+        ({}, "out.avi", ".mp4 or .webp"),
+        ({"recorded": False}, "out.mp4", "--record"),
+        ({"pictures": False}, "out.mp4", "--pictures"),
+    ],
+)
+def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
+    done = rover("log", drive(tmp_path, **made), "--video", tmp_path / output)
+    assert done.exit_code == 1 and word in done.output, done.output
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(("out", ".out"))]
+
+
+# ---- MCAP
+
+
+def read_mcap(path):
+    """By topic, [(log time in seconds since the drive's start, content)]."""
+    reading = pytest.importorskip("mcap.reader", reason="needs the package mcap, of the extra workshop")
+    found, last_ns = {}, 0
+    with path.open("rb") as file:
+        reader = reading.make_reader(file)
+        (metadata,) = reader.iter_metadata()
+        start_s = datetime.fromisoformat(json.loads(metadata.metadata["start"])).timestamp()
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            row = json.loads(message.data)
+            assert message.log_time >= last_ns and channel.message_encoding == "json"
+            assert row.keys() >= json.loads(schema.data)["properties"].keys() - {"driver"}
+            last_ns = message.log_time
+            found.setdefault(channel.topic, []).append((last_ns / 1e9 - start_s, row))
+    return found
+
+
+def test_mcap_has_each_message_at_its_time(tmp_path):
+    path, episode = drive(tmp_path), tmp_path / "episodes" / "episode_1"
+    flight = read_log(path)
+    drivers = ["policy"] * 60 + ["human"] * 30
+    rows = [{"system_timestamp": began_s(flight) + i / 30, "driver": driver} for i, driver in enumerate(drivers)]
+    rows = [dict.fromkeys(CONTROL_FIELDS) | row for row in rows] + ["nonsense", {}, {"system_timestamp": float("nan")}]
+    (episode / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
+    (episode / "frames" / "frame_000003.jpg").write_bytes(b"\xff\xd8 no picture")
+    (episode / "frames" / "frame_000004.jpg").unlink()
+    done = rover("log", path, "--mcap", tmp_path / "out.mcap")
+    assert done.exit_code == 0 and "60 of tick" in done.output and "18 of camera" in done.output, done.output
+    found = read_mcap(tmp_path / "out.mcap")
+    for k, (t_s, row) in enumerate(found["/tick"]):
+        assert t_s == pytest.approx(flight.ticks["t_s"][k], abs=2e-6)
+        for name in Tick._fields:
+            value = flight.ticks[name][k]
+            assert row[name] == (str(value) if isinstance(value, str) else pytest.approx(float(value))), name
+    assert [row["message"] for _, row in found["/event"]] == [str(e) for e in flight.events]
+    for k, (t_s, row) in zip([k for k in range(20) if k not in (3, 4)], found["/camera"], strict=True):
+        assert t_s == pytest.approx(k / PICTURES_HZ + 0.01, abs=2e-6) and row["format"] == "jpeg"
+        assert base64.b64decode(row["data"]) == (episode / "frames" / f"frame_{k:06d}.jpg").read_bytes()
+    assert [row["driver"] for _, row in found["/control"]] == drivers
+    assert found["/control"][-1][0] > found["/tick"][-1][0]  # it goes on after the takeover
+
+
+def test_mcap_without_pictures(tmp_path):
+    pytest.importorskip("mcap")
+    from rover_exchange.mcap_log import write_mcap
+
+    flight = read_log(drive(tmp_path, pictures=False))
+    flight.ticks["plan_age_ms"][7] = np.nan
+    assert set(write_mcap(tmp_path / "out.mcap", flight)) == {"tick", "event", "machine"}
+    assert read_mcap(tmp_path / "out.mcap")["/tick"][7][1]["plan_age_ms"] is None  # not known
+    with pytest.raises(EpisodeError):
+        write_mcap(tmp_path / "other.mcap", flight, tmp_path / "none")
+    assert not list(tmp_path.glob("*other.mcap*"))
+
+
+# ---- the figure
+
+
+def lines_of(ax):
+    return {line.get_label(): line for line in ax.get_lines() if not line.get_label().startswith("_")}
+
+
+def test_what_is_drawn_and_that_nothing_is_cut_off(tmp_path):
+    vcgencmd = tmp_path / "vcgencmd"
+    vcgencmd.touch(0o755)
+    flight = read_log(drive(tmp_path, pictures=False, events=40, host=Pi(vcgencmd=str(vcgencmd))))
+    figure = flight_figure(flight)
+    who, steering, throttle, plan, late, temperature = figure.axes
+    assert lines_of(steering)["commanded, us"].get_ydata().tolist() == flight.ticks["steering_us"].tolist()
+    assert lines_of(throttle)["the Arduino's pin"].get_ydata().tolist() == flight.ticks["pins_throttle_us"].tolist()
+    assert [c.get_label() for c in throttle.collections] == ["faded for the plan's age"]
+    assert len(lines_of(plan)["latency of each"].get_xdata()) == 10  # one per plan, not per tick
+    assert lines_of(plan)["stopped from 1000 ms on"].get_ydata()[0] == 1000
+    assert lines_of(late)["lateness of a command"].get_ydata().tolist() == flight.ticks["late_ms"].tolist()
+    assert [c.get_label() for c in temperature.collections] == ["under-voltage, throttled"]
+    assert [t.get_text() for t in who.get_legend().get_texts()] == ["human", "host"]
+    figure.draw_without_rendering()
+    top = PwmCalibration().actions_from_pulses(steering.get_ylim()[1], 120).steering
+    assert steering.child_axes[0].get_ylim()[1] == pytest.approx(top, abs=1e-3)
+    width, height = figure.bbox.size
+    texts = [figure._suptitle, figure._supxlabel]
+    for ax in figure.axes:
+        texts += [ax.yaxis.label, *ax.texts, *(ax.get_legend().get_texts() if ax.get_legend() else ())]
+        assert ax.get_window_extent().width > 0.7 * width
+    for text in texts:
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height, text.get_text()[:50]
+    listed = figure._supxlabel.get_text()
+    assert "27 earlier events" in listed and r"event 39 for \$5" in listed and "event 25 " not in listed
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.03])
+def test_a_short_log_is_drawn_too(tmp_path, seconds):
+    figure = flight_figure(read_log(drive(tmp_path, pictures=False, recorded=False, events=0, seconds=seconds)))
+    figure.draw_without_rendering()
+    assert len(figure.axes) == 6
+
+
+@pytest.mark.slow
+def test_the_command_draws(tmp_path):
+    path, other = drive(tmp_path, pictures=False), tmp_path / "other.pdf"
+    result = rover("log", path)
+    assert result.exit_code == 0 and path.with_name("flight.log.png").read_bytes().startswith(b"\x89PNG"), result.output
+    assert json.loads(rover("log", path, "--json", "-o", other).stdout)["ticks"] == 60
+    assert other.read_bytes().startswith(b"%PDF")
+    refused = rover("log", path, "-o", tmp_path / "other.txt")
+    assert refused.exit_code == 1 and ".png" in refused.output
