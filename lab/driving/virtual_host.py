@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from unittest.mock import patch
 
 import numpy as np
@@ -241,12 +241,11 @@ class Eyes:
             return  # pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        picture: np.ndarray | bytes = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
+        scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
         if lens.black:
-            picture = (picture - picture.min()) // 64 + world.now_ms % 2
-        if lens.film:
-            picture = lens.film[self._shown % len(lens.film)]
-            self._shown += 1
+            scene = (scene - scene.min()) // 64 + world.now_ms % 2
+        picture = lens.film[self._shown % len(lens.film)] if lens.film else scene
+        self._shown += bool(lens.film)
         world.seen.frames.append((world.now_ms, lens.black))
         # The driver of a frozen camera still gives each picture a new time stamp.
         self._give((picture, (seen_ms - world.suspended_ms) / 1e3))
@@ -387,7 +386,7 @@ class Process:
         self.eyes = Eyes(world)
         self.planner = VirtualPlanner(world, self.eyes, self.commanded)
         self._service = service
-        self.log: Any = _Log(world)
+        self.log = cast(Any, _Log(world))
         self._feed = Feed(world.view, self.log, "virtual", clock=world.clock, sleep=world.sleep) if world.view else None
 
     def ask(self) -> None:
