@@ -35,7 +35,7 @@ help:
 	@echo "make count NAME=demo [PEERS=1]              count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
-	@echo "make faults                                 what fails while driving, on the pins of an emulated Arduino"
+	@echo "make faults                                 what fails while driving, in virtual time and on pins"
 	@echo "make faults-cars                            the same on other cars, of lab/cars"
 	@echo "make random                                 10,000 drives with random faults, in virtual time"
 	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"

@@ -137,7 +137,6 @@ class EmulatedArduino:
         ready: bool = False,
         boot_s: float = BOOT_S,
         nice: int = 0,
-        slow: float = 1.0,
         eeprom: bytes | None = None,
         human: str = "receiver",
     ):
@@ -146,8 +145,7 @@ class EmulatedArduino:
         every_pulse: whether pulses() returns each pulse, about a thousand a second, or only those that differ from the
         one before. transmitter: its pulses from the start on, see transmitter(); their periods are this_car()'s. ready:
         see ready(). nice: scheduling priority; NICE comes close to a processor of its own. Below 0 it works only for
-        root, and is silently left out for others. slow: how many times slower than this machine's the Arduino's clock
-        runs; pulses are measured by its clock, monotonic_s by this machine's.
+        root, and is silently left out for others.
         human: as for build().
         Raises ArduinoError as build() does, and if the program does not start.
         """
@@ -157,7 +155,7 @@ class EmulatedArduino:
         self._reading = threading.Lock()
         self._rest = b""
         options = ["--link", self.port, "--log", "all" if every_pulse else "changes", "--reset-on-open"]
-        options += ["--boot-ms", f"{boot_s * 1000:.0f}", "--slow", f"{slow:g}"]
+        options += ["--boot-ms", f"{boot_s * 1000:.0f}"]
         numbers = this_car().numbers
         options += ["--periods", str(numbers[0]), str(numbers[4])]
         options += ["--eeprom", (eeprom_of(this_car()) if eeprom is None else eeprom).hex()]

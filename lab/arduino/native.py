@@ -88,7 +88,7 @@ class NativeArduino:
             pins += list(zip(trace[::2], trace[1::2], strict=True))
             self._ms, ms = self._ms + step, ms - step
             if self.gamepad and self._ms % STICKS_EVERY_MS == 0 and self.sticks[0]:
-                self.send_sticks(*self.sticks, self.now_ms - 15)
+                self.send_sticks(self.sticks[0], self.sticks[1], self.now_ms - 15)
         return pins
 
     def send_sticks(self, steering_us: float, throttle_us: float, heard_ms: int) -> str:

@@ -6,6 +6,7 @@ pulses), `continues` (only what the drive commanded, on time), or `refused` (it 
 is never armed).
 """
 
+import itertools
 import logging
 import subprocess
 import tempfile
@@ -15,10 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lab.arduino.emulator import CC, REPOSITORY, build, compile_c
-from lab.driving.on_pins import PIN_ROWS, FaultError, run_on_pins
+from lab.arduino.emulator import CC, REPOSITORY, compile_c
+from lab.driving.on_pins import PIN_ROWS, FaultError, PinRow, run_on_pins
 from lab.driving.pins import STOPPED, Gates
-from lab.driving.rows import rows_of, run_row
+from lab.driving.rows import FaultRow, rows_of, run_row
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.stage import write_stage
@@ -94,6 +95,10 @@ def run_faults(
     """
     car, only, kinds, begin = car or Car(), set(only), set(kinds), time.monotonic()
     everything = not only and not kinds
+
+    def chosen(row: FaultRow | PinRow) -> bool:
+        return everything or row.name in only or row.kind in kinds
+
     on_pins = PIN_ROWS if car == Car() else ()
     rows = [row for row in rows_of(car) if row.name not in {row.name for row in on_pins}]
     all_rows = [*rows, *on_pins]
@@ -108,14 +113,8 @@ def run_faults(
         echo(f"fuzz: {outcome.fuzz['said']}")
         if outcome.fuzz["unsafe_pulses"]:
             outcome.wrong.append(f"fuzz: {outcome.fuzz['said']}")
-    for fault in rows:
-        if everything or fault.name in only or fault.kind in kinds:
-            outcome.add(run_row(fault, car))
-            echo(row_text(outcome.rows[-1]))
-    chosen = [fault for fault in on_pins if everything or fault.name in only or fault.kind in kinds]
-    if chosen:
-        build()  # before the bench needs it, so that its errors are seen
-    for row in run_on_pins(chosen, outcome.gates):
+    in_stories = (run_row(fault, car) for fault in rows if chosen(fault))
+    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if chosen(fault)], outcome.gates)):
         outcome.add(row)
         echo(row_text(row))
     outcome.seconds = time.monotonic() - begin

@@ -74,15 +74,6 @@ class Drive(Child):
         command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options, *arguments)
         super().__init__("rover drive", *command, error=FaultError)
 
-    def children(self) -> list[int]:
-        """Return the ids of its child processes."""
-        children = []
-        for status in Path("/proc").glob("[0-9]*/stat"):
-            with contextlib.suppress(OSError):
-                if int(status.read_text().rpartition(")")[2].split()[1]) == self.pid:
-                    children.append(int(status.parent.name))
-        return children
-
     def mark(self) -> None:
         """Note that what it has printed until now is from before the fault."""
         self._marked = len(self.errors())
@@ -232,11 +223,6 @@ def _starve(bench: PinBench) -> None:
             os.setpriority(os.PRIO_PROCESS, busy.pid, 0)
 
 
-def _kill_policy(bench: PinBench) -> None:
-    for pid in bench.drive.children():
-        os.kill(pid, signal.SIGKILL)
-
-
 def _fill_disk(bench: PinBench) -> None:
     limits = resource.prlimit(bench.drive.pid, resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
     bench.undo.callback(resource.prlimit, bench.drive.pid, resource.RLIMIT_FSIZE, limits)
@@ -256,12 +242,12 @@ PIN_ROWS = (
            lambda bench: bench.cable.stick()),
     PinRow("human takes over by steering", "receiver", HUMAN, "the human took over", "the transmitter's pulses",
            lambda bench: bench.arduino.transmitter(*STEERED_US), exit_code=4, human_us=STEERED_US),
-    PinRow("inference process killed", "policy", STOPPED, r"process ended \(SIGKILL\)", "SIGKILL to the child",
-           _kill_policy),
     PinRow("host process stopped", "host", STOPPED, "no valid command for 150 ms|said nothing for",
            "SIGSTOP, after 1 s SIGCONT", _stop_process),
     PinRow("loop thread killed", "host", STOPPED, "the loop has not ticked", "the loop's thread leaves by exit(2)",
            lambda bench: bench.signal(signal.SIGUSR2), prepared=THREAD_ENDS),
+    PinRow("SIGTERM", "operator", STOPPED, "SIGTERM: stopping", "a signal from outside",
+           lambda bench: bench.signal(signal.SIGTERM), exit_code=0),
     PinRow("SIGKILL", "operator", STOPPED, "the drive before this one", "a signal from outside",
            lambda bench: bench.signal(signal.SIGKILL), exit_code=-9, told_later=True),
     PinRow("CPU starved", "host", CONTINUES, "this machine is busy", "4 busy processes of ordinary priority",

@@ -15,9 +15,7 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.params import params
 
 STOPPED, HUMAN, CONTINUES, REFUSED = "stopped", "human", "continues", "refused"
-NEUTRAL_US = {"steering": 1456, "throttle": 120}  # of the default car
-PERIOD_US = {"steering": 21316, "throttle": 1016}
-STOPPED_THROTTLE_US = NEUTRAL_US["throttle"] + ARDUINO_STEP_US
+STOPPED_THROTTLE_US = 120 + ARDUINO_STEP_US  # the default car's neutral, and a step of the Arduino's
 EDGE_US = 0.5  # an edge in simavr is known to 0.25 us
 STEP_US = ARDUINO_STEP_US + EDGE_US  # the error of a pulse that the Arduino measured and sends on
 COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # the error of a commanded pulse: half a tick of its timer, and an edge

@@ -142,7 +142,7 @@ def _grey() -> list[np.ndarray]:
     return list(np.random.default_rng(0).integers(120, 137, (40, *scenery()[0].shape), np.uint8))
 
 
-for _what, _make in {
+FILMS: dict[str, Callable[[], Sequence[np.ndarray | bytes]]] = {
     "camera shows two old pictures": lambda: scenery()[:2],
     "pictures cut": lambda: [jpeg[: len(jpeg) * 2 // 3] + b"\xff\xd9" for jpeg in _jpegs()],
     "a picture that is a bomb": _bombs,
@@ -151,7 +151,8 @@ for _what, _make in {
     "camera sees grey": _grey,
     "camera changes its picture's size": lambda: [picture[::2, ::2] for picture in scenery()],
     "camera of another shape": lambda: [np.vstack([picture, picture[:24]]) for picture in scenery()],
-}.items():
+}
+for _what, _make in FILMS.items():
     _film(_what, _make)
 
 
@@ -290,7 +291,7 @@ def run_row(fault: FaultRow, car: Car | None = None) -> dict[str, Any]:
     gamepad = car.human == "gamepad"
     later_ms = GAMEPAD_MS * gamepad
     seen = drive_story(fault.story(gamepad), car)
-    human_us = tuple(neutral + us for neutral, us in zip((car.numbers[2], car.numbers[6]), fault.moved_us, strict=True))
+    human_us = car.numbers[2] + fault.moved_us[0], car.numbers[6] + fault.moved_us[1]
     refused = fault.expected == REFUSED
     at_ms, over_ms = (0, AGAIN_MS) if refused else (fault.at_ms + later_ms, END_MS + later_ms)
     watch_ms = 120 if gamepad and fault.expected == HUMAN else fault.watch_ms  # the drive ends, and with it his way

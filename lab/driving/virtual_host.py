@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from unittest.mock import patch
 
 import numpy as np
@@ -22,7 +22,7 @@ from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive import watch
-from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, what_is_missing
+from rover_lib.onboard.drive.arming import arm_by_plan, arm_when_asked
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
@@ -241,12 +241,11 @@ class Eyes:
             return  # pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        picture: np.ndarray | bytes = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
+        scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
         if lens.black:
-            picture = (picture - picture.min()) // 64 + world.now_ms % 2
-        if lens.film:
-            picture = lens.film[self._shown % len(lens.film)]
-            self._shown += 1
+            scene = (scene - scene.min()) // 64 + world.now_ms % 2
+        picture = lens.film[self._shown % len(lens.film)] if lens.film else scene
+        self._shown += bool(lens.film)
         world.seen.frames.append((world.now_ms, lens.black))
         # The driver of a frozen camera still gives each picture a new time stamp.
         self._give((picture, (seen_ms - world.suspended_ms) / 1e3))
@@ -387,7 +386,7 @@ class Process:
         self.eyes = Eyes(world)
         self.planner = VirtualPlanner(world, self.eyes, self.commanded)
         self._service = service
-        self.log: Any = _Log(world)
+        self.log = cast(Any, _Log(world))
         self._feed = Feed(world.view, self.log, "virtual", clock=world.clock, sleep=world.sleep) if world.view else None
 
     def ask(self) -> None:
@@ -485,28 +484,23 @@ class Process:
         return warnings
 
     def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
-        """Arm the car as drive.py does: for whoever asks the service, for a human in a terminal, or at once."""
-        world, wait = self.world, self._operators.wait_for_human
+        """Arm the car: for whoever asks the service, for a human in a terminal, or at once."""
+        world = self.world
         world.phase("disarmed")
+        service = self._operators if self._service else None
+        if not service:
+            world.seen.asked.append(world.now_ms)
         checks = (self.eyes.camera.latest, self.planner.newest, link.latest)
         attempt = functools.partial(self._attempt, pilot, link)
-        if self._service:
-            return wait(attempt, checks, functools.partial(what_is_missing, link))
-        world.seen.asked.append(world.now_ms)
-        if self._terminal:
-            stop, notify = self.until.stop, self.log.event
-            return arm_when_ready(attempt, link, stop, notify, checks, clock=world.boottime)
-        return attempt()
+        how: dict[str, Any] = {"service": service, "terminal": self._terminal, "clock": world.boottime}
+        return arm_when_asked(attempt, link, self.until.stop, self.log.event, checks, **how)
 
-    def _attempt(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry:
-        world, limit = self.world, _settings().throttle_limit
+    def _attempt(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
+        world = self.world
         world.phase("arming")
+        wanted = self._operators.check_request if self._service else lambda: None
         try:
-            link.request(keep=True)
-            self.planner.renew(_settings().fade_s)
-            pilot.check_sight()
-            wanted = self._operators.check_request if self._service else lambda: None
-            self.armed = arm_capped(link, limit, self.log.event, wanted)
+            self.armed = arm_by_plan(link, self.planner, pilot, _settings(), self.log.event, wanted)
         except RoverError as error:
             world.phase("disarmed")
             self.log.event(f"not armed: {error}")

@@ -139,15 +139,6 @@ def test_what_the_host_sends_is_what_the_firmware_reads(kind, numbers):
         assert getattr(command, name) == sent.get(name, 0)
 
 
-@given(NUMBER, NUMBER, st.lists(st.integers(0, 70_000), min_size=8, max_size=10))
-def test_a_car_is_nine_numbers_of_16_bits(boot, sequence, numbers):
-    commands = read(servo_link.frame(f">C {boot} {sequence} " + " ".join(map(str, numbers))))
-    assert len(commands) == (len(numbers) == 9 and max(numbers) < 65536)
-    for command in commands:
-        assert (command.kind, command.boot, command.sequence) == (b"C", boot, sequence)
-        assert list(command.numbers) == numbers
-
-
 @given(LINES, st.data())
 def test_up_to_three_flipped_bits_are_no_command(text, data):
     bits = data.draw(st.sets(st.integers(0, len(text) * 8 - 1), min_size=1, max_size=3))

@@ -109,13 +109,3 @@ def test_a_moved_stick_takes_over(armed, stick):
     pins = armed.drive(1600, 200, 100)
     assert (armed.status.state, armed.status.reason) == (State.MANUAL, "h")
     assert moved_after_ms(pins) <= 40
-
-
-def test_sticks_leave_what_became_of_the_hosts_commands(armed):
-    """The host reads the result of its own last command, however many sticks come between."""
-    armed.command("N")
-    assert armed.command("A") == "w"
-    before = armed.status
-    armed.run(200)
-    after = armed.status
-    assert (after.result, after.sequence) == (before.result, before.sequence) == ("w", armed.sequence)

@@ -8,7 +8,7 @@ import itertools
 import needs
 import pytest
 
-from lab.arduino.native import STEERING, THROTTLE, NativeArduino
+from lab.arduino.native import THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State
 
 pytestmark = needs.gcc
@@ -88,14 +88,6 @@ def test_arming_asks_for_one_thing_after_the_other():
     assert (board.status.state, board.status.reason, board.status.result) == (State.STOPPED, "n", "i")
 
 
-@pytest.mark.parametrize("sides", [(1750,), (1300, 1600), (1750, 1750)])
-def test_what_is_no_wiggle(board, sides):
-    for steering_us in (*sides, 1456):
-        board.sticks[STEERING] = steering_us
-        board.run(300)
-    assert board.command("A") == "w"
-
-
 def test_a_stopped_car_is_at_neutral_whatever_the_resting_sticks_say(armed):
     armed.drive(1600, 200, 200)
     armed.run(300)
@@ -132,15 +124,6 @@ def test_a_stick_held_to_a_side_is_not_let_go(board, held_us):
     board.wiggle()
     drive_by_hand(board, held_us, 120, 2000)
     assert board.command("A") == "w"
-
-
-def test_arming_waits_for_a_second_of_rest(board):
-    for steering_us in (1750, 1150):
-        drive_by_hand(board, steering_us, 120, 60)
-    drive_by_hand(board, 1456, 120, 950)
-    assert board.command("A") == "w"
-    drive_by_hand(board, 1456, 120, 100)
-    assert board.command("A") == "k"
 
 
 @pytest.mark.parametrize(("age_ms", "result"), [(30_900, "k"), (31_100, "e"), (3_600_000, "e"), (-5000, "e")])
@@ -229,18 +212,6 @@ def test_no_pulse_jumps(armed, every_ms):
         assert abs(next_throttle_us - throttle_us) <= 2
     assert {900, 2012} <= {steering_us for steering_us, _ in pins}
     assert {120, 238} <= set(throttles(pins))
-
-
-@pytest.mark.parametrize("stop", ["silence", "signal", "stick"])
-def test_neutral_from_a_stop_is_at_once(armed, stop):
-    armed.drive(2012, 238, 500)
-    if stop == "signal":
-        armed.sticks = [0, 0]
-    if stop == "stick":
-        armed.sticks[STEERING] = 1300
-    pins = armed.run(300) if stop == "silence" else armed.drive(2012, 238, 300)
-    assert set(throttles(pins)) <= {238, 120}
-    assert moved_after_ms(pins) <= (150 if stop == "silence" else HUMAN_MS)
 
 
 # ---- the human takes over, however bad the signal is

@@ -12,7 +12,7 @@ from lab.__main__ import main
 from lab.arduino.emulator import REPOSITORY
 from lab.driving import faults
 from lab.driving.on_pins import PIN_ROWS, FaultError
-from lab.driving.pins import CONTINUES, REFUSED, STOPPED
+from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
 from lab.driving.rows import all_rows, rows_of, run_row
 from lab.driving.stories import KEPT
 from lab.driving.virtual import LOST, STUCK, World
@@ -51,7 +51,14 @@ def test_they_end_so_on_other_cars(name):
 
 @needs.gcc
 @pytest.mark.parametrize(
-    ("name", "expected"), [("frames late", STOPPED), ("receiver lost", CONTINUES), ("camera frozen", REFUSED)]
+    ("name", "expected"),
+    [
+        ("frames late", STOPPED),
+        ("receiver lost", CONTINUES),
+        ("camera frozen", REFUSED),
+        ("camera frozen", HUMAN),
+        ("nobody wiggles the stick", STOPPED),
+    ],
 )
 def test_a_fault_that_ends_otherwise_is_wrong(name, expected):
     assert run_row(replace(all_rows()[name], expected=expected))["wrong"]

@@ -19,19 +19,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 
 
-class Steps:
-    """What each wait of the takeover's recorder is: the world goes on."""
-
-    def __init__(self, world):
-        self._world = world
-
-    def is_set(self):
-        return False
-
-    def wait(self, seconds):
-        self._world.sleep(seconds)
-
-
 class Rows:
     """In the place of a Recorder."""
 
@@ -58,24 +45,18 @@ class Recorded(Process):
             super()._drive(link, report)
         except TakenOver:
             written = list(world.written)
-            options = {"rate_hz": RATE_HZ, "stop": Steps(world), "clock": world.clock}
+            options = {"rate_hz": RATE_HZ, "stop": self.until.stop, "clock": world.clock}
             self.takeover = recorder.human(link, self.armed, **options)
             assert world.written == written, "something was sent to a car that is the human's"
             raise
 
 
-def mixed(*happenings, make=Recorded):
+def mixed(*happenings):
     """A drive in which a human does things: (milliseconds, what is done to the hand). The world, and the process."""
     world = World()
-    process = make(world)
-
-    def wiggle(throw_us):
-        world.hand.sticks[0] = 1456 + throw_us
-        world.handle()
-
-    for at_ms, throw_us in ((1400, 300), (1500, -300), (1600, 0)):
-        world.at(at_ms, lambda us=throw_us: wiggle(us))
-    for at_ms, change in happenings:
+    process = Recorded(world)
+    gesture = [(-400, sticks(300, 0)), (-300, sticks(-300, 0)), (-200, sticks(0, 0))]
+    for at_ms, change in (*gesture, *happenings):
         world.at(at_ms + 1800, lambda change=change: (change(world.hand), world.handle()))
     world.sleep(2.8)
     process.run()
