@@ -69,7 +69,7 @@ class Container:
             layers = f"lowerdir={made.root},upperdir={folder}/upper,workdir={folder}/work,redirect_dir=on"
             remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
             run("mount", "-t", "overlay", self.machine, "-o", layers, self.root, error=EmulationError, remedy=remedy)
-            stack.callback(subprocess.run, ["umount", "--lazy", self.root], capture_output=True)
+            stack.callback(lambda: subprocess.run(["umount", "--lazy", self.root], capture_output=True))
             self._enter_cgroup = stack.enter_context(in_cgroup(self.machine))
             self._configure()
             self._stack = stack.pop_all()
