@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from urllib.request import getproxies
 
 from lab.pi.debian_image import debian_image
 from lab.pi.emulation import EmulationError, in_cgroup
@@ -68,7 +69,7 @@ class Container:
             layers = f"lowerdir={made.root},upperdir={folder}/upper,workdir={folder}/work,redirect_dir=on"
             remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
             run("mount", "-t", "overlay", self.machine, "-o", layers, self.root, error=EmulationError, remedy=remedy)
-            stack.callback(subprocess.run, ["umount", "--lazy", self.root], capture_output=True)
+            stack.callback(lambda: subprocess.run(["umount", "--lazy", self.root], capture_output=True))
             self._enter_cgroup = stack.enter_context(in_cgroup(self.machine))
             self._configure()
             self._stack = stack.pop_all()
@@ -179,12 +180,13 @@ def _lend_registries(etc: Path) -> None:
         raise EmulationError(f"this machine's apt sources have no Debian {codename}, whose packages the Pi installs")
     (etc / "apt/sources.list").write_text("".join(f"deb {line}\n" for line in sources))
     settings = [x for x in _run("apt-config", "dump").splitlines() if x.startswith(("Acquire::http", "Acquire::https"))]
-    settings += [f'Acquire::{k}::Proxy "{v}";' for k in ("http", "https") if (v := _proxy(k))]
+    proxies = getproxies()
+    settings += [f'Acquire::{kind}::Proxy "{proxies[kind]}";' for kind in ("http", "https") if kind in proxies]
     (etc / "apt/apt.conf.d/90emulated").write_text("\n".join([*settings, 'Acquire::Languages "none";\n']))
     if CERTIFICATES.exists():
         shutil.copy(CERTIFICATES, etc / CERTIFICATES.relative_to("/etc"))
     config = _run(sys.executable, "-m", "pip", "config", "list")
-    (etc / "pip.conf").write_text(pip_settings(config, _proxy("https")))
+    (etc / "pip.conf").write_text(pip_settings(config, proxies.get("https", "")))
 
 
 def _run(*command: object) -> str:
@@ -204,7 +206,3 @@ def pip_settings(config: str, proxy: str = "") -> str:
             there = [word for word in str(ast.literal_eval(value)).split() if not word.startswith(("file:", "/"))]
             found[name] = " ".join(there)
     return "[global]\n" + "".join(f"{k} = {v}\n" for k, v in found.items() if v)
-
-
-def _proxy(scheme: str) -> str:
-    return os.environ.get(f"{scheme}_proxy") or os.environ.get(f"{scheme.upper()}_PROXY") or ""

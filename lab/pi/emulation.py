@@ -63,7 +63,7 @@ def emulation() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if not (BINFMT / "register").exists():
             run("mount", "-t", "binfmt_misc", "binfmt_misc", BINFMT, error=EmulationError, remedy=RIGHTS)
-            stack.callback(subprocess.run, ["umount", BINFMT], capture_output=True)
+            stack.callback(lambda: subprocess.run(["umount", BINFMT], capture_output=True))
         ours = BINFMT / BINFMT_NAME
         if not ours.exists():
             try:

@@ -187,8 +187,8 @@ class Releases:
             release = self.releases / artifact.content_hash
             if release.exists() and not self.wrong_with(release.name):
                 return Staged(release.name, False)
-            origin = printable(origin or f"{socket.gethostname()}:{source.absolute()}")
-            about = {"schema": 1, "name": release.name, "sha256": arrived, "origin": origin}
+            where = printable(origin or f"{socket.gethostname()}:{source.absolute()}")
+            about = {"schema": 1, "name": release.name, "sha256": arrived, "origin": where}
             (new / ORIGIN).write_text(json.dumps(about | {"mode": artifact.manifest["mode"]}, indent=1) + "\n")
             _let_service_read(new)
             if release.exists():
