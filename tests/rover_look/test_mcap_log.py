@@ -104,7 +104,7 @@ def test_a_drive_without_pictures_is_one_too_and_named_ones_must_be_there(tmp_pa
     flight.header.clear()
     with pytest.raises(LogError, match="when it began is not known"):
         write_mcap(tmp_path / "other.mcap", flight)
-    assert not (tmp_path / "other.mcap").exists() and not list(tmp_path.glob(".*"))
+    assert not (tmp_path / "other.mcap").exists() and not list(tmp_path.glob(".other*"))
 
 
 def test_the_command(tmp_path):
