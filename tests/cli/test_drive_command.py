@@ -1,6 +1,5 @@
 """`rover drive` whole, as a user calls it: a car of its own process, a camera, a serial line, exit codes, files."""
 
-import contextlib
 import json
 import signal
 import subprocess
@@ -19,7 +18,6 @@ from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import read_log
-from rover_lib.onboard.recording.episode import read_controls
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 pytestmark = pytest.mark.slow
@@ -56,40 +54,25 @@ def world_drive(demo_run, tmp_path_factory):
     return drive()
 
 
-def test_a_drive_leaves_its_report(world_drive):
-    report = json.loads((world_drive[0] / "drive.json").read_text())
+def test_a_drive_leaves_its_report_its_log_and_an_episode(world_drive):
+    folder, said = world_drive
+    report = json.loads((folder / "drive.json").read_text())
     assert (report["ticks"], report["ended"]) == (60, "60 ticks")
-    assert {"missed", "jitter_p50_ms", "jitter_p99_ms", "jitter_max_ms", "plan_age_p95_ms", "hits", "trials"} <= set(
-        report
-    )
-    assert 50 <= report["latency_p50_ms"] < 150
-    assert report["memory_mb"] > 50
-
-
-def test_a_drive_leaves_its_log(world_drive):
-    flight = read_log(world_drive[0] / "flight.log")
-    assert len(flight.ticks["t_s"]) == 60
-    assert set(flight.ticks["state"]) == {"A"}
-    assert any(e.text == "armed" for e in flight.events)
-    assert any("neutral: stopped" in e.text for e in flight.events)
-    assert "armed" in world_drive[1]
-
-
-def test_a_recorded_drive_is_an_episode(world_drive):
-    recordings = load_recordings(world_drive[0] / "episodes")
-    (episode,) = recordings.episodes
-    assert len(episode.samples) > 30
-    controls = read_controls(next((world_drive[0] / "episodes").iterdir()))
-    assert len(controls.times_s) == 60
-    data = json.loads(next((world_drive[0] / "episodes").glob("*/episode_data.json")).read_text())
-    assert {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
-    assert {row["driver"] for row in data["control_samples"]} == {s.driver for s in episode.samples} == {"policy"}
+    assert {"missed", "jitter_p99_ms", "plan_age_p95_ms", "hits", "trials"} <= set(report)
+    assert 50 <= report["latency_p50_ms"] < 150 and report["memory_mb"] > 50
+    flight = read_log(folder / "flight.log")
+    assert len(flight.ticks["t_s"]) == 60 and set(flight.ticks["state"]) == {"A"}
+    texts = [e.text for e in flight.events]
+    assert "armed" in texts and any("neutral: stopped" in text for text in texts) and "armed" in said
+    (episode,) = load_recordings(folder / "episodes").episodes
+    assert len(episode.samples) > 30 and {s.driver for s in episode.samples} == {"policy"}
+    data = json.loads(next((folder / "episodes").glob("*/episode_data.json")).read_text())
+    assert len(data["control_samples"]) == 60 and {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
     assert "takeover" not in data["metadata"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 @real_time
-def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
+def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number=signal.SIGINT):
     folder = fresh(tmp_path)
     options = ["--world", "--log", folder / "flight.log", "--json", folder / "drive"]
     command = [*ROVER, str(demo_run / "policy_static.pt"), *map(str, options)]
@@ -105,49 +88,35 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number):
     assert json.loads((folder / "drive").read_text())["ended"] == "told to stop"
 
 
-@contextlib.contextmanager
-def watched(demo_run, folder):
-    """A drive of 300 ticks in the world, its view's server, and an open page that shows it."""
+@real_time
+def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
     pytest.importorskip("aiohttp", reason="needs the extra view")
     from view_page import Page, ViewServer
 
+    folder = fresh(tmp_path)
     options = ["--world", "--ticks", "300", "--view", folder / "view", "--log", folder / "flight.log"]
-    options += ["--json", folder / "drive"]
+    command = [*ROVER, demo_run / "policy_static.pt", *options, "--json", folder / "drive"]
     with ViewServer(folder / "view") as server, Page(server.url) as page:
-        command = [*ROVER, str(demo_run / "policy_static.pt"), *map(str, options)]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True) as process:
             try:
-                until(lambda: page.newest["phase"] == "driving", 120)
-                yield server, page, process
+                until(lambda: sum(m["phase"] == "driving" for m in page.messages) > 20, 120)
+                page.stop()
+                until(lambda: page.newest["phase"] == "ended")
+                _, stderr = process.communicate(timeout=60)
+                assert process.returncode == 0, stderr
             finally:
                 process.kill()
-
-
-def ending(process, folder):
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 0, stderr
-    return json.loads((folder / "drive").read_text())
-
-
-@real_time
-def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
-    folder = fresh(tmp_path)
-    with watched(demo_run, folder) as (_, page, process):
-        until(lambda: len(page.messages) > 20)
-        page.stop()
-        until(lambda: page.newest["phase"] == "ended")
         assert page.newest["stopped"] and page.newest["pins"][1] == 120
-        assert ending(process, folder)["ended"] == page.newest["text"] == "stopped from the view (127.0.0.1)"
+        ended = json.loads((folder / "drive").read_text())["ended"]
+        assert ended == page.newest["text"] == "stopped from the view (127.0.0.1)"
     flight = read_log(folder / "flight.log")
-    assert "ended: stopped from the view (127.0.0.1)" in [e.text for e in flight.events]
     shown = [m for m in page.messages if m["phase"] == "driving"]
-    assert len(shown) > 15 and all(m["jpeg_bytes"] > 1000 and m["size"] == [640, 360] for m in shown)
+    assert all(m["jpeg_bytes"] > 1000 and m["size"] == [640, 360] for m in shown)
     for message in shown:
         row = int(np.argmin(np.abs(flight.ticks["t_s"] - message["tick"]["t_s"])))
         assert flight.ticks["t_s"][row] == pytest.approx(message["tick"]["t_s"], abs=1e-3)
         for name in ("steering_us", "throttle_us", "pins_steering_us", "pins_throttle_us", "plan", "frame"):
             assert message["tick"][name] == flight.ticks[name][row]
-        assert message["pins"] == [message["tick"]["pins_steering_us"], message["tick"]["pins_throttle_us"]]
 
 
 @real_time
@@ -159,6 +128,8 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
         options = ["--film", "--camera", folder / "short.mjpeg", "--port", car.port]
         options += ["--log", folder / "l", "--json", folder / "j"]
         done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+        with ServoLink(car.port) as link:  # the car stands after it
+            until(lambda: link.latest() and link.latest().throttle_us == 120)
     assert done.returncode == 3, done.stderr
     assert "is the camera unplugged?" in done.stderr
     assert "Traceback" not in done.stderr
@@ -167,17 +138,7 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
 
 def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
     (tmp_path / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
-    options = [
-        "--camera",
-        tmp_path / "drive.mjpeg",
-        "--dry-run",
-        "--ticks",
-        "30",
-        "--log",
-        tmp_path / "l",
-        "--json",
-        "-",
-    ]
+    options = ["--camera", tmp_path / "drive.mjpeg", "--dry-run", "--ticks", 30, "--log", tmp_path / "l", "--json", "-"]
     done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["ticks"] == 30
@@ -202,17 +163,3 @@ def test_what_cannot_begin(options, code, message, artifact, tmp_path):
     assert result.exit_code == code
     assert message in result.output
     assert "Traceback" not in result.output
-
-
-@real_time
-def test_the_car_stands_after_it(artifact, tmp_path):
-    folder = fresh(tmp_path)
-    with VirtualCar() as car:
-        (folder / "drive.mjpeg").write_bytes(b"".join(pictures(0) * 50))
-        options = ["--film", "--camera", folder / "drive.mjpeg", "--port", car.port, "--ticks", "20"]
-        options += ["--log", folder / "l"]
-        done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        with ServoLink(car.port) as link:
-            time.sleep(0.1)
-            assert link.latest().throttle_us == 120

@@ -79,10 +79,11 @@ def drive_car(
         if sentence := another_car(policy.manifest, this_car()):
             log.event(sentence, level=logging.WARNING)
         commanded = Commanded()
-        slow = {"rest_s": REST_S, "latency_s": options.latency_ms / 1e3}
-        planner = stack.enter_context(
-            Planner(camera, policy.predict, commanded, policy.rate_hz, limits=this_car().limits, **slow)
-        )
+        planner = Planner(
+            camera, policy.predict, commanded, policy.rate_hz,
+            rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits,
+        )  # fmt: skip
+        stack.enter_context(planner)
         opened = _Opened(options, settings, report, log, service, feed, link, camera, policy, planner, commanded)
         opened.drive(stop)
         while service and not stop.is_set():
@@ -123,8 +124,9 @@ class _Opened:
             report.clear()
 
             def arm() -> Telemetry | None:
-                asked = {"service": service, "said": said, "terminal": sys.stdin.isatty()}
-                telemetry = arm_when_asked(arming.arm, link, stop, log.event, checks, **asked)
+                telemetry = arm_when_asked(
+                    arming.arm, link, stop, log.event, checks, service=service, said=said, terminal=sys.stdin.isatty()
+                )
                 self.camera.begin()  # a film must start with the loop, not while arming waits
                 return telemetry
 

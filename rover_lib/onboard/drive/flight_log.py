@@ -302,14 +302,9 @@ class Flight:
 
     @property
     def period_ms(self) -> float | None:
-        """Time between two ticks by the header's hz, or else the median time between the ticks.
-
-        None if the header has no hz and there are fewer than two ticks.
-        """
+        """Time between two ticks, by the header's hz; None if it has none."""
         hz = self.header.get("drive", {}).get("hz")
-        if isinstance(hz, (int, float)) and hz > 0:
-            return 1000 / hz
-        return float(np.median(np.diff(self.ticks["t_s"])) * 1000) if len(self.ticks["t_s"]) > 1 else None
+        return 1000 / hz if is_number(hz) and hz > 0 else None
 
     @property
     def car(self) -> Car:

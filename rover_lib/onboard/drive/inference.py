@@ -162,7 +162,8 @@ class PolicyProcess:
 
     The artifact is not trusted. So the process is confined (see confine.py), and nothing that it sends is unpickled:
     its answers are accepted only if they have the shape that the manifest gives, which is read in this process.
-    unconfined: why the kernel cannot confine the process, "" if it does.
+    unconfined: why the kernel cannot confine the process, "" if it does. chunk: number of actions in a plan, of which
+    there are rate_hz per second.
     """
 
     loaded: Callable[[Any], None] | None = None  # called with the loaded policy; the laboratory makes it misbehave
@@ -172,7 +173,7 @@ class PolicyProcess:
         self.artifact = artifact.path if isinstance(artifact, Artifact) else Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
-        self.unconfined = ""
+        self.rate_hz, self.chunk, self.unconfined = 0.0, 0, ""
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
         self._closing = threading.Event()
@@ -183,6 +184,7 @@ class PolicyProcess:
             self.manifest = given.manifest if isinstance(given, Artifact) else read_manifest(given)
         except ArtifactError as error:
             raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
+        self.rate_hz, self.chunk = float(self.manifest["rate_hz"]), int(self.manifest["chunk"])
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
         arguments = theirs, str(self.artifact), self.threads, type(self).loaded
@@ -210,16 +212,6 @@ class PolicyProcess:
             self._process.join()
         if self._pipe:
             self._pipe.close()
-
-    @property
-    def rate_hz(self) -> float:
-        """Actions per second of a chunk."""
-        return float(self.manifest["rate_hz"])
-
-    @property
-    def chunk(self) -> int:
-        """Number of actions in a plan."""
-        return int(self.manifest["chunk"])
 
     @property
     def pids(self) -> tuple[int, ...]:

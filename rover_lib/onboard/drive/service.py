@@ -16,9 +16,6 @@ again, disarmed.
 A drive ends after the service's --max-seconds, or earlier if the request says so. A request from another machine also
 promises heartbeats: if no `rover arm-car --heartbeat` comes within the time that the request gives, the drive ends.
 
-While disarmed, nothing has to be fast: the service has ordinary priority and one plan per second. Before the Arduino is
-asked to arm, it switches to real-time priority and full rate, and the car starts with a fresh plan.
-
 The service's status text (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts the
 service only while this is "disarmed".
 
@@ -136,11 +133,10 @@ class Service:
 
     def __enter__(self) -> "Service":
         path = _socket_path()
+        if is_listened_at(path):  # if we took its socket, nobody could arm its car or send it heartbeats
+            raise ServiceError(f"{path}: another service listens there", remedy="end that one first")
         self._operators = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            if is_listened_at(path):  # if we took its socket, nobody could arm its car or send it heartbeats
-                self._operators.close()
-                raise ServiceError(f"{path}: another service listens there", remedy="end that one first")
             path.unlink(missing_ok=True)
             self._operators.bind(str(path))
             path.chmod(0o600)
@@ -246,10 +242,8 @@ class Service:
                 connection, _ = self._operators.accept()
             except TimeoutError:
                 continue
-            with (
-                connection,
-                contextlib.suppress(OSError, ValueError, TypeError, OverflowError, RecursionError),
-            ):  # nonsense gets no answer
+            nonsense = OSError, ValueError, TypeError, OverflowError, RecursionError
+            with connection, contextlib.suppress(*nonsense):  # it gets no answer
                 connection.settimeout(1.0)
                 _, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
                 if uid == 0 or uid == os.geteuid() >= PERSONS:
@@ -323,17 +317,12 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
     Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises ServiceError
     if there is no systemd.
     """
-    names = ("LoadState", "ActiveState", "StatusText", "ActiveEnterTimestamp", "NRestarts", "Result", "UnitFileState")
+    names = "LoadState,ActiveState,StatusText,ActiveEnterTimestamp,NRestarts,Result,UnitFileState"
+    command = ["systemctl", "show", f"--property={names}", unit]
     try:
-        result = subprocess.run(
-            ["systemctl", "show", f"--property={','.join(names)}", unit], capture_output=True, text=True, timeout=30
-        )
+        result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError) as error:
         raise ServiceError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
-    if result.returncode:
-        raise ServiceError(
-            f"systemctl does not know about {unit}: {' '.join(result.stderr.split())}", remedy="is this a rover?"
-        )
     properties = dict(line.partition("=")[::2] for line in result.stdout.splitlines())
     text = properties.get("StatusText", "")
     return {

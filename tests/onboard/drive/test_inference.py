@@ -67,25 +67,21 @@ def test_plans_follow_the_frames():
     assert [0.25, 0.5] in states
 
 
+def raising(frame, state):
+    raise ZeroDivisionError("by zero")
+
+
 @pytest.mark.parametrize(
-    ("chunk", "match"),
+    ("predict", "match"),
     [
-        (np.full((8, 2), np.nan, np.float32), "not finite"),
-        (np.full((8, 2), 3.0, np.float32), "outside the range"),
-        (np.zeros((8, 3), np.float32), "must be"),
+        (lambda *_: np.full((8, 2), np.nan, np.float32), "not finite"),
+        (lambda *_: np.full((8, 2), 3.0, np.float32), "outside the range"),
+        (raising, "ZeroDivisionError: by zero"),
     ],
 )
-def test_a_chunk_that_must_not_drive(chunk, match):
-    with Planner(Frames(), lambda frame, state: chunk, Commanded(), 30.0) as planner:
-        until_raises(planner, PolicyError, match)
-
-
-def test_what_the_policy_raises():
-    def predict(frame, state):
-        raise ZeroDivisionError("by zero")
-
+def test_what_must_not_drive_is_raised(predict, match):
     with Planner(Frames(), predict, Commanded(), 30.0) as planner:
-        until_raises(planner, PolicyError, "ZeroDivisionError: by zero")
+        until_raises(planner, PolicyError, match)
 
 
 def test_what_the_camera_raises():
@@ -93,25 +89,14 @@ def test_what_the_camera_raises():
         until_raises(planner, CameraError, "unplugged")
 
 
-def counted_plans(planner, seconds):
-    before = planner.newest().number
-    time.sleep(seconds)
-    return planner.newest().number - before
-
-
 def test_it_rests_unless_somebody_is_in_a_hurry():
-    with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=0.2) as planner:
-        planner.wait(2.0)
-        assert 1 <= counted_plans(planner, 0.7) <= 4
-        with planner.without_rest():
-            assert counted_plans(planner, 0.5) > 20
-        assert counted_plans(planner, 0.7) <= 5
-
-
-def test_closing_ends_its_rest(monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.drive.inference.END_S", 5.0)  # of waiting for it
     with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=20.0) as planner:
-        planner.wait(2.0)
+        assert planner.wait(2.0).number == 1
+        time.sleep(0.1)
+        assert planner.newest().number == 1
+        with planner.without_rest():
+            assert planner.wait(2.0, after=10).number > 10
+    planner._thread.join(5)  # closing ends its rest
     assert not planner._thread.is_alive()
 
 
@@ -139,7 +124,7 @@ def test_a_policy_that_has_no_fresh_plan(monkeypatch):
     with Planner(Frames(), predict, Commanded(), 30.0, rest_s=10.0) as planner:
         planner.wait(2.0)
         with planner.without_rest():
-            with pytest.raises(PolicyError, match=r"no fresh plan within 0\.1 s; is this machine too busy"):
+            with pytest.raises(PolicyError, match="no fresh plan"):
                 planner.renew(0.0)
             time.sleep(0.5)
             with pytest.raises(PolicyError, match="too late"):
@@ -184,7 +169,7 @@ def test_every_thread_of_the_process_is_confined(process):
     assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
 
 
-@pytest.mark.parametrize("answer", [b"", bytes(7), bytes(8 * 33), bytes(1000)])
+@pytest.mark.parametrize("answer", [b"", bytes(7), bytes(8 * 33)])
 def test_an_answer_of_another_size_is_no_plan(process, monkeypatch, answer):
     monkeypatch.setattr(process, "_answer", lambda timeout_s: answer)
     with pytest.raises(PolicyError, match="size of a plan"):
@@ -207,8 +192,20 @@ def test_an_artifact_that_cannot_be_used(tmp_path, artifacts):
         pass
 
 
+def bad_loader(policy):
+    raise OSError("no such library")
+
+
+def test_what_fails_while_it_is_loaded_is_a_sentence(artifacts, monkeypatch):
+    monkeypatch.setattr(PolicyProcess, "loaded", staticmethod(bad_loader))
+    with pytest.raises(PolicyError, match=r"cannot be loaded \(OSError: no such library\)"):
+        PolicyProcess(artifacts["static"], threads=1).__enter__()
+
+
 def test_a_process_that_is_killed(artifacts):
     with PolicyProcess(artifacts["static"], threads=1) as process:
+        os.kill(*process.pids, signal.SIGINT)  # a terminal's Ctrl-C is not for it
+        assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
         os.kill(*process.pids, signal.SIGKILL)
         with pytest.raises(PolicyError, match="SIGKILL"):
             for _ in range(100):

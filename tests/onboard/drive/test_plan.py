@@ -37,19 +37,14 @@ def test_a_plan_is_used_by_time():
     command = f.command(10.15)  # 4.5 steps after the frame that it looked at
     assert command.steering == pytest.approx(0.045)
     assert command.age_s == pytest.approx(0.15)
-    assert f.command(10.2).steering == pytest.approx(0.06)
-
-
-def test_without_compensation_it_begins_when_it_is_ready():
-    f = follower(compensate=False)
+    f = follower(compensate=False)  # then it begins when it is ready
     f.add(Plan(1, 10.0, 10.15, ramp()), 10.15)
     assert f.command(10.15).steering == pytest.approx(0.0)
 
 
 def test_before_its_first_and_after_its_last_action_it_is_that_one():
     plan = Plan(1, 0.0, 0.0, ramp())
-    assert plan.at(-3)[0] == 0.0
-    assert plan.at(math.inf)[0] == pytest.approx(0.31)
+    assert (plan.at(-3)[0], plan.at(math.inf)[0]) == (0.0, pytest.approx(0.31))
     assert Plan(1, 0.0, 0.0, ramp(chunk=1)).at(5)[0] == 0.0
 
 
@@ -78,12 +73,6 @@ def test_the_throttle_fades_with_the_plans_age():
     assert f.command(0.75).steering == pytest.approx(0.225)  # steering does not fade
 
 
-def test_fade_can_be_switched_off():
-    f = follower(fade_s=0.9, stop_s=0.9)
-    f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
-    assert f.command(0.89).throttle == pytest.approx(0.05)
-
-
 def test_the_throttles_limit():
     f = follower(throttle_limit=0.03)
     f.add(Plan(1, 0.0, 0.0, ramp()), 0.0)
@@ -104,16 +93,6 @@ def test_a_fresh_plan_takes_over_in_steps():
     f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
     found = [f.command(0.1 + i * STEP).steering for i in range(5)]
     assert found == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
-
-
-def test_a_plan_that_comes_while_another_takes_over():
-    f = follower(blend_ticks=3)
-    f.add(Plan(1, 0.0, 0.0, ramp(0.0, 0.0)), 0.0)
-    f.command(0.0)
-    f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
-    before = f.command(0.1).steering  # 0.1, on its way to 0.4
-    f.add(Plan(3, 0.1 + STEP, 0.1 + STEP, ramp(0.4, 0.0)), 0.1 + STEP)
-    assert before < f.command(0.1 + STEP).steering < 0.4
 
 
 @given(
@@ -160,11 +139,9 @@ def test_ensembling_is_lerobots(coefficient):
     [
         np.full((4, 2), np.nan),
         np.array([[0.0, np.inf]]),
-        np.array([[0.0, 5.0]]),
         np.array([[-1.3, 0.0]]),
         np.array([[0.0, -0.3]]),
         np.zeros((4, 3)),
-        np.zeros(4),
         np.zeros((0, 2)),
     ],
 )
@@ -207,17 +184,12 @@ def test_settings_of_params():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"fade_s": 2.0},
         {"stop_s": math.nan},
         {"fade_s": True},
         {"blend_ticks": 1.5},
-        {"blend_ticks": -1},
         {"throttle_limit": 1.1},
         {"frozen_frames": 1},
-        {"ensemble": "a"},
-        {"ensemble": True},
         {"ensemble": -20.0},  # whose weights overflow
-        {"fade_s": 10**400},
         {"compensate": "false"},
         {"speed": 1},
     ],

@@ -32,7 +32,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import service as s
-from rover_lib.onboard.drive.arming import Arming, arm_capped, arm_when_ready
+from rover_lib.onboard.drive.arming import Arming, arm_capped, arm_when_asked, arm_when_ready
 from rover_lib.onboard.drive.drive import drive_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
@@ -42,6 +42,7 @@ from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.recording.episode import read_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
+REQUEST_S = s.REQUEST_S
 
 
 class Systemd:
@@ -58,22 +59,22 @@ class Systemd:
         end, new = time.monotonic() + seconds, []
         while True:
             try:
-                new += self.socket.recv(4096).decode().split("\n")
+                new += [line for line in self.socket.recv(4096).decode().split("\n") if line]
             except TimeoutError:
                 if time.monotonic() >= end:
                     break
-        new = [line for line in new if line]
         self.lines += new
         return new
 
     def hear_until(self, text: str) -> None:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 90
         while not any(text in line for line in self.lines):
             assert time.monotonic() < end, self.lines
             self.hear(0.05)
 
-
-REQUEST_S = s.REQUEST_S
+    def feeds(self, seconds: float) -> int:
+        """How often the watchdog is fed within so long."""
+        return self.hear(seconds).count("WATCHDOG=1")
 
 
 @pytest.fixture
@@ -84,7 +85,7 @@ def systemd(tmp_path, monkeypatch):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
 
     def give_up(*_) -> None:
-        pytest.fail("the service still waits for a human after four minutes: has what asks for the car failed?")
+        pytest.fail("the service still waits for a human: has what asks for the car failed?")
 
     before = signal.signal(signal.SIGALRM, give_up)
     signal.alarm(120)
@@ -95,31 +96,33 @@ def systemd(tmp_path, monkeypatch):
 
 
 def served(stop=None, said=None, report=None, **more) -> s.Service:
-    return s.Service(
-        report or Report(), stop or threading.Event(), (said if said is not None else []).append, model="ab12", **more
-    )
+    notify = (said if said is not None else []).append
+    return s.Service(report or Report(), stop or threading.Event(), notify, model="ab12", **more)
 
 
-def beside(systemd: Systemd, *actions) -> threading.Thread:
-    """Does things once the service says that it is ready, beside the test."""
+@contextlib.contextmanager
+def beside(systemd: Systemd, *actions):
+    """Do things once the service says that it is ready, beside the test; yields what they returned."""
+    returned = []
 
     def run() -> None:
         systemd.hear_until("READY=1")
         for action in actions:
-            action()
+            returned.append(action())
 
     thread = threading.Thread(target=run)
     thread.start()
-    return thread
+    yield returned
+    thread.join()
 
 
-def waits_unarmed(systemd: Systemd, stop: threading.Event, action) -> None:
-    """A service that nothing arms while the action runs beside it, which sets stop at its end."""
-    with served(stop) as service:
-        thread = beside(systemd, action)
-        with pytest.raises(s.NotArmed):
-            service.wait_for_human(lambda: pytest.fail("armed"))
-        thread.join()
+def waits_unarmed(systemd: Systemd, action, arm=lambda: pytest.fail("armed"), **more) -> list:
+    """A service that nothing arms while the action runs beside it; returns what that returned."""
+    stop = threading.Event()
+    refused = pytest.raises(s.NotArmed, match="told to stop")
+    with served(stop, **more) as service, beside(systemd, action, stop.set) as returned, refused:
+        service.wait_for_human(lambda: arm(service) if more else arm())
+    return returned
 
 
 def human(**limits) -> str:
@@ -134,14 +137,18 @@ def armed() -> str:
     return "telemetry"
 
 
+def ask_to_arm(**more) -> dict:
+    """Ask as `rover arm-car` does, with a good ticket."""
+    return s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": s.ask_service(ask="state")["ticket"], **more})
+
+
 def test_ready_and_disarmed_until_a_human_arms(systemd, tmp_path):
-    calls, answers = [], []
+    calls = []
     with served() as service:
         assert stat.S_IMODE((tmp_path / "operators").stat().st_mode) == 0o600
         assert "it is not ready" in human()  # who asked now could not know what the car would do
-        thread = beside(systemd, lambda: answers.append(human()))
-        assert service.wait_for_human(lambda: calls.append("now") or "telemetry") == "telemetry"
-        thread.join()
+        with beside(systemd, human) as answers:
+            assert service.wait_for_human(lambda: calls.append("now") or "telemetry") == "telemetry"
     systemd.hear()
     assert calls == ["now"] and answers == ["driving: armed by a human"]
     ready = systemd.lines.index("READY=1")
@@ -151,114 +158,78 @@ def test_ready_and_disarmed_until_a_human_arms(systemd, tmp_path):
 
 
 def test_an_arduino_that_refuses_leaves_it_waiting(systemd):
-    arduino = [LinkError("no transmitter; switch it on"), "telemetry"]
+    refusals, said = [LinkError("no transmitter")], []
 
     def arm():
-        answer = arduino.pop(0)
-        if isinstance(answer, LinkError):
-            raise answer
-        return answer
+        if refusals:
+            raise refusals.pop()
+        return "telemetry"
 
-    said, answers = [], []
-    with served(said=said) as service:
-        thread = beside(systemd, lambda: answers.append(human()), lambda: answers.append(human()))
+    with served(said=said) as service, beside(systemd, human, human) as answers:
         assert service.wait_for_human(arm) == "telemetry"
-        thread.join()
-        systemd.hear()
-    assert "STATUS=disarmed: not armed: no transmitter; switch it on; waiting for a human to arm it" in systemd.lines
-    assert said == ["not armed: no transmitter; switch it on"]
-    assert "did not arm: no transmitter; switch it on" in answers[0] and answers[1] == "driving: armed by a human"
+    systemd.hear()
+    assert "STATUS=disarmed: not armed: no transmitter; waiting for a human to arm it" in systemd.lines
+    assert said == ["not armed: no transmitter"]
+    assert "did not arm: no transmitter" in answers[0] and answers[1] == "driving: armed by a human"
 
 
 @pytest.mark.slow
 def test_one_request_is_one_attempt(systemd):
     """Two at once, of which the first is refused: the second must not arm the car half a second later."""
-    stop, calls, answers = threading.Event(), [], []
+    calls, answers = [], []
 
     def arm():
         calls.append(1)
-        second = threading.Thread(target=lambda: answers.append(s.ask_service(**asked)))
-        second.start()
+        threading.Thread(target=lambda: answers.append(s.ask_service(**asked))).start()
         time.sleep(0.2)
         if len(calls) == 1:
             raise LinkError("not yet")
-        return "telemetry"
 
     asked = {"ask": "arm", "model": "ab12"}
-    with served(stop) as service:
 
-        def twice() -> None:
-            asked["ticket"] = s.ask_service(ask="state")["ticket"]
-            answers.append(s.ask_service(**asked))
-            time.sleep(0.5)
-            stop.set()
+    def twice() -> None:
+        asked["ticket"] = s.ask_service(ask="state")["ticket"]
+        answers.append(s.ask_service(**asked))
+        time.sleep(0.5)
 
-        thread = beside(systemd, twice)
-        with pytest.raises(s.NotArmed):
-            service.wait_for_human(arm)
-        thread.join()
-    assert len(calls) == 1
-    assert [answer["armed"] for answer in answers] == [False, False]
-    assert any("ask anew" in answer["text"] or "not ready" in answer["text"] for answer in answers)
+    waits_unarmed(systemd, twice, arm)
+    assert len(calls) == 1 and [answer["armed"] for answer in answers] == [False, False]
 
 
 def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
     """Such a request would arm it again as soon as that drive ends."""
-    asked = []
-
-    def ask() -> None:
-        ticket = s.ask_service(ask="state")["ticket"]
-        asked.append(s.ask_service(ask="arm", model="ab12", ticket=ticket)["armed"])
-
     with served() as service:
-        thread = beside(systemd, ask)
-        assert service.wait_for_human(armed) == "telemetry"
-        thread.join()
-        assert asked == [True] and s.ask_service(ask="state")["ticket"] == ""
+        with beside(systemd, ask_to_arm) as asked:
+            assert service.wait_for_human(armed) == "telemetry"
+        assert asked[0]["armed"] and s.ask_service(ask="state")["ticket"] == ""
 
 
 @pytest.mark.parametrize("old", [{"asked_s": -1e9}, {"asked_s": math.nan}, {}])
 def test_an_operator_who_asked_long_ago_is_asked_again(systemd, monkeypatch, old):
     """The camera was slow, or this process was stopped: the car must not set off when nobody expects it any more."""
     monkeypatch.setattr(s, "REQUEST_S", REQUEST_S)
-    stop, calls, answers, now = threading.Event(), [], [], [100.0]
+    calls, now = [], [100.0]
 
-    def arm():
+    def arm(service):
         if not old:
             now[0] += s.REQUEST_S + 0.1  # arming itself takes too long
         service.check_request()
         calls.append(1)
 
-    def ask() -> None:
-        ticket = s.ask_service(ask="state")["ticket"]
-        answers.append(s.ask_service(ask="arm", model="ab12", ticket=ticket, **old))
-        stop.set()
-
-    with served(stop, clock=lambda: now[0]) as service:
-        thread = beside(systemd, ask)
-        with pytest.raises(s.NotArmed, match="told to stop"):
-            service.wait_for_human(arm)
-        thread.join()
-    assert not calls and not answers[0]["armed"]
-    assert "have passed since the car was asked for, at most 2 may; ask again" in answers[0]["text"]
+    answer, _ = waits_unarmed(systemd, lambda: ask_to_arm(**old), arm, clock=lambda: now[0])
+    assert not calls and not answer["armed"] and "ask again" in answer["text"]
 
 
 def test_a_request_names_the_model_that_it_arms(systemd):
     """Another operator deployed in between, and the service was started again."""
-    stop, answers = threading.Event(), []
 
-    def operator() -> None:
-        with pytest.raises(s.ServiceError, match=r"has loaded another model than cd34, found ab12; did somebody"):
+    def operator() -> list:
+        with pytest.raises(s.ServiceError, match="another model than cd34"):
             s.arm_car(s.Request(), model="cd34")
-        with pytest.raises(ZeroDivisionError):  # the second copy of a release that was damaged is that model too
-            s.arm_car(s.Request(), model="ab12-2", confirm=lambda state: 1 / 0)
-        state = s.ask_service(ask="state")
-        for wrong in ({"model": "cd34"}, {"ticket": "of the start before"}, {"ticket": ""}):
-            answers.append(s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": state["ticket"], **wrong}))
-        stop.set()
+        return [ask_to_arm(**wrong)["armed"] for wrong in ({"model": "cd34"}, {"ticket": "old"}, {"ticket": ""})]
 
-    waits_unarmed(systemd, stop, operator)
-    assert len(answers) == 3 and not any(answer["armed"] for answer in answers)
+    answers, _ = waits_unarmed(systemd, operator)
+    assert answers == [False] * 3
 
 
 @pytest.mark.parametrize(
@@ -266,158 +237,126 @@ def test_a_request_names_the_model_that_it_arms(systemd):
     [b"", b"[]", b'{"ask": "arm", "seconds": 7}', b'{"ask": "arm", "max_seconds": NaN}', b"\xff", b"[" * 4000],
 )
 def test_nonsense_arms_nothing(systemd, tmp_path, nonsense):
-    stop = threading.Event()
-
-    def talk() -> None:
+    def talk() -> str:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
             connection.connect(str(tmp_path / "operators"))
             connection.send(nonsense)
-        assert s.ask_service(ask="state")["text"] == "disarmed: waiting for a human to arm it"  # it still answers
-        stop.set()
+        return s.ask_service(ask="state")["text"]  # it still answers
 
-    waits_unarmed(systemd, stop, talk)
+    assert waits_unarmed(systemd, talk)[0] == "disarmed: waiting for a human to arm it"
 
 
 @pytest.mark.parametrize("limits", [{"max_seconds": -1}, {"asked_s": 10**400}, {"asked_s": "soon"}], ids=range(3))
 def test_a_request_with_a_number_that_is_none_is_no_attempt(systemd, limits):
     """All else in it is right: the model, and the ticket, which stays good."""
-    stop = threading.Event()
 
     def operator() -> None:
         state = s.ask_service(ask="state")
-        with pytest.raises(s.ServiceError, match="gave no answer"):
-            s.ask_service(ask="arm", model=state["model"], ticket=state["ticket"], **limits)
+        with pytest.raises(s.ServiceError, match="no answer"):
+            ask_to_arm(**limits)
         assert s.ask_service(ask="state") == state
-        stop.set()
 
-    waits_unarmed(systemd, stop, operator)
+    waits_unarmed(systemd, operator)
 
 
-def test_a_second_service_leaves_the_first_its_operators(systemd):
+def test_a_second_service_leaves_the_first_its_operators(systemd, monkeypatch):
     with served() as first:
-        with pytest.raises(s.ServiceError, match="another service listens there; end that one first"), served():
+        with pytest.raises(s.ServiceError, match="another service"), served():
             pass
-        thread = beside(systemd, human)
-        assert first.wait_for_human(armed) == "telemetry"
-        thread.join()
+        with beside(systemd, human):
+            assert first.wait_for_human(armed) == "telemetry"
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/nowhere")
+    with pytest.raises(s.ServiceError, match="/nowhere/operators"), served():
+        pass
 
 
 def test_says_what_is_missing_and_refuses_until_then(systemd):
-    missing, answers, told = ["switch the transmitter on"], [], []
+    missing, told = ["switch the transmitter on"], []
 
-    def operator() -> None:
+    def operator() -> str:
         systemd.hear_until("STATUS=disarmed: switch the transmitter on")
-        answers.append(human())
-        missing[0] = ""
-        systemd.hear_until("STATUS=disarmed: not armed: switch the transmitter on; waiting")
+        assert "did not arm: switch the transmitter on" in human()
         missing[0] = "wiggle the stick"
         with pytest.raises(s.ServiceError, match="did not arm: wiggle the stick"):
-            s.arm_car(s.Request(), wait_s=0.3)
-        threading.Timer(0.3, missing.__setitem__, (0, "")).start()
-        answers.append(s.arm_car(s.Request(), notify=told.append, wait_s=10))
+            s.arm_car(s.Request(), wait_s=0.1)
+        threading.Timer(0.2, missing.__setitem__, (0, "")).start()
+        return s.arm_car(s.Request(), notify=told.append, wait_s=10)
 
-    with served() as service:
-        thread = beside(systemd, operator)
+    with served() as service, beside(systemd, operator) as answers:
         assert service.wait_for_human(armed, missing=lambda: missing[0]) == "telemetry"
-        thread.join()
-    assert "did not arm: switch the transmitter on" in answers[0] and answers[1] == "driving: armed by a human"
-    assert told == ["wiggle the stick"]
+    assert answers == ["driving: armed by a human"] and told == ["wiggle the stick"]
 
 
 def test_what_breaks_while_it_waits_ends_it(systemd):
     def check() -> None:
-        raise LinkError("the Arduino said nothing for 0.6 s; is it still plugged in?")
+        raise LinkError("the Arduino said nothing for 0.6 s")
 
-    with served() as service, pytest.raises(LinkError, match="plugged in"):
+    with served() as service, pytest.raises(LinkError):
         service.wait_for_human(lambda: pytest.fail("armed"), [check])
 
 
-class Clock:
-    now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-
 def test_a_request_limits_its_drive(systemd):
-    clock = Clock()
-    with served(clock=clock) as service:
-        thread = beside(systemd, lambda: human(max_seconds=30, heartbeat_s=5))
-        service.wait_for_human(armed)
-        thread.join()
-        clock.now += 4.9
+    """And those limits are forgotten with the drive; who asked before does not arm the car again."""
+    now, report = [1000.0], Report()
+    with served(clock=lambda: now[0], report=report) as service:
+        with beside(systemd, lambda: human(max_seconds=30, heartbeat_s=5)):
+            service.wait_for_human(armed)
+        assert "did not arm: driving: armed by a human" in human()
+        now[0] += 4.9
         assert service.over() is None
-        clock.now += 0.2
-        assert service.over() == "no heartbeat of the operator for 5 s"  # the laptop is gone
+        now[0] += 0.2
+        assert "no heartbeat" in service.over()  # the laptop is gone
         for _ in range(5):
             s.ask_service(ask="heartbeat")
-            clock.now += 4.9
+            now[0] += 4.9
             assert service.over() is None
         s.ask_service(ask="heartbeat")
-        clock.now += 0.9
+        now[0] += 0.9
         assert service.over() == "30 s, as requested"
-
-
-def test_a_drive_that_has_ended_waits_for_another_request(systemd):
-    """Its limits are forgotten, and who asked before does not arm it again."""
-    clock, report, answers = Clock(), Report(), []
-    with served(clock=clock, report=report) as service:
-        thread = beside(systemd, lambda: answers.append(human(max_seconds=1)))
-        service.wait_for_human(armed)
-        thread.join()
-        assert "did not arm: driving: armed by a human" in human()
-        report.ended = "the human took over with the transmitter"
+        report.ended = "the human took over"
         report.clear()
-        thread = threading.Thread(
-            target=lambda: (systemd.hear_until("STATUS=disarmed: the human took over"), answers.append(human()))
-        )
+        thread = threading.Thread(target=lambda: (systemd.hear_until("STATUS=disarmed: the human took over"), human()))
         thread.start()
         service.wait_for_human(armed, said="the human took over")
         thread.join()
-        clock.now += 100
+        now[0] += 100
         assert service.over() is None
-    assert answers == ["driving: armed by a human"] * 2
     assert systemd.lines.count("READY=1") == 1
 
 
-def feeds(lines: list[str]) -> int:
-    return lines.count("WATCHDOG=1")
-
-
 @pytest.mark.slow
-def test_the_watchdog_hears_of_ticks_that_happened_only(systemd):
+def test_the_watchdog_hears_of_ticks_that_happened_only(systemd, monkeypatch):
+    monkeypatch.setattr(s, "FEED_S", 0.05)
     report = Report()
     with served(report=report) as service:
-        assert feeds(systemd.hear(0.6)) == 0  # nothing before it is ready: loading takes what it takes
-        thread = beside(systemd, lambda: (time.sleep(0.8), human()))
-        service.wait_for_human(lambda: None)
-        thread.join()
-        systemd.hear()
-        assert feeds(systemd.lines) >= 2  # the checks while it waits
+        assert systemd.feeds(0.2) == 0  # nothing before it is ready: loading takes what it takes
+        with beside(systemd, lambda: (time.sleep(0.4), human())):
+            service.wait_for_human(lambda: None)
         systemd.hear(2 * s.FEED_S)
-        assert feeds(systemd.hear(0.8)) == 0  # armed, and the loop hangs
+        assert systemd.lines.count("WATCHDOG=1") >= 2  # the checks while it waits
+        assert systemd.feeds(0.3) == 0  # armed, and the loop hangs
         report.status = "steering +0.10\nREADY=0"
         for _ in range(16):
             report.ticks += 1
-            systemd.hear(0.05)
-        assert feeds(systemd.lines[-20:]) >= 2
+            systemd.hear(0.02)
+        assert systemd.lines[-20:].count("WATCHDOG=1") >= 2
         systemd.hear(2 * s.FEED_S)
-        assert feeds(systemd.hear(0.8)) == 0
+        assert systemd.feeds(0.3) == 0
     assert "STATUS=driving: steering +0.10 READY=0" in systemd.lines and "READY=0" not in systemd.lines
 
 
 @pytest.mark.slow
 def test_an_episode_may_be_finished_after_a_drive_but_not_for_ever(systemd, monkeypatch):
-    monkeypatch.setattr(s, "FINISH_S", 1.0)
+    monkeypatch.setattr(s, "FEED_S", 0.05)
+    monkeypatch.setattr(s, "FINISH_S", 0.5)
     report = Report()
     with served(report=report) as service:
-        thread = beside(systemd, human)
-        service.wait_for_human(lambda: None)
-        thread.join()
+        with beside(systemd, human):
+            service.wait_for_human(lambda: None)
         report.ended = "the human took over"
-        assert feeds(systemd.hear(0.8)) >= 2
-        systemd.hear(0.8)
-        assert feeds(systemd.hear(0.8)) == 0
+        assert systemd.feeds(0.4) >= 2
+        systemd.hear(0.6)
+        assert systemd.feeds(0.4) == 0
 
 
 def test_the_watchdog_has_no_say_once_it_was_told_to_stop(systemd):
@@ -431,11 +370,15 @@ def test_the_watchdog_has_no_say_once_it_was_told_to_stop(systemd):
     assert systemd.lines == ["STATUS=stopping: told to stop", "STOPPING=1"]
 
 
-def test_a_systemd_that_takes_nothing_holds_nobody_up(systemd):
+@pytest.mark.parametrize("there", ["busy", "none"])
+def test_a_systemd_that_takes_nothing_holds_nobody_up(systemd, monkeypatch, tmp_path, there):
+    if there == "none":
+        monkeypatch.delenv("NOTIFY_SOCKET")
     with served() as service:
         systemd.socket.close()
         threading.Timer(0.1, human).start()
         assert service.wait_for_human(armed) == "telemetry"
+    assert not (tmp_path / "operators").exists()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
@@ -456,6 +399,58 @@ def test_another_user_arms_nothing_even_if_the_socket_is_open_to_all(systemd, mo
     assert "connect" not in done.stderr and "ab12" not in done.stdout, done  # it got no answer, or was cut off
 
 
+# rover arm-car
+
+
+@pytest.mark.parametrize("active", ["inactive", "activating"])
+def test_a_service_that_is_not_there_is_not_armed(tmp_path, monkeypatch, active):
+    script = tmp_path / "systemctl"
+    shown = f"LoadState=loaded\\nActiveState={active}\\nStatusText=driving: x\\nNRestarts=2\\nUnitFileState=disabled\\n"
+    script.write_text(f"#!/bin/sh\nprintf '{shown}'\n")
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    found = s.state_of()
+    assert found["state"] == "driving" and found["restarts"] == 2 and found["installed"] and not found["at_boot"]
+    with pytest.raises(s.ServiceError, match=f"is {active}, not waiting to be armed .*; sudo systemctl start rover"):
+        s.arm_car(s.Request())
+    script.write_text("#!/bin/sh\nexit 1\n")
+    with pytest.raises(s.ServiceError, match="is this a rover"):
+        s.state_of()
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(s.ServiceError, match="is this a rover"):
+        s.state_of()
+
+
+def test_arming_asks_first(systemd):
+    def operator() -> list:
+        run = lambda answer, *options: CliRunner().invoke(main, ["arm-car", *options], input=f"{answer}\n")  # noqa: E731
+        no, yes = run("n", "--max-seconds", "9"), run("y", "--max-seconds", "9")
+        return [run("y", "--model", "cd34"), no, yes, CliRunner().invoke(main, ["arm-car", "--heartbeat"])]
+
+    with served() as service, beside(systemd, operator) as results:
+        service.wait_for_human(armed)
+    other, no, yes, beat = results[0]
+    assert other.exit_code == 1 and "another model than cd34" in other.output
+    assert no.exit_code == 1 and "model ab12" in no.output
+    assert yes.exit_code == 0 and "driving: armed by a human" in yes.output
+    assert (beat.exit_code, beat.output) == (0, "driving: armed by a human\n")
+
+
+def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
+    """CLOCK_MONOTONIC stands still then: a request of before armed the car."""
+    asked, answer = [], {"model": "", "ticket": "", "armed": True, "text": ""}
+    monkeypatch.setattr(s, "ask_service", lambda unit, ask, **more: asked.append(more) or answer)
+    monkeypatch.setattr(host.time, "clock_gettime", {time.CLOCK_BOOTTIME: 5000.0}.__getitem__)
+    s.arm_car(s.Request())
+    assert asked[-1]["asked_s"] == 5000.0
+    for function in (s.Service.__init__, arm_when_ready, arm_when_asked):
+        assert inspect.signature(function).parameters["clock"].default() == 5000.0
+
+
+# arming.py
+
+
 def test_an_old_plan_is_renewed_before_the_car_is_armed():
     """Or it would set off by a picture of long ago."""
     asked = []
@@ -466,57 +461,46 @@ def test_an_old_plan_is_renewed_before_the_car_is_armed():
 
     planner = SimpleNamespace(without_rest=contextlib.nullcontext, renew=renew)
     link = SimpleNamespace(request=lambda keep: None, lower_cap=lambda us: pytest.fail("armed"))
-    log = SimpleNamespace(event=lambda *_: None)
-    options, settings = DriveOptions(Path("policy.pt")), Settings()
+    log, options, settings = SimpleNamespace(event=lambda *_: None), DriveOptions(Path("policy.pt")), Settings()
     with pytest.raises(PolicyError), Arming(options, settings, link, log, planner, None, None, mode="static") as arming:
         arming.arm()
-    assert asked == [Settings().fade_s]
+    assert asked == [settings.fade_s]
 
 
-# rover arm-car
+def lacking(steps):
+    """Return a link whose statuses lack one of these after the other."""
+    latest = lambda: replace(STATUS, missing=next(steps))  # noqa: E731
+    return SimpleNamespace(latest=latest, request=lambda: None, remedy=MISSING.get)
 
 
-@pytest.fixture
-def systemctl(tmp_path, monkeypatch):
-    """Writes what systemctl says of the service."""
-    script = tmp_path / "systemctl"
-    script.write_text(f"#!/bin/sh\ncat {tmp_path}/show\n")
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-
-    def tell(text: str, active: str = "active") -> None:
-        (tmp_path / "show").write_text(
-            f"LoadState=loaded\nActiveState={active}\nStatusText={text}\nNRestarts=2\nUnitFileState=disabled\n"
-        )
-
-    return tell
+def test_a_human_in_a_terminal_is_told_what_is_missing():
+    """In the order in which a human does it; said once each."""
+    link, stop, said, checked = lacking(iter("sstwww-")), threading.Event(), [], []
+    checks = [lambda: checked.append(1)]
+    assert arm_when_asked(armed, link, stop, said.append, checks, terminal=True) == "telemetry"
+    assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
+    assert len(checked) == 6
+    stop.set()  # who goes away gets nothing
+    with pytest.raises(s.NotArmed):
+        arm_when_asked(lambda: pytest.fail("armed"), lacking(itertools.repeat("s")), stop, print, terminal=True)
 
 
-@pytest.mark.parametrize("active", ["inactive", "deactivating", "activating"])
-def test_a_service_that_is_not_there_is_not_armed(systemctl, active):
-    systemctl("", active)
-    with pytest.raises(s.ServiceError, match=f"is {active}, not waiting to be armed .*; sudo systemctl start rover"):
-        s.arm_car(s.Request())
+@pytest.mark.parametrize("missing", ["ww-", "-"])
+def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
+    """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
+    now = iter([0.0, 3600.0] if missing == "-" else [0.0, 20.0, 31.0])
+    with pytest.raises(s.NotArmed, match="at most 30"):
+        arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), now.__next__)
 
 
-def test_the_services_state(systemctl, monkeypatch):
-    systemctl("driving: steering +0.10")
-    found = s.state_of()
-    assert found["state"] == "driving" and found["restarts"] == 2 and found["installed"] and not found["at_boot"]
-    monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(s.ServiceError, match="is this a rover"):
-        s.state_of()
-
-
-# The whole: rover drive --service, as systemd starts it, in the balloon world
+# The whole: rover drive --service, as systemd starts it
 
 
 class Link:
     """An Arduino that arms once the stick was wiggled, and whose human takes over after ten commands."""
 
-    port, hello, garbled, calibration = "fake", None, 0, PwmCalibration()
-    opened, missing, remedy = 0, "w", MISSING.get
+    port, hello, garbled, calibration, car = "fake", None, 0, PwmCalibration(), Car()
+    opened, missing, remedy = 0, "-", MISSING.get
     arms: ClassVar[list[float]] = []
     caps: ClassVar[list[int]] = []
 
@@ -558,134 +542,9 @@ class Link:
         return replace(STATUS, host_s=time.monotonic(), sequence=self.sequence, state=self.state, missing=self.missing)
 
 
-def test_the_arduino_is_told_what_a_drive_may_use(monkeypatch):
-    """And the human, where it gives less than that: it was cut in silence."""
-    for name in ("arms", "caps"):
-        monkeypatch.setattr(Link, name, [])
-    link, said = Link("port"), []
-    assert arm_capped(link, 0.1, said.append).state is State.AUTONOMOUS
-    assert (link.caps, said) == ([179], [])
-    arm_capped(link, 0.2, said.append)
-    assert link.caps == [179, 238]
-    assert len(said) == 1
-    assert "at most throttle 0.14 (200 us), and this drive may ask for 0.20" in said[0]
-    armed_before = len(link.arms)
-    with pytest.raises(s.NotArmed, match=r"3\.0 s have passed"):
-        arm_capped(link, 0.1, said.append, lambda: s.check_age(3.0))
-    assert len(link.arms) == armed_before
-
-
-class Policy:
-    """A policy that has one plan."""
-
-    manifest: ClassVar[dict] = {"mode": "fake"}
-    rate_hz, pids, unconfined = 30.0, (), ""
-
-    def __init__(self, artifact, threads=None):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
-
-    def predict(self, frame_bgr, state):
-        return np.tile(np.float32([0.1, 0.05]), (32, 1))
-
-
-class OneFile:
-    """An artifact that is opened and verified."""
-
-    manifest: ClassVar[dict] = {"mode": "fake", "cameras": [{"height": 160, "width": 320}]}
-    content_hash = "ab12"
-
-    def __init__(self, path):
-        self.path = path
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
-
-
-class Eyes:
-    """A camera that has a new picture whenever it is asked."""
-
-    wanted_hz, number, wall_start_s = 30.0, 0, 0.0
-
-    def __init__(self, camera, **options):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
-
-    def begin(self):
-        pass
-
-    def latest(self):
-        self.number += 1
-        return Frame(np.zeros((160, 320, 3), np.uint8), time.monotonic(), self.number, 0, 100.0, 40.0)
-
-    def wait(self, after, timeout_s):
-        time.sleep(0.005)
-        return self.latest()
-
-
-@pytest.fixture
-def fake_car(monkeypatch, tmp_path):
-    """drive_car() with fakes for all devices, driven as a service; a function that drives it with a link's class."""
-
-    def drive(link, **options):
-        for name, fake in {"ServoLink": link, "PolicyProcess": Policy, "Artifact": OneFile, "Camera": Eyes}.items():
-            monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
-        given = {"artifact": tmp_path / "policy.pt", "camera": str(tmp_path), "film": True, "service": True}
-        drive_car(DriveOptions(**given, log_file=tmp_path / "flight.log", **options), Report())
-
-    return drive
-
-
-@pytest.mark.slow
-def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tmp_path, monkeypatch, fake_car):
-    """The port stays open: opened again, it might reset the Arduino, and the human would lose the car."""
-    for name, value in {"arms": [], "caps": [], "opened": 0}.items():
-        monkeypatch.setattr(Link, name, value)
-    answers = []
-    monkeypatch.setattr(Link, "missing", "w")
-
-    def operator() -> None:
-        systemd.hear_until("STATUS=disarmed: move the steering stick")
-        assert "did not arm: move the steering stick" in human()
-        Link.missing = "-"
-        answers.append(human())
-        systemd.hear_until("STATUS=disarmed: the human took over with the transmitter; waiting for a human to arm it")
-        answers.append(human(max_seconds=0.2))
-        systemd.hear_until("STATUS=disarmed: 0.2 s, as requested; waiting for a human to arm it")
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    thread = beside(systemd, operator)
-    with pytest.raises(s.NotArmed, match="told to stop"):
-        fake_car(Link)
-    thread.join()
-    assert answers == ["driving: armed by a human"] * 2
-    assert (Link.opened, len(Link.arms)) == (1, 2)
-    assert Link.caps == [238, 238]  # before each: the Arduino may have been reset meanwhile
-    first, second = read_log(tmp_path / "flight.log", 0), read_log(tmp_path / "flight.log", 1)
-    assert len(first.ticks["t_s"]) == 10 and first.drives == 2
-    # 0.2 s are six periods; a busy machine misses some of them, and the wait for the human is none.
-    assert 5 <= len(second.ticks["t_s"]) + second.summary()["missed"] <= 8
-    assert any(e.text == "the human took over with the transmitter" for e in first.events)
-
-
 class DrivenLink(Link):
     """And who then drives for three seconds."""
 
-    car, missing, opened = Car(), "-", 0
-    arms: ClassVar[list[float]] = []
     sent_later: ClassVar[list[int]] = []
     taken_s = 0.0
 
@@ -707,38 +566,136 @@ class DrivenLink(Link):
         sticks = {"receiver_steering_us": steering_us, "receiver_throttle_us": throttle_us}
         periods = {"receiver_steering_period_us": 21316, "receiver_throttle_period_us": 1016}
         pins = {"steering_us": steering_us, "throttle_us": throttle_us}
-        now_s = time.monotonic()
-        return replace(super().latest(), host_s=now_s, uptime_ms=int(now_s * 1000), **sticks, **periods, **pins)
+        return replace(super().latest(), uptime_ms=int(time.monotonic() * 1000), **sticks, **periods, **pins)
+
+
+@pytest.fixture(autouse=True)
+def _new_links(monkeypatch):
+    for kind, names in ((Link, ("arms", "caps")), (DrivenLink, ("arms", "caps", "sent_later"))):
+        monkeypatch.setattr(kind, "opened", 0)
+        for name in names:
+            monkeypatch.setattr(kind, name, [], raising=False)
+    monkeypatch.setattr(DrivenLink, "taken_s", 0)
+
+
+def test_the_arduino_is_told_what_a_drive_may_use():
+    """And the human, where it gives less than that: it was cut in silence."""
+    link, said = Link("port"), []
+    assert arm_capped(link, 0.1, said.append).state is State.AUTONOMOUS
+    assert (link.caps, said) == ([179], [])
+    arm_capped(link, 0.2, said.append)
+    assert link.caps == [179, 238] and "at most throttle 0.14 (200 us)" in said[0]
+    with pytest.raises(s.NotArmed, match=r"3\.0 s have passed"):
+        arm_capped(link, 0.1, said.append, lambda: s.check_age(3.0))
+    assert len(link.arms) == 2
+
+
+class Opened:
+    """Any device that a drive opens."""
+
+    def __init__(self, given, **options):
+        self.path = given
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+
+class Policy(Opened):
+    manifest: ClassVar[dict] = {"mode": "fake"}
+    rate_hz, pids, unconfined = 30.0, (), ""
+
+    def predict(self, frame_bgr, state):
+        return np.tile(np.float32([0.1, 0.05]), (32, 1))
+
+
+class OneFile(Opened):
+    manifest: ClassVar[dict] = {"mode": "fake", "cameras": [{"height": 160, "width": 320}]}
+    content_hash = "ab12"
+
+
+class Eyes(Opened):
+    """A camera that has a new picture whenever it is asked."""
+
+    wanted_hz, number = 30.0, 0
+
+    def begin(self):
+        pass
+
+    def latest(self):
+        self.number += 1
+        return Frame(np.zeros((160, 320, 3), np.uint8), time.monotonic(), self.number, 0, 100.0, 40.0)
+
+    def wait(self, after, timeout_s):
+        time.sleep(0.005)
+        return self.latest()
+
+
+@pytest.fixture
+def drive_fakes(monkeypatch, tmp_path):
+    """Drive as a service with fakes for all devices: drive_fakes(link's class, more options)."""
+
+    def drive(link, **options):
+        for name, fake in {"ServoLink": link, "PolicyProcess": Policy, "Artifact": OneFile, "Camera": Eyes}.items():
+            monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
+        given = {"artifact": tmp_path / "policy.pt", "camera": str(tmp_path), "film": True, "service": True}
+        drive_car(DriveOptions(**given, log_file=tmp_path / "flight.log", **options), Report())
+
+    return drive
+
+
+@pytest.mark.slow
+def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tmp_path, monkeypatch, drive_fakes):
+    """The port stays open: opened again, it might reset the Arduino, and the human would lose the car."""
+    monkeypatch.setattr(Link, "missing", "w")
+
+    def operator() -> list:
+        systemd.hear_until("STATUS=disarmed: move the steering stick")
+        assert "did not arm: move the steering stick" in human()
+        Link.missing = "-"
+        answers = [human()]
+        systemd.hear_until("STATUS=disarmed: the human took over with the transmitter; waiting for a human to arm it")
+        answers.append(human(max_seconds=0.2))
+        systemd.hear_until("STATUS=disarmed: 0.2 s, as requested; waiting for a human to arm it")
+        os.kill(os.getpid(), signal.SIGTERM)
+        return answers
+
+    with beside(systemd, operator) as answers, pytest.raises(s.NotArmed, match="told to stop"):
+        drive_fakes(Link)
+    assert answers == [["driving: armed by a human"] * 2]
+    assert (Link.opened, len(Link.arms)) == (1, 2)
+    assert Link.caps == [238, 238]  # before each: the Arduino may have been reset meanwhile
+    first, second = read_log(tmp_path / "flight.log", 0), read_log(tmp_path / "flight.log", 1)
+    assert len(first.ticks["t_s"]) == 10 and first.drives == 2
+    # 0.2 s are six periods; a busy machine misses some of them, and the wait for the human is none.
+    assert 5 <= len(second.ticks["t_s"]) + second.summary()["missed"] <= 8
+    assert any(e.text == "the human took over with the transmitter" for e in first.events)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ends", ["let go", "SIGTERM"])
-def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp_path, monkeypatch, fake_car, ends):
+def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp_path, monkeypatch, drive_fakes, ends):
     monkeypatch.setattr("rover_lib.onboard.drive.takeover.LET_GO_S", 0.5)
     monkeypatch.setattr(s, "FINISH_S", 0.0)  # the watchdog hears of what happens, and of nothing else
-    for name in ("taken_s", "opened"):
-        monkeypatch.setattr(DrivenLink, name, 0)
-    for name in ("arms", "sent_later"):
-        monkeypatch.setattr(DrivenLink, name, [])
-    answers = []
 
-    def operator() -> None:
-        answers.append(human())
+    def operator() -> list:
+        answers = [human()]
         until(lambda: DrivenLink.taken_s)
         systemd.hear_until("STATUS=driving: the human took over")
         answers.append(human())  # nobody can ask for a car that the human has
         systemd.lines.clear()
         if ends == "let go":
-            systemd.hear(0.8)
-            assert feeds(systemd.lines) >= 2
+            assert systemd.feeds(0.8) >= 2
             systemd.hear_until("STATUS=disarmed: the human took over with the transmitter; waiting for a human")
         os.kill(os.getpid(), signal.SIGTERM)
+        return answers
 
-    thread = beside(systemd, operator)
-    with contextlib.suppress(s.NotArmed):  # of a service that waits again; one that was told to stop before just ends
-        fake_car(DrivenLink, record=tmp_path / "episodes")
-    thread.join()
-    assert answers[0] == "driving: armed by a human" and answers[1].startswith("rover-drive.service did not arm")
+    # A service that waits again raises; one that was told to stop before just ends.
+    with beside(systemd, operator) as answers, contextlib.suppress(s.NotArmed):
+        drive_fakes(DrivenLink, record=tmp_path / "episodes")
+    assert answers[0][0] == "driving: armed by a human" and "did not arm" in answers[0][1]
     assert (len(DrivenLink.arms), DrivenLink.opened, DrivenLink.sent_later) == (1, 1, [])
     (episode,) = (tmp_path / "episodes").iterdir()
     content = json.loads((episode / "episode_data.json").read_text())
@@ -746,92 +703,31 @@ def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp
     commands = drivers.index("human")
     assert 4 < commands <= 10 and set(drivers[:commands]) == {"policy"} and set(drivers[commands:]) == {"human"}
     takeover = content["metadata"]["takeover"]
-    assert takeover["ended"] == ("the sticks have been at rest for 0.5 s" if ends == "let go" else "told to stop")
+    assert ("rest" if ends == "let go" else "told to stop") in takeover["ended"]
     assert takeover["controls"] == {"human": len(drivers) - commands, "nobody": 0}
     assert "fault" not in content["metadata"]
     events = [e.text for e in read_log(tmp_path / "flight.log", 0).events]
     assert events.index("the human took over with the transmitter") < events.index(f"recorded: {episode}")
 
 
-def lacking(steps):
-    """Return a link whose statuses lack one of these after the other."""
-    latest = lambda: replace(STATUS, missing=next(steps))  # noqa: E731
-    return SimpleNamespace(latest=latest, request=lambda: None, remedy=MISSING.get)
-
-
-def test_a_human_in_a_terminal_is_told_what_is_missing():
-    """In the order in which a human does it; said once each."""
-    steps = iter(["s", "s", "t", "w", "w", "w", "-"])
-    link = lacking(steps)
-    said, checked = [], []
-    assert arm_when_ready(armed, link, threading.Event(), said.append, [lambda: checked.append(1)]) == "telemetry"
-    assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
-    assert len(checked) == 6
-
-
-def test_a_human_in_a_terminal_may_go_away():
-    stop = threading.Event()
-    stop.set()
-    link = lacking(itertools.repeat("s"))
-    with pytest.raises(s.NotArmed):
-        arm_when_ready(lambda: pytest.fail("armed"), link, stop, print)
-
-
-@pytest.mark.parametrize("missing", ["ww-", "-"])
-def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
-    """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
-    steps, now = iter(missing), iter([0.0, 20.0, 31.0])
-    link = lacking(steps)
-    if missing == "-":
-        next(now), next(now)
-        now = iter([0.0, 3600.0])
-    with pytest.raises(s.NotArmed, match="have passed since the car was asked for, at most 30 may"):
-        arm_when_ready(lambda: pytest.fail("armed"), link, threading.Event(), print, clock=lambda: next(now))
-
-
-def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
-    """CLOCK_MONOTONIC stands still then: a request of before armed the car."""
-    asked = []
-    monkeypatch.setattr(s, "ask_service", lambda unit, ask, **more: asked.append(more) or {
-        "model": "", "ticket": "", "armed": True, "text": ""})  # fmt: skip
-    monkeypatch.setattr(host.time, "clock_gettime", {time.CLOCK_BOOTTIME: 5000.0}.__getitem__)
-    s.arm_car(s.Request())
-    assert asked[-1]["asked_s"] == 5000.0
-    for function in (s.Service.__init__, arm_when_ready):
-        assert inspect.signature(function).parameters["clock"].default() == 5000.0
-
-
-def started(systemd: Systemd, tmp_path: Path, artifact: Path) -> subprocess.Popen:
-    command = [str(Path(sys.executable).with_name("rover")), "drive", str(artifact), "--world", "--service"]
-    for option, name in (("log", "flight.log"), ("json", "drive.json"), ("record", "episodes")):
-        command += [f"--{option}", str(tmp_path / name)]
-    process = subprocess.Popen(
-        [*command, "--record-mb", "200"],
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "WATCHDOG_USEC": "2000000"},
-    )
-    end = time.monotonic() + 120
-    while "READY=1" not in systemd.lines:
-        assert process.poll() is None and time.monotonic() < end, process.communicate()[1]
-        systemd.hear(0.1)
-    return process
-
-
 def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(systemd, tmp_path, demo_run):
-    process = started(systemd, tmp_path, demo_run / "policy_static.pt")
+    command = [str(Path(sys.executable).with_name("rover")), "drive", str(demo_run / "policy_static.pt"), "--world"]
+    options = ["--service", "--log", tmp_path / "flight.log", "--record", tmp_path / "episodes", "--record-mb", "200"]
+    env = {**os.environ, "WATCHDOG_USEC": "2000000"}
+    process = subprocess.Popen([*command, *map(str, options)], stderr=subprocess.PIPE, text=True, env=env)
     try:
-        assert feeds(systemd.hear(1.5)) >= 3
+        systemd.hear_until("READY=1")
+        assert systemd.feeds(1.5) >= 3
         assert not any("driving" in line for line in systemd.lines)
         assert os.sched_getscheduler(process.pid) == os.SCHED_OTHER  # nobody is in a hurry
         assert human() == "driving: armed by a human"
         if os.geteuid() == 0:
             assert os.sched_getscheduler(process.pid) == os.SCHED_RR | os.SCHED_RESET_ON_FORK
-        assert feeds(systemd.hear(2.0)) >= 4
+        assert systemd.feeds(2.0) >= 4
         assert any(line.startswith("STATUS=driving: ") and "steering" in line for line in systemd.lines)
         process.send_signal(signal.SIGSTOP)
         systemd.hear(0.5)
-        assert feeds(systemd.hear(2.0)) == 0  # here systemd would kill it; the Arduino has stopped the car
+        assert systemd.feeds(2.0) == 0  # here systemd would kill it; the Arduino has stopped the car
         systemd.lines.clear()
         process.send_signal(signal.SIGCONT)
         # Which of the two it finds first is a matter of threads; it does not drive on.
@@ -842,8 +738,7 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     finally:
         process.kill()
     assert process.returncode == 0 and "told to stop before a human armed the car" in said, said
-    assert not any("driving" in line for line in systemd.hear())
-    assert "STOPPING=1" in systemd.lines
+    assert not any("driving" in line for line in systemd.hear()) and "STOPPING=1" in systemd.lines
     flight = read_log(tmp_path / "flight.log")
     assert any(e.text == "armed" for e in flight.events)
     (episode,) = (tmp_path / "episodes").iterdir()  # of the drive, not of the time before
@@ -854,22 +749,3 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
 def test_a_service_is_no_dry_run():
     result = CliRunner().invoke(main, ["drive", "--service", "policy.pt", "--dry-run"])
     assert result.exit_code != 0
-
-
-def test_arming_asks_first(systemd):
-    results = []
-
-    def operator() -> None:
-        for options in (["--model", "cd34"], ["--max-seconds", "9"], ["--max-seconds", "9"]):
-            results.append(CliRunner().invoke(main, ["arm-car", *options], input="y\n" if results[1:] else "n\n"))
-        results.append(CliRunner().invoke(main, ["arm-car", "--heartbeat"]))
-
-    with served() as service:
-        thread = beside(systemd, operator)
-        service.wait_for_human(armed)
-        thread.join()
-    other, no, yes, beat = results
-    assert other.exit_code == 1 and "another model than cd34" in other.output
-    assert no.exit_code == 1 and "model ab12" in no.output and "Is the way free" in no.output
-    assert yes.exit_code == 0 and "driving: armed by a human" in yes.output
-    assert (beat.exit_code, beat.output) == (0, "driving: armed by a human\n")

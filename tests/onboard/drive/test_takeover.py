@@ -99,14 +99,11 @@ def let_go_at(end_s):
     ("status", "driver"),
     [
         (ARMED, POLICY),
-        (manual(), HUMAN),
-        (manual(steering_us=1604), HUMAN),
         (manual(receiver_steering_us=1604), HUMAN),  # a step of the Arduino's clock
         (manual(receiver_steering_us=1605), NOBODY),
         (manual(throttle_us=120, receiver_throttle_us=180), NOBODY),  # it waits until it was at rest
         (manual(**LOST), NOBODY),
         (manual(state=State.STOPPED), NOBODY),
-        (manual(1456, 120, receiver_steering_us=None, receiver_throttle_us=None), NOBODY),
     ],
 )
 def test_who_drives(status, driver):
@@ -153,12 +150,6 @@ def test_rest_is_neutral_where_nothing_is_known_of_arming():
     assert takeover.seconds == pytest.approx(MOST_S, abs=0.1)
 
 
-def test_a_held_throttle_is_no_rest():
-    takeover, _ = human(lambda t_s: manual(1460, 153))
-    assert (takeover.ended, takeover.fault) == (f"after {MOST_S:g} s", False)
-    assert takeover.seconds == pytest.approx(MOST_S, abs=0.1)
-
-
 @pytest.mark.parametrize("lost", [LOST, {"receiver_steering_us": None, "steering_us": 1456, "throttle_us": 120}])
 def test_it_ends_when_the_transmitter_is_off(lost):
     takeover, written = human(lambda t_s: manual() if t_s < 1 else manual(**lost))
@@ -166,50 +157,32 @@ def test_it_ends_when_the_transmitter_is_off(lost):
     assert written.drivers[-1] == NOBODY
 
 
-def test_a_link_that_fails_is_a_fault():
-    takeover, written = human(lambda t_s: manual() if t_s < 1 else LinkError("fake port: silent", remedy="plug it in"))
-    assert takeover.fault and takeover.ended == "fake port: silent; plug it in"
-    assert len(written.rows) > 25
+def full(written, time):
+    written.failure = "the disk is full" if time.now_s > 101 else None
 
 
-def test_a_reset_is_a_fault():
-    """Its clock begins anew, and its pins were loose for a while."""
-    takeover, written = human(lambda t_s: manual(boot=7 if t_s < 1 else 8))
-    assert takeover.fault and takeover.ended == "the Arduino was reset"
-    assert written.rows[-1][0][0] < 101
-
-
-def test_another_program_that_arms_ends_it():
-    takeover, written = human(lambda t_s: manual() if t_s < 1 else ARMED)
-    assert takeover.ended == "another program has armed the car" and POLICY not in written.drivers
-
-
-def test_a_signal_ends_it():
-    takeover, _ = human(let_go_at(9), over=lambda time: time.set() if time.now_s > 101 else None)
-    assert takeover.ended == "told to stop" and takeover.seconds < 1.2
-
-
-def test_what_is_asked_at_each_turn_may_end_it():
-    asked = []
-    takeover, _ = human(let_go_at(9), over=lambda time: asked.append(time) or ("enough" if len(asked) == 40 else None))
-    assert takeover.ended == "enough" and len(asked) == 40
-
-
-def test_a_recorder_that_takes_no_more_ends_it():
+@pytest.mark.parametrize(
+    ("later", "over", "ended", "fault"),
+    [
+        (LinkError("fake port: silent"), None, "silent", True),
+        (manual(boot=8), None, "reset", True),  # its clock begins anew, and its pins were loose for a while
+        (ARMED, None, "another program", False),
+        (None, lambda written, time: time.set() if time.now_s > 101 else None, "told to stop", False),
+        (None, lambda written, time: "enough" if time.now_s > 101 else None, "enough", False),
+        (None, full, "nothing more can be recorded", False),
+    ],
+    ids=["link", "reset", "armed", "signal", "asked", "disk"],
+)
+def test_what_else_ends_it(later, over, ended, fault):
     written = Written()
-
-    def full(time):
-        written.failure = "the disk is full" if time.now_s > 101 else None
-
-    takeover, _ = human(let_go_at(9), written=written, over=full)
-    assert takeover.ended == "nothing more can be recorded" and takeover.seconds < 1.2
-
-
-def test_it_says_how_it_was():
-    takeover, _ = human(lambda t_s: manual(throttle_us=120, receiver_throttle_us=180) if t_s < 1 else let_go_at(2)(t_s))
-    text = str(takeover)
-    assert text.startswith("the human's driving was recorded for 4.0 s (") and "policy" not in text
-    assert f"{takeover.controls[HUMAN]} of human" in text and f"{takeover.controls[NOBODY]} of nobody" in text
+    takeover, _ = human(
+        lambda t_s: manual() if later is None or t_s < 1 else later,
+        written=written,
+        over=lambda time: over(written, time) if over else None,
+    )
+    assert ended in takeover.ended and takeover.fault is fault and takeover.seconds < 1.2
+    assert len(written.rows) > 25 and written.rows[-1][0][0] < 101.2 and POLICY not in written.drivers
+    assert f"{takeover.controls[HUMAN]} of human" in str(takeover)
 
 
 # ---- the policy's last command
