@@ -64,7 +64,7 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.service import UNIT
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.recording.episode import read_controls
+from rover_lib.onboard.recording.episode import json_controls
 from rover_lib.onboard.stage import sha256_of
 
 STAGE = "pi-fast"
@@ -260,7 +260,7 @@ class _Run:
         left = [p.name for p in (pi.root / STATE.lstrip("/") / "episodes").glob("*")]
         episodes = [p.name for p in home.glob("*")]
         frames = len(list(home.glob("*/frames/*.jpg")))
-        commands = sum(len(read_controls(home / name).times_s) for name in episodes)
+        commands = sum(len(json_controls(home / name / "episode_data.json")) for name in episodes)
         recorded = {"episodes": episodes, "left": left, "frames": frames, "commands": commands}
         whole = len(episodes) == 1 and not left and min(frames, commands) >= 10
         self.report.gate("the drive, recorded and brought home", "an episode, none left on the rover", recorded, whole)
