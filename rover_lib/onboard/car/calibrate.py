@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rover_lib.onboard.car.car import (
     DEFAULT,
@@ -22,9 +22,12 @@ from rover_lib.onboard.car.car import (
     Car,
     yaml_of,
 )
-from rover_lib.onboard.car.servo_link import Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
 from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.stage import atomic_path
+
+if TYPE_CHECKING:  # what asks may also be a stand-in with tell() and latest()
+    from rover_lib.onboard.car.servo_link import ServoLink
 
 LOOK_S = 0.5  # time for both signals to appear with one kind of car; two or even eight pulses of 25 ms take less
 MEASURE_S = 1.0
@@ -32,16 +35,6 @@ STEP_S = 0.02  # between two statuses of the Arduino
 STEADY_US = 24  # a stick held still stays within this; resting sticks in the recordings stay within 16
 RETURNS_US = 40  # if the throttle moves back less than this, the car has no reverse
 NAMES = ("steering", "throttle")
-
-
-class Link(Protocol):
-    """The part of a ServoLink that is needed here."""
-
-    def tell(self, car: Car) -> None:
-        """Make the Arduino use its pins as for this car from now on."""
-
-    def latest(self) -> Telemetry | None:
-        """Return the newest status, None before the first."""
 
 
 def _slow(steering_us: int, throttle_us: int) -> Car:
@@ -70,7 +63,7 @@ class Held(NamedTuple):
 
 
 def measure(
-    link: Link,
+    link: "ServoLink",
     ask: Callable[[str], object],
     *,
     notify: Callable[[str], None] = lambda text: None,
@@ -157,7 +150,7 @@ def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
     return backwards_us > RETURNS_US
 
 
-def _find(link: Link, sleep: Callable[[float], None]) -> None:
+def _find(link: "ServoLink", sleep: Callable[[float], None]) -> None:
     """Tell the Arduino of one kind of car after the other until it receives both signals.
 
     Raises CarError if no kind lets it receive both.
@@ -183,7 +176,7 @@ def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
     return (status.receiver_steering_us, status.receiver_throttle_us) if status else (None, None)
 
 
-def _hold(link: Link, where: str, sleep: Callable[[float], None]) -> Held:
+def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> Held:
     """Measure both channels for MEASURE_S. Raises CarError if a signal is lost or a stick moves."""
     rows: list[tuple[int, ...]] = []
     for _ in range(round(MEASURE_S / STEP_S)):

@@ -30,7 +30,6 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import atomic_path, open_plain, plain, read_plain
 
@@ -52,7 +51,6 @@ ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
 BURST_SHARE = 0.3  # two controls that arrive within this share of the usual interval had waited in a buffer
 BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter than a frame, and left as they are
 SIMULATED = "playground"  # the port of the balloon world's Arduino
-CLOCKS_APART_S = 0.5  # if the clocks differ by more between two controls, the system's clock was set
 
 
 class EpisodeExists(EpisodeError):
@@ -485,21 +483,6 @@ def find_backlog(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
     return [b - a < BURST_SHARE * usual_s for a, b in pairwise(system_s)] + [False]
 
 
-@dataclass(frozen=True, eq=False)
-class Controls:
-    """The usable controls of a recording.
-
-    times_s: (n,) float64 seconds from the first control, never decreasing; a hole in the recording is a long step.
-    steering_us, throttle_us: (n,) int64 microseconds, as measured. left_out: number of controls that were not usable,
-    because a time or a pulse was not measured, or nobody drove and the car stood.
-    """
-
-    times_s: np.ndarray
-    steering_us: np.ndarray
-    throttle_us: np.ndarray
-    left_out: int
-
-
 def read_car_of(folder: Path | str) -> Car:
     """Return the car whose pulses an episode folder contains, from its metadata.
 
@@ -517,80 +500,12 @@ def read_car_of(folder: Path | str) -> Car:
     return replace(car, positive="left") if before and car.drives_like(Car()) else car
 
 
-def read_controls(folder: Path | str) -> Controls:
-    """Return the controls of an episode folder that have both pulses measured.
-
-    They are read from control_data.csv, or from episode_data.json if that gives none. Times are the system's, unless
-    its clock was set meanwhile or controls arrived in a burst; then they are the Arduino's. Raises EpisodeError if no
-    control is usable, CarError as read_car_of() does.
-    """
-    folder = Path(folder)
-    pwm = read_car_of(folder).pwm
-    for name, read in (("control_data.csv", _csv_rows), ("episode_data.json", json_controls)):
-        rows = read(folder / name)
-        timed = []
-        for row in rows:
-            t_s, arduino_ms = _found(row, "system_timestamp"), _found(row, "arduino_timestamp")
-            if t_s is not None and arduino_ms is not None:
-                timed.append((row, t_s, arduino_ms))
-        pulses = [_pulses(row, pwm) for row, _, _ in timed]
-        keep = [i for i, found in enumerate(pulses) if found]
-        if not keep:
-            continue
-        times_s = _times([t_s for _, t_s, _ in timed], [ms / 1000 for _, _, ms in timed])[keep]
-        steering_us, throttle_us = np.array([pulses[i] for i in keep], np.int64).T
-        return Controls(times_s - times_s[0], steering_us, throttle_us, len(rows) - len(keep))
-    raise EpisodeError(
-        f"{folder}: no control with both pulses measured in control_data.csv or episode_data.json",
-        remedy="give the folder of one episode, recorded with the transmitter on",
-    )
-
-
-def _found(row: Mapping[str, Any], name: str) -> float | None:
-    found = number_of(row.get(name))
-    return None if found is None or math.isnan(found) else found
-
-
-def _pulses(row: Mapping[str, Any], pwm: PwmCalibration) -> tuple[int, int] | None:
-    """Return both pulses of a control, in whole microseconds; None if one was not measured or nobody drove."""
-    if driver_of(row) not in (POLICY, HUMAN):
-        return None
-    pulses = []
-    for name in CHANNELS:
-        pulse_us, period_us = _found(row, f"{name}_raw_us"), _found(row, f"{name}_period_us")
-        if no_pulse(row, name) or pulse_us is None or period_us is None or pulse_us != int(pulse_us):
-            return None
-        if not pwm.channel(name).measured(pulse_us, period_us):
-            return None
-        pulses.append(int(pulse_us))
-    return pulses[0], pulses[1]
-
-
-def _times(system_s: list[float], arduino_s: list[float]) -> np.ndarray:
-    """Return the seconds from the first control to each, never decreasing, in the order of the file."""
-    steps_s = np.diff(system_s)
-    clock_s = np.array([arduino_step_s(a, b) for a, b in pairwise(arduino_s)])
-    late = "".join("x" if x else " " for x in find_backlog(system_s, arduino_s))
-    with np.errstate(invalid="ignore"):
-        was_set = (steps_s < 0) | (np.abs(steps_s - clock_s) > CLOCKS_APART_S)
-    if was_set.any() or "x" * BURST_MIN in late:
-        steps_s = np.where(np.isnan(clock_s), steps_s.clip(0), clock_s)
-    return np.concatenate([[0.0], np.cumsum(steps_s)])
-
-
 def _data_of(path: Path) -> bytes:
     """Return a data file's bytes; none if it cannot be read, or is larger than any drive's."""
     try:
         return read_plain(path, DATA_BYTES)
     except OSError:
         return b""
-
-
-def _csv_rows(path: Path) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    with contextlib.suppress(csv.Error):  # the rows before the damage count
-        rows.extend(csv.DictReader(_data_of(path).decode("utf-8-sig", errors="replace").splitlines()))
-    return rows
 
 
 def json_controls(path: Path, key: str = "control_samples") -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of, read_controls
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, json_controls, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as car_of_samples
 
@@ -46,7 +46,7 @@ def episode(folder, car, name="episode_20260101_000000"):
 def test_a_recording_carries_its_car(tmp_path):
     folder = episode(tmp_path, CRAWLER)
     assert read_car_of(folder) == CRAWLER and read_car_of(episode(tmp_path / "first", Car())) == Car()
-    assert set(read_controls(folder).throttle_us.tolist()) == {1550, 1450}
+    assert {row["throttle_raw_us"] for row in json_controls(folder / "episode_data.json")} == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
     assert actions[:, 1].min() == pytest.approx(-0.1)
     assert actions[:, 1].max() == pytest.approx(0.1)
@@ -73,7 +73,7 @@ def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):
     assert [e.id for e in recordings.episodes] == [good.name]
     assert any(fault.kind == "no_car" for fault in recordings.faults)
     with pytest.raises(CarError, match="between its two ends"):
-        read_controls(bad)
+        read_car_of(bad)
 
 
 def test_an_artifact_says_whose_it_is():

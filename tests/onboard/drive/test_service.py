@@ -39,7 +39,7 @@ from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.recording.episode import read_controls
+from rover_lib.onboard.recording.episode import json_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
 REQUEST_S = s.REQUEST_S
@@ -742,7 +742,7 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     flight = read_log(tmp_path / "flight.log")
     assert any(e.text == "armed" for e in flight.events)
     (episode,) = (tmp_path / "episodes").iterdir()  # of the drive, not of the time before
-    assert len(read_controls(episode).times_s) == pytest.approx(len(flight.ticks["t_s"]), abs=2)
+    assert len(json_controls(episode / "episode_data.json")) == pytest.approx(len(flight.ticks["t_s"]), abs=2)
     assert flight.ticks["plan"][0] < 10 and flight.ticks["plan_age_ms"][0] <= 1e3 * Settings().fade_s
 
 

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import os
 import re
 import subprocess
 import sys
@@ -13,12 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from recorded import real_episode
 
 from rover_lib.cli import main
-from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
@@ -27,7 +23,6 @@ from rover_lib.onboard.recording.episode import (
     EpisodeWriter,
     find_killed,
     finish_killed,
-    read_controls,
 )
 from rover_lib.onboard.recording.recorder import _new_episode
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -255,8 +250,6 @@ def test_no_pulse_is_a_flag_and_no_value(tmp_path):
     with (folder / "control_data.csv").open(newline="") as f:
         lines = list(csv.DictReader(f))
     assert [{k: "" if v is None else str(v) for k, v in r.items()} for r in rows] == lines
-    controls = read_controls(folder)
-    assert (controls.steering_us.tolist(), controls.throttle_us.tolist(), controls.left_out) == ([1500], [136], 3)
 
 
 def test_further_columns_must_be_new_and_plain(tmp_path):
@@ -337,202 +330,3 @@ def test_a_long_drive_stays_out_of_memory(tmp_path):
     tracemalloc.stop()
     assert held < 100_000  # 3000 rows are a megabyte
     assert most < 400_000
-
-
-# ---- controls that come back -----------------------------------------------------------------------------
-
-
-def csv_of(folder, rows):
-    folder.mkdir(exist_ok=True)
-    with (folder / "control_data.csv").open("w", newline="") as f:
-        table = csv.DictWriter(f, rows[0].keys() if rows else CONTROL_FIELDS)
-        table.writeheader()
-        table.writerows(rows)
-    return folder
-
-
-def row_of(system_s, arduino_ms, steering_us=1500, throttle_us=136, steering_period_us=21316, throttle_period_us=1016):
-    pulses = (0, 0, steering_us, throttle_us, steering_period_us, throttle_period_us)
-    return dict(zip(CONTROL_FIELDS, (arduino_ms, system_s, *pulses), strict=True))
-
-
-PULSES = st.tuples(st.integers(252, 478), st.integers(30, 177)).map(lambda p: (4 * p[0], 4 * p[1]))
-
-
-@given(
-    pulses=st.lists(st.one_of(PULSES, st.none()), max_size=30),
-    first=PULSES,
-    steps=st.lists(st.integers(10, 60), min_size=31, max_size=31),
-)
-@settings(max_examples=30, deadline=None)
-def test_pulses_come_back(tmp_path_factory, pulses, first, steps):
-    folder = tmp_path_factory.mktemp("round") / NAME
-    pulses = [first, *pulses]
-    times = [1.76e9 + sum(steps[:i]) / 1000 for i in range(len(pulses))]
-    with EpisodeWriter(folder, About("x"), resolution=(64, 36), flags=True) as writer:
-        for i, (t_s, found) in enumerate(zip(times, pulses, strict=True)):
-            steering, throttle = found or (1500, None)
-            writer.control(t_s, sum(steps[:i]), steering, throttle, 21316, 1016 if throttle else None)
-            writer.frame(t_s, FRAME)
-    measured = [p for p in pulses if p]
-    expected = [t for t, p in zip(times, pulses, strict=True) if p]
-    for _ in range(2):
-        controls = read_controls(folder)
-        assert list(zip(controls.steering_us.tolist(), controls.throttle_us.tolist(), strict=True)) == measured
-        assert controls.left_out == len(pulses) - len(measured)
-        assert controls.times_s == pytest.approx(np.array(expected) - expected[0], abs=1e-6)
-        (folder / "control_data.csv").unlink(missing_ok=True)  # and again from the JSON
-    recordings = load_recordings(folder, chunk=1, sync_s=0.005)
-    assert recordings.samples
-    pwm = PwmCalibration()
-    known = {round(t - times[0], 3): p for t, p in zip(times, pulses, strict=True) if p}
-    for sample in recordings.samples:
-        again = pwm.pulses(*sample.chunk[0].tolist())
-        steering, throttle = known[round(sample.time_s, 3)]
-        assert abs(again.steering_us - steering) < ARDUINO_STEP_US
-        assert abs(again.throttle_us - throttle) < ARDUINO_STEP_US
-
-
-def times_of(folder, rows):
-    return read_controls(csv_of(folder, rows)).times_s
-
-
-def test_times_are_the_systems(tmp_path):
-    rows = [row_of(1.76e9 + t, ms) for t, ms in ((0, 0), (0.033, 20), (0.066, 60), (1.1, 1100))]
-    assert times_of(tmp_path, rows) == pytest.approx([0, 0.033, 0.066, 1.1], abs=1e-6)
-
-
-def test_times_of_a_burst_are_the_arduinos(tmp_path):
-    late = [row_of(1.76e9 + 0.0003 * i, 33 * i) for i in range(20)]
-    live = [row_of(1.76e9 + 0.006 + 0.033 * i, 33 * (20 + i)) for i in range(20)]
-    assert times_of(tmp_path, late + live) == pytest.approx(0.033 * np.arange(40), abs=1e-6)
-
-
-@pytest.mark.parametrize("by_s", [3600, -3600, -0.2])
-def test_times_over_a_clock_that_was_set_are_the_arduinos(tmp_path, by_s):
-    rows = [row_of(1.76e9 + 0.033 * i + (by_s if i > 5 else 0), 33 * i) for i in range(12)]
-    assert times_of(tmp_path, rows) == pytest.approx(0.033 * np.arange(12), abs=1e-6)
-
-
-def test_the_arduinos_clock_wraps_and_restarts(tmp_path):
-    stamps = [2**32 - 66, 2**32 - 33, 0, 33, 66, 5, 38, 38]  # and says one thing twice
-    rows = [row_of(1.76e9 + 0.0003 * i, ms) for i, ms in enumerate(stamps)]
-    expected = [0, 0.033, 0.066, 0.099, 0.132, 0.1323, 0.1653, 0.1656]
-    assert times_of(tmp_path, rows) == pytest.approx(expected, abs=2e-6)
-
-
-def test_a_hole_of_unmeasured_controls_is_a_long_step(tmp_path):
-    rows = [row_of(1.76e9 + 0.033 * i, 33 * i, throttle_us=0 if 3 <= i < 9 else 136) for i in range(12)]
-    controls = read_controls(csv_of(tmp_path, rows))
-    assert controls.left_out == 6
-    assert controls.times_s == pytest.approx([0.033 * i for i in (0, 1, 2, 9, 10, 11)], abs=1e-6)
-
-
-def test_what_no_recorder_measured_is_left_out(tmp_path):
-    rows = [row_of(1.76e9 + 0.033 * i, 33 * i) for i in range(4)]
-    rows[1]["throttle_measured"] = False  # whatever the values say
-    rows[2]["steering_raw_us"] = 1500.5
-    (tmp_path / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
-    controls = read_controls(tmp_path)
-    assert controls.left_out == 2
-    assert controls.times_s == pytest.approx([0, 0.099], abs=1e-6)
-
-
-@pytest.mark.parametrize("word", ["nobody", "the cat"])
-def test_pulses_that_the_car_did_not_follow_are_never_replayed(tmp_path, word):
-    """The throttle was held, and the stick said go: a replay would move a car that had stood."""
-    drivers = ["policy"] * 4 + [word] * 4 + ["human"] * 4
-    rows = [row_of(1.76e9 + 0.033 * i, 33 * i) | {"driver": driver} for i, driver in enumerate(drivers)]
-    left = [0.033 * i for i in (*range(4), *range(8, 12))]
-    (tmp_path / "json").mkdir()
-    (tmp_path / "json" / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
-    for folder in (csv_of(tmp_path / "csv", rows), tmp_path / "json"):
-        controls = read_controls(folder)
-        assert controls.left_out == 4 and controls.times_s == pytest.approx(left, abs=1e-6)
-
-
-def test_controls_of_a_real_recording():
-    folder = real_episode()
-    rows = json.loads((folder / "episode_data.json").read_text())["control_samples"]
-    measured = [r for r in rows if r["throttle_raw_us"] and 762 < r["throttle_period_us"] < 1270]
-    controls = read_controls(folder)
-    assert controls.steering_us.tolist() == [r["steering_raw_us"] for r in measured]
-    assert controls.throttle_us.tolist() == [r["throttle_raw_us"] for r in measured]
-    stamps = np.array([r["arduino_timestamp"] for r in measured])
-    assert controls.times_s == pytest.approx((stamps - stamps[0]) / 1000, abs=1e-6)  # it begins with a burst
-    assert controls.left_out == len(rows) - len(measured)
-
-
-@pytest.mark.parametrize("make", ["nothing", "empty", "frames", "fifo", "unmeasured"])
-def test_no_controls_is_a_sentence(tmp_path, make):
-    folder = tmp_path / NAME
-    if make != "nothing":
-        folder.mkdir()
-    if make == "frames":
-        (folder / "frame_data.csv").write_text("frame_id,timestamp,image_path\n1,1.0,x.jpg\n")
-    if make == "fifo":
-        os.mkfifo(folder / "control_data.csv")
-    if make == "unmeasured":
-        csv_of(folder, [row_of(1.0, 0, throttle_us=0), row_of(1.1, 100, steering_period_us=42632)])
-    with pytest.raises(EpisodeError, match="no control with both pulses") as e:
-        read_controls(folder)
-    assert "\n" not in str(e.value)
-
-
-ODD = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just([]), st.just("nan"))
-FIELDS = {
-    "arduino_timestamp": st.integers(0, 2**32),
-    "system_timestamp": st.one_of(st.floats(0, 3), st.floats()),
-    "steering_raw_us": st.sampled_from([0, 1000, 1456, 1900.5]),
-    "throttle_raw_us": st.sampled_from([0, 120, 136, "136", None]),
-    "steering_period_us": st.sampled_from([21316, 42632]),
-    "throttle_period_us": st.sampled_from([0, 1016]),
-    "steering_normalized": st.just(0.1),
-    "throttle_normalized": st.just(0.1),
-    "throttle_measured": st.sampled_from([True, False, "False", "True", None]),
-}
-ROW = st.fixed_dictionaries({f: st.one_of(v, v, v, v, v, ODD) for f, v in FIELDS.items()})
-WILD = st.one_of(
-    ODD, st.fixed_dictionaries({"control_samples": st.one_of(st.lists(st.one_of(ROW, ROW, ODD), max_size=25), ODD)})
-)
-QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-
-
-def check_sane(folder):
-    try:
-        controls = read_controls(folder)
-    except EpisodeError as e:
-        assert "\n" not in str(e)
-        return False
-    n = len(controls.times_s)
-    assert n == len(controls.steering_us) == len(controls.throttle_us) > 0
-    assert controls.times_s[0] == 0
-    assert np.isfinite(controls.times_s).all()
-    assert (np.diff(controls.times_s) >= 0).all()
-    assert (controls.steering_us > 0).all()
-    assert (controls.throttle_us > 0).all()
-    assert controls.steering_us.dtype == controls.throttle_us.dtype == np.int64
-    return True
-
-
-@QUICK
-@given(content=WILD)
-def test_wild_json(tmp_path_factory, content):
-    folder = tmp_path_factory.mktemp("json")
-    (folder / "episode_data.json").write_text(json.dumps(content))
-    check_sane(folder)
-
-
-@pytest.mark.slow
-@QUICK
-@given(rows=st.lists(ROW, max_size=25), tail=st.binary(max_size=40), cut=st.integers(0, 60))
-def test_wild_csv(tmp_path_factory, rows, tail, cut):
-    folder = tmp_path_factory.mktemp("csv")
-    with (folder / "control_data.csv").open("w", newline="") as f:
-        table = csv.DictWriter(f, list(FIELDS))
-        table.writeheader()
-        table.writerows(rows)
-    path = folder / "control_data.csv"
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) - cut] + tail)
-    check_sane(folder)
