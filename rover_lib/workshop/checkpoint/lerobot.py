@@ -20,7 +20,14 @@ from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import COPY_AGAIN, LARGEST_SIDE_PX, MOST_NUMBERS, name_numbers, name_weights
+from rover_lib.workshop.checkpoint.contents import (
+    COPY_AGAIN,
+    LARGEST_SIDE_PX,
+    MOST_NUMBERS,
+    Contents,
+    name_numbers,
+    name_weights,
+)
 from rover_lib.workshop.recordings.samples import camera_names
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -60,11 +67,8 @@ def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
     return None
 
 
-def read_lerobot(folder: Path) -> tuple[ActConfig, dict[str, Tensor], dict[str, Any]]:
-    """Return the config, the weights by LeRobot's names without the leading `model.`, and more for the report.
-
-    Raises CheckpointError for missing or damaged files, and for policies that this project cannot run.
-    """
+def read_lerobot(folder: Path) -> Contents:
+    """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
     _refuse_pieces(folder)
     said, notes = _act_config(folder)
     state, buffers = _read_safetensors(folder / "model.safetensors"), {}
