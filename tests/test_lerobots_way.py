@@ -44,32 +44,22 @@ def lerobot_train(dataset, out, *options, cache, timeout=1800):
     return out / "checkpoints/last"
 
 
-@pytest.fixture(scope="module", params=[pytest.param("images", marks=pytest.mark.release), "video"])
-def artifact(request, tmp_path_factory):
-    """The static artifact that rover makes of a policy that LeRobot trained on a dataset of images, or of video."""
-    folder = tmp_path_factory.mktemp(request.param)
-    cache, recorded, dataset = folder / "cache", folder / "mine", folder / "dataset"
-    with pytest.MonkeyPatch.context() as patch:
-        import datasets
-
-        patch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
-        patch.setenv("HF_HUB_OFFLINE", "1")
-        rover("world", "record", recorded, "--count", 3)
-        video = ["--video"] if request.param == "video" else []
-        rover("export-dataset", recorded, dataset, "--size", "64x36", *video)
-        new = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY)
-        steps = ("--steps=2", "--save_freq=2", "--batch_size=2")
-        last = lerobot_train(dataset, folder / "train", *new, *steps, cache=cache)
-        assert last.resolve().name == "000002"
-        words = json.loads(rover("inspect", folder / "train", "--json"))["checkpoint"]
-        assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
-        make_artifact(load(last, dataset), folder / "policy_static.pt", Recipe.of(params(), samples=6))
-    return folder / "policy_static.pt"
-
-
 @pytest.mark.slow
 @needs.real_time
-def test_from_recordings_to_a_drive(artifact, tmp_path):
+def test_from_recordings_to_a_drive(tmp_path, monkeypatch):
+    import datasets
+
+    cache, recorded, dataset = (tmp_path / name for name in ("cache", "mine", "dataset"))
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    rover("world", "record", recorded, "--count", 3)
+    rover("export-dataset", recorded, dataset, "--size", "64x36", "--video")
+    new = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY)
+    last = lerobot_train(dataset, tmp_path / "train", *new, "--steps=2", "--save_freq=2", "--batch_size=2", cache=cache)
+    words = json.loads(rover("inspect", tmp_path / "train", "--json"))["checkpoint"]
+    assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
+    artifact = tmp_path / "policy_static.pt"
+    make_artifact(load(last, dataset), artifact, Recipe.of(params(), samples=6))
     manifest = load_policy(artifact).manifest
     assert (manifest["mode"], manifest["rate_hz"], manifest["chunk"]) == ("static", 30, 32)
     assert manifest["cameras"] == [{"name": "cam_front", "height": 36, "width": 64}]

@@ -5,6 +5,7 @@ Nothing in a file is ever executed. `trainer` and `lerobot` read the two formats
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from rover_lib.onboard.kinds import refuse_holder, refuse_part
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import TWO_ACTIONS, check_weights, tensor_bytes
+from rover_lib.workshop.checkpoint.contents import TWO_ACTIONS, Contents, check_weights, tensor_bytes
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer
 from rover_lib.workshop.recordings.samples import Layout
@@ -185,16 +186,15 @@ def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
         if (found_at := lerobot_folder(path)) is None:
             refuse_holder(path)
         path, notes = found_at or (path, [])
-        config, weights, extra = read_lerobot(path)
-        extra["notes"] = notes + extra["notes"]
-        return _checkpoint(path, "lerobot", path / "model.safetensors", checked, config, weights, extra)
+        found = _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path))
+        return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
     if not path.is_file():
         what = "neither a file nor a folder" if path.exists() else "not found"
         raise CheckpointError(
             f"{path}: {what}",
             remedy="give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub",
         )
-    return _checkpoint(path, "trainer", path, checked, *read_trainer(path))
+    return _checkpoint(path, "trainer", path, checked, read_trainer(path))
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -216,31 +216,23 @@ def normalisation(c: ActConfig) -> dict[str, str]:
     return words
 
 
-def _checkpoint(
-    path: Path,
-    kind: str,
-    file: Path,
-    checked: str | None,
-    config: ActConfig,
-    weights: dict[str, Tensor],
-    extra: dict[str, Any],
-) -> Checkpoint:
-    """file: the weights'. extra: more for the report. Raises CheckpointError unless config and weights agree."""
+def _checkpoint(path: Path, kind: str, file: Path, checked: str | None, read: Contents) -> Checkpoint:
+    """file: the weights'. Raises CheckpointError unless config and weights agree."""
+    config, weights, extra = read
     if (sha256 := sha256_of(file)) != checked:
         check_weights(path, config, weights)
-    parts: dict[str, int] = {}
+    parts: Counter[str] = Counter()
     for k, v in weights.items():
-        part = "vae (training only)" if k.startswith("vae_") else k.split(".")[0].removesuffix("_embed")
-        parts[part] = parts.get(part, 0) + v.numel()
+        parts["vae (training only)" if k.startswith("vae_") else k.split(".")[0].removesuffix("_embed")] += v.numel()
     total = sum(parts.values())
-    acts = total - parts.get("vae (training only)", 0)
+    acts = total - parts["vae (training only)"]
     report = {
         "format": kind,
         "file_mb": file.stat().st_size / 1e6,
         "weights_mb": tensor_bytes(weights) / 1e6,
         "parameters": total,
         "parameters_acting": acts,
-        "parameters_by_part": parts,
+        "parameters_by_part": dict(parts),
         "int8_floor_mb": acts / 1e6,
         "normalisation": normalisation(config),
         **extra,

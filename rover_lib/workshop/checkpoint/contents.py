@@ -11,6 +11,9 @@ from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, expected_shapes
 from rover_lib.workshop.untrusted import quote, quote_all
 
+# Config, weights by LeRobot's names without the leading `model.`, and more for the report.
+Contents = tuple[ActConfig, dict[str, Tensor], dict[str, Any]]
+
 TWO_ACTIONS = ("steering", "throttle")
 # Bounds, each far above what a policy of full size has.
 LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels a side

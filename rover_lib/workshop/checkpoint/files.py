@@ -18,6 +18,7 @@ from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
 
+Weights = dict[str, Tensor]
 # Settings of the user's trainer, which its checkpoints name:
 DROPOUT = 0.1  # LeRobot's default
 KL_WEIGHT = 10.0
@@ -36,12 +37,7 @@ def trainer_can_hold(config: ActConfig) -> bool:
 
 
 def write_trainer(
-    path: Path,
-    config: ActConfig,
-    weights: dict[str, Tensor],
-    best_val_loss: float,
-    origin: dict[str, Any],
-    **settings: Any,
+    path: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
 ) -> None:
     """One file in the format of the user's trainer. weights: LeRobot's names without the leading `model.`. settings: of
     its training, as `trainer_config` wants them.
@@ -74,7 +70,7 @@ def save_torch(path: Path, content: Any) -> None:
         torch.save(content, file)
 
 
-def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], origin: dict[str, Any]) -> None:
+def write_lerobot(folder: Path, config: ActConfig, weights: Weights, origin: dict[str, Any]) -> None:
     """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_trainer`.
 
     Raises CheckpointError on a full disk.
@@ -107,12 +103,7 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
 
 
 def write_both(
-    folder: Path,
-    config: ActConfig,
-    weights: dict[str, Tensor],
-    best_val_loss: float,
-    origin: dict[str, Any],
-    **settings: Any,
+    folder: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
 ) -> dict[str, str]:
     """pretrained_model/ in a folder, and best_model.pth where the trainer's format can hold the policy. Arguments as of
     `write_trainer`. Returns sha256 by name: of the weights' file of the one, and of the other.
@@ -141,37 +132,20 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
     """Return the config of the user's trainer as a plain dict, key for key.
 
     known: learning_rate, batch_size, data_dir, output_dir, device and seed, and rate_hz, the steps per second of its
-    plans, which is written if it is not the trainer's 30. Give folders by their name only, because a
-    checkpoint is shown to others.
+    plans, which is written if it is not the trainer's 30. Give folders by their name only, because a checkpoint is
+    shown to others.
     """
     ((height, width),) = size.image_sizes
-    return {
-        "image_width": width,
-        "image_height": height,
-        "n_obs_steps": 1,
-        "chunk_size": size.chunk,
-        "n_action_steps": size.chunk,
-        "hidden_size": size.dim,
-        "n_encoder_layers": size.encoder_layers,
-        "n_decoder_layers": size.decoder_layers,
-        "n_heads": size.heads,
-        "feedforward_dim": size.feedforward,
-        "dropout": DROPOUT,
-        "kl_weight": KL_WEIGHT,
-        "vision_encoder": size.backbone,
+    rate_hz = known.pop("rate_hz", RATE_HZ)
+    shape = {
+        "image_width": width, "image_height": height, "n_obs_steps": 1, "chunk_size": size.chunk,
+        "n_action_steps": size.chunk, "hidden_size": size.dim, "n_encoder_layers": size.encoder_layers,
+        "n_decoder_layers": size.decoder_layers, "n_heads": size.heads, "feedforward_dim": size.feedforward,
+        "dropout": DROPOUT, "kl_weight": KL_WEIGHT, "vision_encoder": size.backbone,
         "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
-        "learning_rate": known["learning_rate"],
-        "weight_decay": WEIGHT_DECAY,
-        "betas": BETAS,
-        "grad_clip": GRAD_CLIP,
-        "num_epochs": 1,
-        "batch_size": known["batch_size"],
-        "train_split": 0.75,
-        "data_dir": known["data_dir"],
-        "output_dir": known["output_dir"],
-        "device": known["device"],
-        "seed": known["seed"],
-        "log_freq": 1,
-        "save_freq": 1,
-        "num_workers": 0,
-    } | ({} if (rate_hz := known.get("rate_hz", 30)) == 30 else {"rate_hz": rate_hz})
+    }  # fmt: skip
+    training = {
+        "weight_decay": WEIGHT_DECAY, "betas": BETAS, "grad_clip": GRAD_CLIP, "num_epochs": 1, "train_split": 0.75,
+        "log_freq": 1, "save_freq": 1, "num_workers": 0,
+    }  # fmt: skip
+    return shape | training | known | ({} if rate_hz == RATE_HZ else {"rate_hz": rate_hz})

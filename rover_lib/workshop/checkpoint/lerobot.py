@@ -20,7 +20,14 @@ from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import COPY_AGAIN, LARGEST_SIDE_PX, MOST_NUMBERS, name_numbers, name_weights
+from rover_lib.workshop.checkpoint.contents import (
+    COPY_AGAIN,
+    LARGEST_SIDE_PX,
+    MOST_NUMBERS,
+    Contents,
+    name_numbers,
+    name_weights,
+)
 from rover_lib.workshop.recordings.samples import camera_names
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -60,11 +67,8 @@ def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
     return None
 
 
-def read_lerobot(folder: Path) -> tuple[ActConfig, dict[str, Tensor], dict[str, Any]]:
-    """Return the config, the weights by LeRobot's names without the leading `model.`, and more for the report.
-
-    Raises CheckpointError for missing or damaged files, and for policies that this project cannot run.
-    """
+def read_lerobot(folder: Path) -> Contents:
+    """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
     _refuse_pieces(folder)
     said, notes = _act_config(folder)
     state, buffers = _read_safetensors(folder / "model.safetensors"), {}
@@ -74,29 +78,32 @@ def read_lerobot(folder: Path) -> tuple[ActConfig, dict[str, Tensor], dict[str, 
     weights, more = name_weights(folder, state)
     inner, outer = Normaliser(folder, *INNER, said, buffers), Normaliser(folder, *OUTER, said, buffers)
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
-    config = ActConfig(
-        cameras=tuple(camera_names(inner.recorded_cameras(images))),
-        image_sizes=tuple((f.shape[1], f.shape[2]) for f in images.values()),
-        state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
-        action_names=name_numbers(actions.shape[0], "action"),
-        chunk=said.chunk_size,
-        dim=said.dim_model,
-        heads=said.n_heads,
-        feedforward=said.dim_feedforward,
-        encoder_layers=said.n_encoder_layers,
-        decoder_layers=said.n_decoder_layers,
-        latent=said.latent_dim,
-        vae_layers=said.n_vae_encoder_layers if said.use_vae else 0,
-        backbone=said.vision_backbone,
-        dilation=bool(said.replace_final_stride_with_dilation),
-        pre_norm=said.pre_norm,
-        activation=said.feedforward_activation,
-        rate_hz=_own_rate_hz(folder),
-        image_norm=tuple(inner.affine(key, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for key in images),
-        state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
-        sees_state=numbers is not None,
-        action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
-    )
+    with _as_checkpoint_error(folder):
+        config = ActConfig(
+            cameras=tuple(camera_names(inner.recorded_cameras(images))),
+            image_sizes=tuple((f.shape[1], f.shape[2]) for f in images.values()),
+            state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
+            action_names=name_numbers(actions.shape[0], "action"),
+            chunk=said.chunk_size,
+            dim=said.dim_model,
+            heads=said.n_heads,
+            feedforward=said.dim_feedforward,
+            encoder_layers=said.n_encoder_layers,
+            decoder_layers=said.n_decoder_layers,
+            latent=said.latent_dim,
+            vae_layers=said.n_vae_encoder_layers if said.use_vae else 0,
+            backbone=said.vision_backbone,
+            dilation=bool(said.replace_final_stride_with_dilation),
+            pre_norm=said.pre_norm,
+            activation=said.feedforward_activation,
+            rate_hz=_own_rate_hz(folder),
+            image_norm=tuple(
+                inner.affine(key, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for key in images
+            ),
+            state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
+            sees_state=numbers is not None,
+            action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
+        )
     sources = {"in": inner.source, "out": outer.source}
     written = (folder / ORIGIN).exists()
     extra = {"optimizer_mb": 0.0, "normalisation_from": sources, "written_here": written, "notes": more + notes}
@@ -237,9 +244,8 @@ class Normaliser:
                 "policy_postprocessor* files, or say IDENTITY where it was trained on raw values",
             )
         x = torch.stack([torch.zeros(shape), torch.ones(shape)]).double()
-        with _as_checkpoint_error(self.where):
-            y = step._normalize_action(x, True) if inverse else step._normalize_observation({key: x}, False)[key]
-            shift, scale = y[0].flatten(), (y[1] - y[0]).flatten()
+        y = step._normalize_action(x, True) if inverse else step._normalize_observation({key: x}, False)[key]
+        shift, scale = y[0].flatten(), (y[1] - y[0]).flatten()
         finite = torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()  # used as float32
         if y.shape != x.shape or not finite or (scale < 0).any() or not (inverse or scale.all()):
             raise CheckpointError(

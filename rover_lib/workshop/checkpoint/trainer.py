@@ -22,6 +22,7 @@ from rover_lib.workshop.checkpoint.contents import (
     IS_IT_WHOLE,
     LARGEST_SIDE_PX,
     MOST_NUMBERS,
+    Contents,
     name_numbers,
     name_weights,
     tensor_bytes,
@@ -31,11 +32,8 @@ from rover_lib.workshop.untrusted import quote, quote_all
 TRAINER_CAMERA = "cam_front"
 
 
-def read_trainer(path: Path) -> tuple[ActConfig, dict[str, Tensor], dict[str, Any]]:
-    """Return the config, the weights by LeRobot's names without the leading `model.`, and more for the report.
-
-    Raises CheckpointError for a file that is damaged, would run code, or lacks something.
-    """
+def read_trainer(path: Path) -> Contents:
+    """Raises CheckpointError for a file that is damaged, would run code, or lacks something."""
     content = _read_pickle(path)
     for key in ("config", "model_state_dict"):
         if not isinstance(content, dict) or not isinstance(content.get(key), dict):

@@ -66,46 +66,15 @@ def is_dataset(root: Path) -> bool:
     return (root / INFO).is_file()
 
 
-@dataclass(frozen=True)
-class _Camera:
-    """name: what the policy calls the camera. key: what the dataset calls it. size: (height, width)."""
-
-    name: str
-    key: str
-    size: tuple[int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class _Pictures:
-    """The cameras of a dataset that a policy looks through, opened once for all of its samples."""
-
-    dataset: "LeRobotDataset"
-    cameras: tuple[_Camera, ...]
-
-    def frames_bgr(self, row: int, path: Path) -> dict[str, np.ndarray]:
-        """Read one frame's pictures by the cameras' names, (h, w, 3) uint8 BGR each."""
-        with _as_episode_error(path, f"its frame {row} cannot be decoded"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
-            item = self.dataset[row]
-            # Each is (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
-            pixels = [(item[camera.key] * 255).round().byte().permute(1, 2, 0).numpy() for camera in self.cameras]
-        frames = {}
-        for camera, frame in zip(self.cameras, pixels, strict=True):
-            if frame.shape != (*camera.size, 3):
-                raise EpisodeError(
-                    f"{path}: its frame {row} of '{camera.key}' has another shape than {INFO} says, {camera.size}",
-                    found=frame.shape,
-                    remedy="record pictures of one size, in colour, in one dataset",
-                )
-            frames[camera.name] = np.ascontiguousarray(frame[..., ::-1])
-        return frames
-
-
 @dataclass(frozen=True, eq=False)
 class LerobotSample(Sample):
-    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera)."""
+    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera).
 
-    pictures: _Pictures = field(kw_only=True)
+    dataset: opened once for all samples. cameras: by the policy's name of each, the dataset's, and (height, width).
+    """
+
+    dataset: "LeRobotDataset" = field(kw_only=True)
+    cameras: Mapping[str, tuple[str, tuple[int, int]]] = field(kw_only=True)
 
     @property
     def frame_name(self) -> str:
@@ -114,9 +83,22 @@ class LerobotSample(Sample):
     def frame_bgr(self) -> Any:
         """Read the picture, (h, w, 3) uint8 BGR, by LeRobot's loader; of several cameras, a dict by their names.
 
-        Raises EpisodeError if it cannot be decoded.
+        Raises EpisodeError if it cannot be decoded, or has another size than the others.
         """
-        frames = self.pictures.frames_bgr(self.row, self.frame_path)
+        frames = {}
+        with _as_episode_error(self.frame_path, f"its frame {self.row} cannot be decoded"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            item = self.dataset[self.row]
+            for name, (key, size) in self.cameras.items():
+                # (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
+                rgb = (item[key] * 255).round().byte().permute(1, 2, 0).numpy()
+                if rgb.shape != (*size, 3):
+                    raise EpisodeError(
+                        f"{self.frame_path}: its frame {self.row} of '{key}' has another shape than {size} in {INFO}",
+                        found=rgb.shape,
+                        remedy="record pictures of one size, in colour, in one dataset",
+                    )
+                frames[name] = np.ascontiguousarray(rgb[..., ::-1])
         return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
 
 
@@ -132,20 +114,19 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
-    _check_files(root, info["features"], [camera.key for camera in cameras])
+    keys = [key for key, _ in cameras.values()]
+    _check_files(root, info["features"], keys)
     dataset = _open_local(root)
     columns = _columns(root, dataset, layout)
     starts = _check_frames(root, dataset, columns)
-    for camera in cameras:
-        if camera.key in dataset.meta.video_keys:
-            _check_video_times(root, dataset.meta, camera.key)
+    for key in (key for key in keys if key in dataset.meta.video_keys):
+        _check_video_times(root, dataset.meta, key)
     exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
     _check_numbers(root, columns, layout, exported.car)
-    pictures = _Pictures(dataset, cameras)
     episodes = []
     parts = np.split(np.arange(len(columns["index"])), starts[1:])
     for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
-        episodes.append(_episode(root, pictures, columns, rows, chunk, exported, i))
+        episodes.append(_episode(dataset, cameras, columns, rows, chunk, exported, i))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
@@ -233,8 +214,8 @@ def _is_feature(feature: Any) -> bool:
     return isinstance(shape, list) and all(is_whole(n, 1, 10_000) for n in shape)
 
 
-def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, tuple[_Camera, ...]]:
-    """Find the cameras that the policy looks through, and the names and columns of states and actions."""
+def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, Any]]:
+    """Find the names and columns of states and actions, and the policy's cameras, as `LerobotSample` wants them."""
     features = info["features"]
     keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
@@ -245,7 +226,7 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
         what = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
         remedy = "say once each what the policy looks through: --camera NAME, with commas between several"
         raise EpisodeError(f"{root}: {what}", found=quote_all(keys), remedy=remedy)
-    cameras = tuple(_Camera(name, keys[name], _picture_size(root, keys[name], features[keys[name]])) for name in names)
+    cameras = {name: (keys[name], _picture_size(root, keys[name], features[keys[name]])) for name in names}
     for key in (STATE, ACTION):
         row = features.get(key, {})  # LeRobot makes 1 of 0.3 where it says bool
         if len(row.get("shape", ())) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
@@ -255,7 +236,7 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
             )
     actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
     states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
-    sizes = {camera.name: camera.size for camera in cameras}
+    sizes = {name: size for name, (_, size) in cameras.items()}
     return Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes), cameras
 
 
@@ -463,8 +444,8 @@ def _check_frames(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, n
 
 
 def _episode(
-    root: Path,
-    pictures: _Pictures,
+    dataset: "LeRobotDataset",
+    cameras: Mapping[str, Any],
     columns: Mapping[str, np.ndarray],
     rows: np.ndarray,
     chunk: int,
@@ -472,9 +453,9 @@ def _episode(
     number: int,
 ) -> Episode:
     """rows: of the whole dataset, those of episode `number`."""
-    meta, first, n = pictures.dataset.meta, int(rows[0]), len(rows)
+    root, meta, first, n = dataset.root, dataset.meta, int(rows[0]), len(rows)
     driver, outcome = exported.drivers[number], exported.outcomes[number]
-    name, keys = f"episode_{number:06d}", [camera.key for camera in pictures.cameras]
+    name, keys = f"episode_{number:06d}", [key for key, _ in cameras.values()]
     with _as_episode_error(root, f"where the files of episode {number} lie cannot be read"):
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
@@ -495,7 +476,8 @@ def _episode(
             state=columns[STATE][row].copy(),
             chunk=chunks[k].copy(),
             is_pad=pads[k].copy(),
-            pictures=pictures,
+            dataset=dataset,
+            cameras=cameras,
             row=int(row),
             driver=HUMAN if taken_over[k] else driver,
             car=exported.car,

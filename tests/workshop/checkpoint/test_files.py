@@ -86,7 +86,7 @@ def test_a_full_disk_is_one_sentence(config, weights, tmp_path, write):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-        with pytest.raises(RoverError, match="policy: cannot be written whole; is the disk full"):
+        with pytest.raises(RoverError, match="disk full"):
             write(tmp_path / "policy", config, weights)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -106,15 +106,16 @@ def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_pat
     read = load_checkpoint(tmp_path)
     assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
     assert read.recorded_as(Layout(("cam_front",), rate_hz=15.0)) is read
-    with pytest.raises(CheckpointError, match="plans 15 steps a second, found recordings of 30 frames"):
+    with pytest.raises(CheckpointError, match="15 steps"):
         read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
     assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
-    with pytest.raises(CheckpointError, match="cannot hold this policy's normalisation or rate"):
-        write_trainer(tmp_path / "best_model.pth", slow, weights, 0.25, ORIGIN, **SETTINGS)
-    for damaged in ('{"rate_hz": 0}', '{"rate_hz": NaN}', '{"rate_hz": true}'):
-        (tmp_path / "origin.json").write_text(damaged)
-        with pytest.raises(CheckpointError, match="'rate_hz' must be above 0"):
-            load_checkpoint(tmp_path)
+    for other in (slow, replace(config, action_unnorm=Affine((0.4, 0.02), (0.1, 0.05)))):
+        with pytest.raises(CheckpointError, match="normalisation or rate"):
+            write_trainer(tmp_path / "best_model.pth", other, weights, 0.25, ORIGIN, **SETTINGS)
+    assert not (tmp_path / "best_model.pth").exists()
+    (tmp_path / "origin.json").write_text('{"rate_hz": NaN}')
+    with pytest.raises(CheckpointError, match="rate_hz"):
+        load_checkpoint(tmp_path)
 
 
 @pytest.mark.slow
@@ -127,10 +128,3 @@ def test_other_statistics_beside_the_same_weights_are_another_policy(config, wei
     was, again, corrected = made.values()
     assert was.sha256 == corrected.sha256 and was.identity == again.identity != corrected.identity
     assert calibrate(was, memory_samples(2)).checkpoint == was.identity
-
-
-def test_the_trainers_format_has_no_place_for_normalised_actions(config, weights, tmp_path):
-    normalised = replace(config, action_unnorm=Affine((0.4, 0.02), (0.1, 0.05)))
-    with pytest.raises(CheckpointError, match="cannot hold this policy's normalisation"):
-        write_trainer(tmp_path / "best_model.pth", normalised, weights, 0.25, ORIGIN, **SETTINGS)
-    assert not list(tmp_path.iterdir())

@@ -111,18 +111,11 @@ def test_pairs_of_a_faultless_recording(tmp_path):
     ("columns", "driver"), [({}, "human"), ({"mode": "static"}, "policy"), ({"driver": "nobody"}, "nobody")]
 )
 def test_every_sample_says_who_drove(tmp_path, columns, driver):
-    edit(record(tmp_path), lambda content: [row.update(columns) for row in content["control_samples"]] and None)
-    assert {sample.driver for sample in load(tmp_path).samples} == {driver}
-
-
-def test_a_driver_of_whom_nobody_knows_is_left_out(tmp_path):
-    def change(content):
-        for row in content["control_samples"][10:20]:
-            row["driver"] = "the cat"
-
-    recordings = load(edit(record(tmp_path), change).parent)
-    assert kinds(recordings)["unknown_driver"] == 10
-    assert {sample.driver for sample in recordings.samples} == {"human"}
+    edit(record(tmp_path), lambda content: [row.update(columns) for row in content["control_samples"][10:]] and None)
+    edit(tmp_path / "episode_20260101_120000", lambda content: content["control_samples"][20].update(driver="the cat"))
+    recordings = load(tmp_path)
+    assert {sample.driver for sample in recordings.samples if sample.row > 15} == {driver}
+    assert kinds(recordings)["unknown_driver"] == 1
 
 
 def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
@@ -253,22 +246,16 @@ def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
     assert kinds(load(tmp_path))["throttle_no_pulse"] == 2
 
 
-def test_two_periods_at_once_are_odd(tmp_path):
-    def change(content):
-        content["control_samples"][20].update(steering_period_us=42632, steering_normalized=0.0)
-
-    edit(record(tmp_path), change)
-    assert kinds(load(tmp_path)) == {"steering_odd_period": 1}
-
-
 def test_single_lost_readings_cost_no_frame(tmp_path):
     def change(content):
-        for control in content["control_samples"][5:35:3]:
+        controls = content["control_samples"]
+        controls[20].update(steering_period_us=42632, steering_normalized=0.0)  # two periods at once
+        for control in controls[5:35:3]:
             control.update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"throttle_zero_period": 10}
+    assert kinds(recordings) == {"throttle_zero_period": 10, "steering_odd_period": 1}
     assert len(recordings.samples) == 40
     assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009
 
@@ -360,16 +347,6 @@ def test_without_json_and_csvs_the_folder_is_skipped(tmp_path, text):
     shutil.rmtree(tmp_path / "episode_20260101_000000")
     with pytest.raises(EpisodeError, match="no usable sample in 1 episode folder"):
         load(tmp_path)
-
-
-def test_files_larger_than_any_drives_are_not_read(tmp_path):
-    """Sparse files of a terabyte take no disk, but reading them would leave no memory for the other episodes."""
-    record(tmp_path, "episode_20260101_120000")
-    other = record(tmp_path, "episode_20260102_120000")
-    for name in ("episode_data.json", "control_data.csv", "frame_data.csv"):
-        os.truncate(other / name, 1 << 40)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"unreadable": 3, "nothing_usable": 1} and len(recordings.episodes) == 1
 
 
 def test_csv_faults(tmp_path):
@@ -619,25 +596,19 @@ def test_paths_that_leave_the_folder(tmp_path):
     assert all(s.frame_path.resolve().is_relative_to(folder) for s in recordings.samples)
 
 
-@pytest.mark.parametrize("make", ["nothing", "file", "empty", "strangers"])
+@pytest.mark.parametrize("make", [lambda root: None, lambda root: root.write_text("x"), lambda root: root.mkdir()])
 def test_no_recordings_is_one_sentence(tmp_path, make):
-    root = tmp_path / "episodes"
-    if make == "file":
-        root.write_text("x")
-    elif make != "nothing":
-        root.mkdir()
-    if make == "strangers":
-        (root / "photos").mkdir()
+    make(tmp_path / "episodes")
     with pytest.raises(EpisodeError, match="episodes") as e:
-        load(root)
+        load(tmp_path / "episodes")
     assert "\n" not in str(e.value)
 
 
-@pytest.mark.parametrize("options", [{"chunk": 0}, {"sync_s": 0}, {"sync_s": math.nan}])
-def test_options_that_make_no_sense(tmp_path, options):
+def test_options_that_make_no_sense(tmp_path):
     record(tmp_path)
-    with pytest.raises(EpisodeError, match="sync_s"):
-        load(tmp_path, **options)
+    for options in ({"chunk": 0}, {"sync_s": math.nan}):
+        with pytest.raises(EpisodeError, match="sync_s"):
+            load(tmp_path, **options)
 
 
 # ---- wild input ------------------------------------------------------------------------------------------
@@ -719,29 +690,6 @@ def wild_folder(tmp_path_factory):
 def test_wild_json(wild_folder, content):
     (wild_folder / "episode_data.json").write_text(json.dumps(content))
     check_sane(wild_folder.parent)
-
-
-@pytest.fixture(scope="module")
-def csv_folder(tmp_path_factory):
-    """Return a recording without its JSON, and the content of its CSV tables."""
-    folder = record(tmp_path_factory.mktemp("csv"), frames=2)
-    (folder / "episode_data.json").unlink()
-    return folder, {name: (folder / name).read_bytes() for name in ("control_data.csv", "frame_data.csv")}
-
-
-@pytest.mark.slow
-@QUICK
-@given(
-    controls=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), st.integers().map(str)))),
-    frames=st.lists(st.lists(st.one_of(st.text(max_size=6), st.floats().map(str), GOOD["image_path"]))),
-    tail=st.binary(max_size=20),
-)
-def test_wild_csv(csv_folder, controls, frames, tail):
-    folder, tables = csv_folder
-    for name, rows in (("control_data.csv", controls), ("frame_data.csv", frames)):
-        text = "\n".join(",".join(row) for row in rows)
-        (folder / name).write_bytes(tables[name] + text.encode(errors="replace") + tail)
-    check_sane(folder.parent)
 
 
 # ---- splitting and choosing ------------------------------------------------------------------------------
@@ -827,9 +775,5 @@ def test_fewer_than_asked_is_said(many):
     assert choose_calibration(many.samples[:7], 7)[1] is None
     with pytest.raises(EpisodeError, match="cannot choose"):
         choose_calibration((), 10)
-
-
-def test_equal_samples_are_not_taken_twice(many):
     same = tuple(replace(many.samples[0]) for _ in range(30))
-    chosen, _ = choose_calibration(same, 10)
-    assert len({id(s) for s in chosen}) == 10
+    assert len({id(s) for s in choose_calibration(same, 10)[0]}) == 10, "none is taken twice"
