@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib import cli as workstation
 from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.wheelhouse import REQUIREMENTS, make
@@ -79,11 +78,6 @@ def test_help_lists_the_rovers_commands_alone(rover):
     for name in commands:
         assert rover.run("rover", name, "--help").returncode == 0
     assert rover.run("rover", "world", "--help").returncode == 2  # a workstation's
-
-
-def test_a_workstation_has_the_rovers_commands_and_more():
-    assert set(workstation.main.commands) > set(onboard.main.commands)
-    assert {"run", "distill", "finetune", "sweep", "world"} <= set(workstation.main.commands)
 
 
 def test_inspects_an_artifact(rover, artifacts):

@@ -85,9 +85,8 @@ class _Writer(Interpreter):
             "policy",
             [_info(name, tensor) for name, tensor in self._inputs.items()],
             [_info(name, tensor) for name, tensor in zip(self._outputs, self._made, strict=True)],
-            [
-                c for name, c in self._constants.items() if name in used
-            ],  # a scale that torch reads from a constant is not
+            # A scale that torch reads from a constant is not used.
+            [c for name, c in self._constants.items() if name in used],
         )
         opset = helper.make_opsetid("", OPSET)
         return helper.make_model(graph, opset_imports=[opset], ir_version=IR_VERSION, producer_name="rover_lib")
@@ -114,16 +113,13 @@ class _Writer(Interpreter):
             return names[0]
         if n.op == "get_attr":
             return self._constant(str(n.target), result) if isinstance(result, Tensor) else None
-        if n.op == "call_module":
-            module = self.fetch_attr(str(n.target))
-            write = MODULES.get(type(module))
-        else:
-            module = None
-            write = FUNCTIONS.get(n.target) or FUNCTIONS.get(getattr(n.target, "__name__", ""))
+        module = self.fetch_attr(str(n.target)) if n.op == "call_module" else None
+        kind = n.target if module is None else type(module)
+        write = WRITERS.get(kind) or WRITERS.get(getattr(kind, "__name__", ""))
         if write is None:
-            what = type(module).__name__ if module is not None else n.target
+            what = getattr(kind, "__name__", kind)
             raise QuantizeError(f"{n.name}: {what} has no form in ONNX here", remedy="add it to onnx_graph.py")
-        return write(self, n, result, module) if module is not None else write(self, n, result)
+        return write(self, n, result) if module is None else write(self, n, result, module)
 
     # --- what writers use ---
 
@@ -146,6 +142,10 @@ class _Writer(Interpreter):
 
     def _name(self, n: Any) -> str:
         return self._names[n]
+
+    def _unary(self, kind: str, n: Node, *constants: str, **attributes: Any) -> str:
+        """Write a node of one operator, that takes the node's first argument as it is, and constants."""
+        return self._add(kind, [self._name(n.args[0]), *constants], n.name, **attributes)
 
     def _is_columns(self, n: Any) -> bool:
         return n.op == "call_module" and isinstance(self.fetch_attr(n.target), Columns)
@@ -186,7 +186,7 @@ def _lowest(value: Tensor) -> int:
     return -128 if value.dtype == torch.qint8 else 0
 
 
-# --- modules: (writer, node, result, module) -> name ------------------------------------------------------------------
+# --- modules: (writer, node, result, module) -> name -----------------------------------------------------------------
 
 
 def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
@@ -316,7 +316,7 @@ def _linear(w: _Writer, n: Node, result: Tensor, m: nn.Linear) -> str:
 
 
 def _max_pool(w: _Writer, n: Node, result: Tensor, m: nn.MaxPool2d) -> str:
-    return w._add("MaxPool", [w._name(_args(n)[0])], n.name, **_geometry(m))  # works on INT8 values too
+    return w._unary("MaxPool", n, **_geometry(m))  # works on INT8 values too
 
 
 def _layer_norm(w: _Writer, n: Node, result: Tensor, m: nn.LayerNorm) -> str:
@@ -338,23 +338,8 @@ def _gelu(w: _Writer, n: Node, result: Tensor, m: nn.GELU) -> str:
     return w._add("Mul", [y, half], n.name)
 
 
-def _same(w: _Writer, n: Node, result: Any, m: nn.Module) -> str:
+def _same(w: _Writer, n: Node, result: Any, m: nn.Module | None = None) -> str:
     return w._name(_args(n)[0])
-
-
-MODULES: dict[type, Callable[..., str]] = {
-    Columns: _columns,
-    nn.Conv2d: _conv,
-    ConvReLU2d: _conv_relu,
-    int8.Conv2d: _int8_conv,
-    fused_int8.ConvReLU2d: _int8_conv,
-    nn.Linear: _linear,
-    nn.MaxPool2d: _max_pool,
-    nn.LayerNorm: _layer_norm,
-    nn.ReLU: _relu,
-    nn.GELU: _gelu,
-    nn.Identity: _same,
-}
 
 
 # --- functions and methods: (writer, node, result) -> name ------------------------------------------------------------
@@ -372,28 +357,26 @@ def _getitem(w: _Writer, n: Node, result: Any) -> Any:
 
 
 def _transpose(w: _Writer, n: Node, result: Tensor) -> str:
-    source, *axes = _args(n)
+    _, *axes = _args(n)
     perm = list(range(result.dim()))
     if n.target == "permute":
         perm = [a % result.dim() for a in axes]
     else:
         a, b = axes
         perm[a], perm[b] = perm[b], perm[a]
-    return w._add("Transpose", [w._name(source)], n.name, perm=perm)
+    return w._unary("Transpose", n, perm=perm)
 
 
 def _reshape(w: _Writer, n: Node, result: Tensor) -> str:
-    return w._add("Reshape", [w._name(_args(n)[0]), w._ints(f"{n.name}_shape", result.shape)], n.name)
+    return w._unary("Reshape", n, w._ints(f"{n.name}_shape", result.shape))
 
 
 def _squeeze(w: _Writer, n: Node, result: Tensor) -> str:
-    source, axis = _args(n)
-    kind = "Squeeze" if n.target == "squeeze" else "Unsqueeze"
-    return w._add(kind, [w._name(source), w._ints(f"{n.name}_axes", [axis])], n.name)
+    return w._unary(str(n.target).capitalize(), n, w._ints(f"{n.name}_axes", [n.args[1]]))
 
 
 def _cast(w: _Writer, n: Node, result: Tensor) -> str:
-    return w._add("Cast", [w._name(_args(n)[0])], n.name, to=ONNX_TYPES[result.dtype])
+    return w._unary("Cast", n, to=ONNX_TYPES[result.dtype])
 
 
 def _cat(w: _Writer, n: Node, result: Tensor) -> str:
@@ -427,36 +410,37 @@ def _dequantize(w: _Writer, n: Node, result: Tensor) -> str:
     return w._float(_args(n)[0], n.name)
 
 
-def _bytes(w: _Writer, n: Node, result: Tensor) -> str:
-    return w._name(_args(n)[0])
-
-
 def _int8_add(w: _Writer, n: Node, result: Tensor) -> str:
     x, y, *_ = _args(n)
     both = [w._float(x, f"{n.name}_left"), w._float(y, f"{n.name}_right")]
     return _rounded(w, n, result, w._add("Add", both, f"{n.name}_sum"), relu=n.target is torch.ops.quantized.add_relu)
 
 
-FUNCTIONS: dict[Any, Callable[[_Writer, Node, Any], Any]] = {
+WRITERS: dict[Any, Callable[..., Any]] = {
+    Columns: _columns,
+    nn.Conv2d: _conv,
+    ConvReLU2d: _conv_relu,
+    int8.Conv2d: _int8_conv,
+    fused_int8.ConvReLU2d: _int8_conv,
+    nn.Linear: _linear,
+    nn.MaxPool2d: _max_pool,
+    nn.LayerNorm: _layer_norm,
+    nn.ReLU: _relu,
+    nn.GELU: _gelu,
+    nn.Identity: _same,
     operator.getitem: _getitem,
-    "transpose": _transpose,
-    "permute": _transpose,
-    "flatten": _reshape,
-    "unflatten": _reshape,
-    "reshape": _reshape,
-    "squeeze": _squeeze,
-    "unsqueeze": _squeeze,
+    **dict.fromkeys(("transpose", "permute"), _transpose),
+    **dict.fromkeys(("flatten", "unflatten", "reshape"), _reshape),
+    **dict.fromkeys(("squeeze", "unsqueeze"), _squeeze),
     "float": _cast,
     torch.cat: _cat,
-    operator.add: _binary("Add"),
-    "add": _binary("Add"),  # a constant plus a value, in this order
-    operator.mul: _binary("Mul"),
-    "mul": _binary("Mul"),
+    **dict.fromkeys((operator.add, "add"), _binary("Add")),  # "add": a constant plus a value, in this order
+    **dict.fromkeys((operator.mul, "mul"), _binary("Mul")),
     torch.addcmul: _addcmul,
     F.scaled_dot_product_attention: _attend,
     torch.quantize_per_tensor: _quantize,
     "dequantize": _dequantize,
-    "int_repr": _bytes,
+    "int_repr": _same,
     torch.ops.quantized.add_relu: _int8_add,
     torch.ops.quantized.add: _int8_add,
 }
