@@ -112,18 +112,11 @@ def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
 def summary(content: Mapping[str, Any]) -> str:
     """The content of finetune.json as text for people."""
     metrics = content["metrics"]
-    learned = metrics["learned_from"]
-    lines = [
-        f"learned from {learned['demonstrations']} frames of old demonstrations, {learned['new_demonstrations']} of "
-        f"new ones and {learned['corrections']} of corrections; {learned['not_imitated']} that no human drove left out"
-    ]
+    counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in metrics["learned_from"].items())
+    lines = [f"frames: {counts}"]
     for row in metrics["held_out"]:
-        actions = [key[len("after_") : -len("_pct")] for key in row if key.startswith("after_")]
-        pairs = (
-            f"{action} {' to '.join(format_pct(row[f'{when}_{action}_pct']).strip() for when in ('before', 'after'))}"
-            for action in actions
-        )
-        lines.append(f"{row['kind']} {row['episode']}, error before and after: {', '.join(pairs)}")
+        errors = [f"{key.removesuffix('_pct')} {format_pct(row[key]).strip()}" for key in row if key.endswith("_pct")]
+        lines.append(f"{row['kind']} {row['episode']}, error: {', '.join(errors)}".replace("_", " "))
     for kind, each in metrics["verdict"]["kinds"].items():
         if each["episodes"]:
             lines.append(
