@@ -70,6 +70,7 @@ demo: $(READY)
 
 demo-more: $(DEMO)
 	$(ROVER) world latency runs/demo
+	@rm -rf runs/demo-small
 	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256
 	$(ROVER) world students runs/demo runs/demo-small --worlds 40
 	$(ROVER) report runs/demo

@@ -32,15 +32,13 @@ import numpy as np
 from balloon_world.child_process import Child
 from balloon_world.record import JPEG_QUALITY
 from balloon_world.simulated_arduino import PinEvent
-from balloon_world.trial import Trajectory, wilson_interval
-from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, World
+from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import WorldError
 
 HOLD_S = 1.0
 STEPS_PER_S = 100  # steps of the physics a second, at least
-KEEP_DRIVES = 8
 KEEP_OUTCOMES = 1000
 STANDSTILL_S = 0.5  # if the machine stopped for longer than this, the world stopped too for the time beyond it
 NOISE = 3  # the noise's grey levels, 0 to 2; with noise, two frames of a car that stands still are never the same
@@ -117,16 +115,12 @@ class CameraFeed:
     """A simulated camera: a thread that writes pictures into a FIFO at a fixed rate.
 
     path: of the FIFO, which is made if it does not exist. pictures: JPEGs, or frames (h, w, 3) uint8 BGR. They are
-    shown in turn, then again from the first; with a single one, every frame is the same. written, dropped: how many
-    frames so far were written, or dropped because the reader was too slow. late_s: how long after its due time each
-    frame is written; you may set it.
+    shown in turn, then again from the first. written: how many frames so far.
     """
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
-        self.written = self.dropped = 0
-        self.late_s = 0.0
-        self._pipe = FramePipe(path)
-        self._period_s = 1 / rate_hz
+        self.written = 0
+        self._pipe, self._period_s = FramePipe(path), 1 / rate_hz
         self._pictures: tuple[bytes, ...] = ()
         self._next = -1
         self._frozen = self._paused = False
@@ -142,20 +136,13 @@ class CameraFeed:
         self.close()
 
     def show(self, *pictures: bytes | np.ndarray) -> None:
-        """Show these pictures from the next frame on, and end freeze(), pause() and black().
-
-        Without pictures nothing is written.
-        """
+        """Show these pictures from the next frame on, and end freeze() and pause(). Without any, nothing is written."""
         self._pictures = tuple(jpeg_of(picture) for picture in pictures)
         self._frozen = self._paused = False
 
     def freeze(self) -> None:
         """Repeat the same frame until show()."""
         self._frozen = True
-
-    def black(self) -> None:
-        """Show black frames until show()."""
-        self.show(np.zeros((FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8))
 
     def pause(self) -> None:
         """Write no frames until show(), as a camera that stays plugged in but sends nothing."""
@@ -168,69 +155,35 @@ class CameraFeed:
         self._pipe.close()
 
     def _run(self) -> None:
-        waiting: deque[tuple[float, tuple[bytes, ...], bool]] = deque()
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + self._period_s, time.monotonic() - self._period_s)
-            pictures = self._pictures
-            if pictures and not self._paused:
-                waiting.append((time.monotonic() + self.late_s, pictures, not self._frozen))
-            while waiting and waiting[0][0] <= time.monotonic():
-                _, pictures, moves = waiting.popleft()
-                if self._pipe.read:
-                    # Go on to the next picture only once this one was written. If refused pictures were skipped, a
-                    # slow reader would see only the same few of them.
-                    if self._pipe.write(pictures[(self._next + moves) % len(pictures)]):
-                        self._next += moves
-                        self.written += 1
-                    else:
-                        self.dropped += 1
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One world, driven to its end.
-
-    outcome: 'hit', 'left' or 'timeout'. nearest_m: the least distance between camera and balloon.
-    released_s: time.monotonic() when the car was let go. trajectory: from then on, a point for each frame of the camera
-    (every 1 / rate_hz seconds), and the last one.
-    """
-
-    seed: int
-    outcome: str
-    released_s: float
-    duration_s: float
-    nearest_m: float
-    trajectory: Trajectory
+            pictures, following = self._pictures, self._next + (not self._frozen)
+            # Go on to the next picture only once this one was written: a slow reader shall see all of them.
+            if pictures and not self._paused and self._pipe.write(pictures[following % len(pictures)]):
+                self._next = following
+                self.written += 1
 
 
 @dataclass(frozen=True)
 class CarReport:
     """What a virtual car has done so far.
 
-    trials, hits: how many worlds have ended, and how many of them with a hit. wilson: the 95 % interval of the share of
-    hits, None before the first world has ended. outcomes: (seed, outcome) of the last 1000 worlds. drives: the last 8.
-    frames: how many were written to the camera; dropped: how many were not, because the reader was too slow;
-    late: how many were left out, because this machine was too slow.
-    seed, held, distance_m, bearing_rad and speed_mps describe the present world: its seed, whether the car is held, the
-    balloon's distance and bearing (positive to the left), and the car's speed. finished: whether all the worlds that
-    were asked for have ended.
+    trials, hits: how many worlds have ended, and how many of them with a hit. outcomes: (seed, outcome) of the last
+    1000 worlds, 'hit', 'left' or 'timeout'. frames: how many were written to the camera; dropped: how many were not,
+    because the reader was too slow; late: how many were left out, because this machine was too slow.
+    seed, held, speed_mps: the present world's seed, whether the car is held, and its speed.
     """
 
     hits: int
     trials: int
-    wilson: tuple[float, float] | None
     outcomes: list[tuple[int, str]]
-    drives: list[Drive]
     frames: int
     dropped: int
     late: int
     seed: int
     held: bool
-    distance_m: float
-    bearing_rad: float
     speed_mps: float
-    finished: bool
 
 
 class VirtualCar:
@@ -240,54 +193,24 @@ class VirtualCar:
 
     The first world begins when the pins first ask for motion. A world ends when the car hits the balloon, passes it or
     leaves the arena ('left'), or after 8 s. Then the car stands in the next world and is held there for hold_s, so that
-    it is let go with a plan for what it sees there. worlds: after how many worlds the car stays where it is; None: it
-    never does. The process ends when this process ends, at most a frame later.
+    it is let go with a plan for what it sees there. The process ends when this process ends, at most a frame later.
     """
 
-    def __init__(
-        self,
-        *,
-        seed: int = 10_000,
-        board: str = STAND_IN,
-        rate_hz: float = 30.0,
-        worlds: int | None = None,
-        hold_s: float = HOLD_S,
-        nice: int = NICE,
-    ):
+    def __init__(self, *, seed: int = 10_000, board: str = STAND_IN, hold_s: float = HOLD_S):
         """Start the process.
 
         board: 'module:function' that makes the car's Arduino in that process, with a port and pulses() as StandIn has.
-        rate_hz: of the camera. nice: of the thread that moves the car and draws. Raises WorldError for numbers outside
-        their ranges, or if the process does not start.
+        Raises WorldError for numbers outside their ranges, or if the process does not start.
         """
-        if seed < 0 or not 1 <= rate_hz <= 120 or hold_s < 0 or (worlds is not None and worlds < 1):
-            raise WorldError(
-                "a car needs a seed from 0, 1 to 120 frames per second, at least 1 world and a hold from 0 s",
-                found=f"{seed}, {rate_hz}, {worlds} and {hold_s}",
-            )
+        if seed < 0 or hold_s < 0:
+            raise WorldError("a car needs a seed and a hold from 0", found=f"{seed} and {hold_s}")
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
-        self._talking = threading.Lock()
-        self._answers = b""
-        self._asked = 0
-        options = {
-            "seed": seed,
-            "board": board,
-            "rate_hz": rate_hz,
-            "worlds": worlds,
-            "hold_s": hold_s,
-            "nice": nice,
-            "folder": str(self._folder),
-            "camera": self.camera,
-            "parent": os.getpid(),
-        }
-        self._process = Child(
-            "the virtual car",
-            *(sys.executable, "-m", "balloon_world.car", json.dumps(options)),
-            error=WorldError,
-            talks=True,
-            env={"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # where the board's module is
-        )
+        self._talking, self._answers, self._asked = threading.Lock(), b"", 0
+        options = {"seed": seed, "board": board, "hold_s": hold_s, "folder": str(self._folder), "parent": os.getpid()}
+        command = (sys.executable, "-m", "balloon_world.car", json.dumps(options))
+        env = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where the board's module is
+        self._process = Child("the virtual car", *command, error=WorldError, talks=True, env=env)
         self.pid = self._process.pid
         try:
             self.port: str = self._answer(START_S)["port"]
@@ -315,15 +238,8 @@ class VirtualCar:
             self._process.send_line(f"report {self._asked}")
             while (answer := self._answer(ANSWER_S))["asked"] != self._asked:
                 pass  # this answers an earlier call, which did not wait long enough
-        report = answer["report"]
-        drives = []
-        for drive in report.pop("drives"):
-            track, balloon_xy_m = np.array(drive.pop("track")), tuple(drive.pop("balloon_xy_m"))
-            x_m, y_m, steering, throttle = track.T
-            drives.append(Drive(**drive, trajectory=Trajectory(x_m, y_m, steering, throttle, balloon_xy_m)))
-        outcomes = [(seed, outcome) for seed, outcome in report.pop("outcomes")]
-        wilson = wilson_interval(report["hits"], report["trials"]) if report["trials"] else None
-        return CarReport(wilson=wilson, outcomes=outcomes, drives=drives, **report)
+        outcomes = [(seed, outcome) for seed, outcome in answer["report"].pop("outcomes")]
+        return CarReport(outcomes=outcomes, **answer["report"])
 
     def summary(self) -> dict[str, Any]:
         """Return what the report of a drive says about this car: hits, trials and camera_late. Raises as report()."""
@@ -348,7 +264,7 @@ class VirtualCar:
             data = self._process.read(max(0.0, deadline - time.monotonic()))
             if not data:
                 raise WorldError(
-                    f"the virtual car did not answer within {within_s:g} s", remedy="is this machine too busy?"
+                    "the virtual car did not answer", found=f"{within_s:g} s", remedy="is it too busy here?"
                 )
             self._answers += data
         line, _, self._answers = self._answers.partition(b"\n")
@@ -399,19 +315,16 @@ class _Pins:
 class _Car:
     """A car that the pins drive through one world after the other."""
 
-    def __init__(self, pins: _Pins, seed: int, rate_hz: float, worlds: int | None, hold_s: float):
+    def __init__(self, pins: _Pins, seed: int, hold_s: float):
         self._pins = pins
-        self._steps_per_frame = math.ceil(STEPS_PER_S / rate_hz)
-        self._dt = 1 / (rate_hz * self._steps_per_frame)
-        self._worlds, self._hold_s = worlds, hold_s
+        self._dt = 1 / (RATE_HZ * math.ceil(STEPS_PER_S / RATE_HZ))
+        self._hold_s = hold_s
         self.world = World(seed)
         self._now = time.monotonic()  # the time up to which the car was moved
-        self._release_s = self._released_s = math.inf
+        self._release_s = math.inf
         self.held = True
-        self.finished = False
         self.hits = self.trials = 0
         self.outcomes: deque[tuple[int, str]] = deque(maxlen=KEEP_OUTCOMES)
-        self.drives: deque[dict[str, Any]] = deque(maxlen=KEEP_DRIVES)
 
     def move(self, until_s: float) -> None:
         """Move the car on to the time until_s."""
@@ -427,52 +340,28 @@ class _Car:
         if self.held:
             if self.trials == 0 and self._pins.asked_for_motion:
                 self._release_s = self._now
-            if self.finished or self._now < self._release_s:
+            if self._now < self._release_s:
                 return
-            self.held, self._released_s = False, self._now
+            self.held = False
         self.world.step(*action, self._dt)
         if self.world.done:
             self._end()
 
     def _end(self) -> None:
-        world, track = self.world, self.world.trajectory
-        balloon = world.balloon.x_m, world.balloon.y_m
         self.trials += 1
-        self.hits += world.hit
-        self.outcomes.append((world.seed, str(world.outcome)))
-        points = [*track[: -1 : self._steps_per_frame], track[-1]]
-        self.drives.append(
-            {
-                "seed": world.seed,
-                "outcome": world.outcome,
-                "released_s": self._released_s,
-                "duration_s": world.state.time_s,
-                "nearest_m": min(math.hypot(s.x_m - balloon[0], s.y_m - balloon[1]) for s in track),
-                "balloon_xy_m": balloon,
-                "track": [
-                    [round(x, 4) for x in (s.x_m, s.y_m, s.steering_command, s.throttle_command)] for s in points
-                ],
-            }
-        )
-        self.held = True
-        self.finished = self.trials == self._worlds
-        if not self.finished:
-            self.world = World(world.seed + 1)
-            self._release_s = self._now + self._hold_s
+        self.hits += self.world.hit
+        self.outcomes.append((self.world.seed, str(self.world.outcome)))
+        self.world = World(self.world.seed + 1)
+        self.held, self._release_s = True, self._now + self._hold_s
 
     def report(self) -> dict[str, Any]:
-        distance_m, bearing_rad = self.world.balloon_seen()
         return {
             "hits": self.hits,
             "trials": self.trials,
             "outcomes": list(self.outcomes),
-            "drives": list(self.drives),
             "seed": self.world.seed,
             "held": self.held,
-            "distance_m": distance_m,
-            "bearing_rad": bearing_rad,
             "speed_mps": self.world.state.speed_mps,
-            "finished": self.finished,
         }
 
 
@@ -489,7 +378,7 @@ class _Sensor:
         return cv2.add(frame, self._noise[row : row + FRAME_HEIGHT, column : column + FRAME_WIDTH])
 
 
-def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
+def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
     """Move the car and write frames at absolute deadlines, until the parent closes standard input or has ended."""
     frames = dropped = late = 0
     sensor = _Sensor()
@@ -512,9 +401,9 @@ def _run(car: _Car, pipe: FramePipe, rate_hz: float, parent: int) -> None:
                 frames += 1
             else:
                 dropped += 1
-        due += 1 / rate_hz
+        due += 1 / RATE_HZ
         while due < time.monotonic():
-            due += 1 / rate_hz
+            due += 1 / RATE_HZ
             late += 1
 
 
@@ -529,13 +418,12 @@ def main() -> None:
     try:
         module, _, name = options["board"].partition(":")
         board: Board = getattr(importlib.import_module(module), name)()
-        with board, contextlib.closing(FramePipe(options["camera"])) as pipe:
+        with board, contextlib.closing(FramePipe(Path(options["folder"]) / "camera")) as pipe:
             # This concerns only the present thread: the stand-in's thread and the emulator's process keep their turn.
-            os.nice(options["nice"])
-            rate_hz = options["rate_hz"]
-            car = _Car(_Pins(board), options["seed"], rate_hz, options["worlds"], options["hold_s"])
+            os.nice(NICE)
+            car = _Car(_Pins(board), options["seed"], options["hold_s"])
             print(json.dumps({"port": board.port}), flush=True)
-            _run(car, pipe, rate_hz, options["parent"])
+            _run(car, pipe, options["parent"])
     finally:
         shutil.rmtree(options["folder"], ignore_errors=True)  # in case the parent was killed and cannot do it
 

@@ -9,7 +9,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Mapping
-from typing import IO
+from typing import IO, Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import last_words
@@ -37,19 +37,12 @@ class Child:
         standard input and output; then the end of its input tells it to end. Otherwise it has neither, and SIGTERM
         tells it. env: variables in addition to this process's own.
         """
-        self.name = name
-        self._error = error
+        self.name, self._error = name, error
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open until close()
-        stream = subprocess.PIPE if talks else subprocess.DEVNULL
-        self.process: subprocess.Popen[bytes] = subprocess.Popen(
-            [str(part) for part in command],
-            env={**os.environ, **(env or {})},
-            stdin=stream,
-            stdout=stream,
-            stderr=self._errors,
-            bufsize=0,
-            start_new_session=True,
-        )
+        words, stream = [str(part) for part in command], subprocess.PIPE if talks else subprocess.DEVNULL
+        streams: dict[str, Any] = {"stdin": stream, "stdout": stream, "stderr": self._errors, "bufsize": 0}
+        environment = {**os.environ, **(env or {})}
+        self.process = subprocess.Popen(words, env=environment, start_new_session=True, **streams)
         self.pid = self.process.pid
 
     @property

@@ -76,10 +76,9 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
 def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
     """Judge the students that `rover distill` left in STUDENT_RUNS beside the teacher in TEACHER_RUN.
 
-    Each folder has a policy_static.pt, and an arm.json if its instructions were counted. All policies drive through
-    the same worlds: left alone, and pushed with plans that are as late as was computed for the policy. Leaves
-    students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its teacher's place. If
-    it is ended at any moment, the same command continues where it was.
+    All policies drive through the same worlds: left alone, and pushed with plans that are as late as was computed for
+    the policy. Leaves students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its
+    teacher's place. If it is ended at any moment, the same command continues where it was.
     """
     from balloon_world.students import judge_students, sentences, table
     from rover_lib.workshop.run.run import execute
@@ -110,10 +109,9 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, *
 def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options: Any) -> None:
     """Let the policy in RUN_DIR drive while an expert takes over where a human would, and train it further on that.
 
-    For comparison, another copy of the policy is trained on plain demonstrations of the same duration. After each
-    round, both are judged in worlds in which neither has learned. Leaves learn.json and the executed notebook 09 in
-    RUN_DIR. If it is ended at any moment, the same command continues where it was; with more --worlds, it drives only
-    in those that are missing.
+    For comparison, another copy of the policy is trained on plain demonstrations of the same duration. Leaves
+    learn.json and the executed notebook 09 in RUN_DIR. If it is ended at any moment, the same command continues where
+    it was; with more --worlds, it drives only in those that are missing.
     """
     from balloon_world.learn import Experiment, run_experiment, table
     from rover_lib.workshop.run.run import execute

@@ -176,8 +176,7 @@ def run_experiment(
     run_dir: has best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: keeps what is
     recorded, learned and driven on the way; after an end at any moment, the same call goes on from there. A learn.json
     that was made from the same files and parameters is read, not made again.
-    Raises WorldError if the run lacks a file or out_dir belongs to another experiment, and whatever reading, learning
-    and driving raise.
+    Raises WorldError if the run lacks a file or out_dir belongs to another experiment.
     """
     experiment = experiment or Experiment()
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
@@ -390,17 +389,16 @@ def sentences(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def table(content: Mapping[str, Any] | None) -> Table:
-    """Show the content of learn.json as a table; None gives an empty one with a sentence that says what to do."""
+    """Show the policies of learn.json as a table; None gives an empty one with a sentence that says what to do."""
     rows = []
     for row in content["metrics"]["policies"] if content else ():
-        hits = (
-            f"{found['hits']} of {found['trials']} ({found['wilson_low']:.0%} to {found['wilson_high']:.0%})"
-            for found in (row[how] for how in HOW)
-        )
+        counted = [row[how] for how in HOW]
+        hits = [f"{c['hits']} of {c['trials']} ({c['wilson_low']:.0%} to {c['wilson_high']:.0%})" for c in counted]
         name = row["name"] if row["arm"] == BEFORE else f"{row['arm']}, round {row['round']}"
         rows.append((name, f"{row['human_s']:.0f}", *hits))
-    notes = ["hits, with Wilson's 95 % interval"] if content else [NOTHING]
-    return Table(("", "human s", *HOW.values()), rows, notes=notes)
+    return Table(
+        ("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval"] if content else [NOTHING]
+    )
 
 
 def rounds_table(content: Mapping[str, Any] | None) -> Table:
@@ -409,5 +407,5 @@ def rounds_table(content: Mapping[str, Any] | None) -> Table:
         (str(r["round"]), f"{r['takeovers']} of {r['drives']}", f"{r['human_s']:.1f}", str(r["missed"]))
         for r in (content["metrics"]["rounds"] if content else ())
     ]
-    notes = () if content else (NOTHING,)
-    return Table(("round", "drives with a takeover", "human s", "missed all the same"), rows, notes=notes)
+    header = ("round", "drives with a takeover", "human s", "missed all the same")
+    return Table(header, rows, notes=() if content else (NOTHING,))

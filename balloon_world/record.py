@@ -62,25 +62,19 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
         )
     made = cache_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
     out_dir.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=out_dir.parent, prefix=f".{out_dir.name}."))
-    try:
+    with tempfile.TemporaryDirectory(dir=out_dir.parent, prefix=f".{out_dir.name}.") as temporary:
         # Copied and not linked: somebody who damages an episode to see what happens must not damage the cache.
-        copy = shutil.copytree(made, temporary / "episodes")
+        copy = shutil.copytree(made, Path(temporary) / "episodes")
         if out_dir.is_dir():
             out_dir.rmdir()
         copy.rename(out_dir)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return out_dir
 
 
 def _marker_of(folder: Path) -> str | None:
-    marker = folder / MARKER
-    if not marker.is_file():
-        return None
     try:
-        return json.loads(marker.read_text()).get("key")
-    except (ValueError, AttributeError):
+        return json.loads((folder / MARKER).read_text()).get("key")
+    except (OSError, ValueError, AttributeError):
         return None
 
 

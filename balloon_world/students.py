@@ -53,7 +53,7 @@ NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 class _Run:
     """A run's static artifact.
 
-    shape: its row of students.json. counts: its instructions from arm.json, None if they were not counted.
+    shape: its row of distill.json. counts: its instructions from arm.json, None if they were not counted.
     """
 
     name: str
@@ -62,17 +62,33 @@ class _Run:
     shape: dict[str, Any]
     counts: dict[str, Any] | None
 
-    @property
-    def computed_ms(self) -> list[float] | None:
-        """The low and the high end of the computed latency on a Pi 5; None if instructions were not counted."""
-        if not self.counts:
-            return None
-        span = predict_ms(Work.of(self.counts))
-        return [span.low, span.high]
+    @classmethod
+    def read(cls, folder: Path, name: str, shape: dict[str, Any]) -> "_Run":
+        """Read a run's folder. Raises DistillError if it has no artifact."""
+        artifact, counts = folder / ARTIFACT, None
+        if not artifact.is_file():
+            raise DistillError(f"{artifact}: not there", remedy="'rover quantize' or 'rover run' makes it")
+        if (folder / "arm.json").is_file():
+            arm = read_stage(folder / "arm.json", "arm")
+            row = arm["metrics"]["artifacts"].get(artifact.stem, {})
+            counts = row if arm["inputs"].get(ARTIFACT) == sha256_of(artifact) and "cycles_g" in row else None
+        return cls(name, artifact, read_manifest(artifact), shape, counts)
 
-    @property
-    def estimated_ms(self) -> float:
-        return estimate_ms(self.manifest["gmac"])
+    def row(self) -> dict[str, Any]:
+        """How its row of students.json begins. computed_ms: the low and the high end of the latency on a Pi 5."""
+        (camera,) = self.manifest["cameras"]
+        span = predict_ms(Work.of(self.counts)) if self.counts else None
+        return {
+            "name": self.name,
+            "height": camera["height"],
+            "width": camera["width"],
+            **{key: self.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
+            "backbone_channels": self.shape.get("backbone_channels"),  # older students have all channels
+            "gmac": self.manifest["gmac"],
+            **{key: self.counts and self.counts[key] for key in ("instructions_g", "simd_g")},
+            "size_mb": self.artifact.stat().st_size / 1e6,
+            "computed_ms": span and [span.low, span.high],
+        }
 
 
 def judge_students(
@@ -90,20 +106,25 @@ def judge_students(
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
     `run_trials`, and pushed at the latency computed for it. With 0 nobody drives, as there is no world for a real
     car's policy. held_out_frames: how many to judge with at most.
-    Raises DistillError for runs that do not belong together or lack a file, and
-    whatever reading them raises.
+    Raises DistillError for runs that do not belong together or lack a file, and whatever reading them raises.
     """
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
-    source = _source_of(folder, episodes)
+    if (folder / "load.json").is_file():  # the recordings that the teacher's run loaded, or others read the same way
+        source = Source.loaded(read_stage(folder / "load.json", "load")["params"], episodes)
+    elif episodes:
+        source = Source.of(episodes)
+    else:
+        raise DistillError(f"{folder}: says nothing of its recordings", remedy="give --episodes")
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
     samples = pick_evenly(parts.held_out, held_out_frames)
     counted = runs[0].counts is not None
     rows = []
     for run, errors in zip(runs, _errors(folder, runs, samples, recordings, progress), strict=True):
-        pushed_ms = (run.computed_ms[1] if run.computed_ms else None) if counted else run.estimated_ms
-        rows.append(_row(run) | errors | _drives(run, worlds, pushed_ms, progress))
+        row = run.row() | errors
+        pushed_ms = (row["computed_ms"] or (None, None))[1] if counted else estimate_ms(run.manifest["gmac"])
+        rows.append(row | _drives(run, worlds, pushed_ms, progress))
     notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
     if missing := [run.name for run in runs if run.counts is None]:
         notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make count` counts.")
@@ -128,82 +149,25 @@ def judge_students(
     return write_stage(folder / "students.json", "students", params=how, metrics=metrics, inputs=inputs)
 
 
-# --- which runs -------------------------------------------------------------------------------------------------------
-
-
 def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     """Read the teacher's run and its students', the teacher first, and check that they belong together."""
     names = [student.name for student in students]
     if not names or len({*names, TEACHER}) <= len(names):
         raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
-    taught = [_read_distilled(student) for student in students]
-    manifest = read_manifest(_artifact_of(folder))
-    runs = [_Run(TEACHER, folder / ARTIFACT, manifest, taught[0]["metrics"]["students"][0], _counts(folder))]
-    for student, content in zip(students, taught, strict=True):
-        if manifest["checkpoint"]["sha256"] not in content["inputs"].values():
+    runs: list[_Run] = []
+    for student in students:
+        if not (student / "distill.json").is_file():
+            raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
+        taught = read_stage(student / "distill.json", "distill")
+        of_teacher, own = taught["metrics"]["students"]
+        runs = runs or [_Run.read(folder, TEACHER, of_teacher)]
+        runs.append(_Run.read(student, student.name, own))
+        if runs[0].manifest["checkpoint"]["sha256"] not in taught["inputs"].values():
             raise DistillError(f"{student}: is a student of another checkpoint than {folder / ARTIFACT} is made of")
-        own_manifest = read_manifest(_artifact_of(student))
-        if own_manifest["checkpoint"]["sha256"] not in content["metrics"]["files_sha256"].values():
-            raise DistillError(
-                f"{student / ARTIFACT}: is not made of the student that was distilled there",
-                remedy="'rover run' makes it anew",
-            )
-        runs.append(
-            _Run(student.name, student / ARTIFACT, own_manifest, content["metrics"]["students"][1], _counts(student))
-        )
+        if runs[-1].manifest["checkpoint"]["sha256"] not in taught["metrics"]["files_sha256"].values():
+            remedy = "'rover run' makes it anew"
+            raise DistillError(f"{student / ARTIFACT}: is not made of the student that was distilled", remedy=remedy)
     return runs
-
-
-def _read_distilled(student: Path) -> dict[str, Any]:
-    """Read the distill.json that `rover distill` left in a student's run."""
-    path = student / "distill.json"
-    if not path.is_file():
-        raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
-    return read_stage(path, "distill")
-
-
-def _artifact_of(run_dir: Path) -> Path:
-    if not (path := run_dir / ARTIFACT).is_file():
-        raise DistillError(f"{path}: not there", remedy="'rover run' makes it")
-    return path
-
-
-def _counts(run_dir: Path) -> dict[str, Any] | None:
-    """Return what arm.json says about policy_static.pt; None if nothing, or of another file, or without cycles."""
-    if not (path := run_dir / "arm.json").is_file():
-        return None
-    arm = read_stage(path, "arm")
-    same = arm["inputs"].get(ARTIFACT) == sha256_of(run_dir / ARTIFACT)
-    row = arm["metrics"]["artifacts"].get(Path(ARTIFACT).stem, {})
-    return row if same and "cycles_g" in row else None
-
-
-def _source_of(run_dir: Path, episodes: Path | str | None) -> Source:
-    """Return the recordings that the teacher's run loaded; or, if `episodes` is given, those, read the same way."""
-    if (run_dir / "load.json").is_file():
-        return Source.loaded(read_stage(run_dir / "load.json", "load")["params"], episodes)
-    if not episodes:
-        raise DistillError(f"{run_dir}: says nothing of its recordings", remedy="give --episodes")
-    return Source.of(episodes)
-
-
-def _row(run: _Run) -> dict[str, Any]:
-    (camera,) = run.manifest["cameras"]
-    return {
-        "name": run.name,
-        "height": camera["height"],
-        "width": camera["width"],
-        **{key: run.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
-        "backbone_channels": run.shape.get("backbone_channels"),  # older students have all channels
-        "gmac": run.manifest["gmac"],
-        "instructions_g": run.counts and run.counts["instructions_g"],
-        "simd_g": run.counts and run.counts["simd_g"],
-        "size_mb": run.artifact.stat().st_size / 1e6,
-        "computed_ms": run.computed_ms,
-    }
-
-
-# --- on recordings ----------------------------------------------------------------------------------------------------
 
 
 def _errors(
@@ -212,7 +176,7 @@ def _errors(
     """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
-        remedy = "'rover run CHECKPOINT EPISODES' makes it"
+        remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
         raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy=remedy)
     taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
@@ -223,13 +187,13 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
     """Return what an artifact plans for the samples, (n, C, A) float32, from the cache if it is there."""
     frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
     planned_by = {"artifact": content_hash(artifact), "torch": torch.__version__, **car_in_key()}
-    key = key_of(planned_by | {"frames": frames}, preprocess)
-    path = cache_root() / f"plans-{key}.npy"
+    path = cache_root() / f"plans-{key_of(planned_by | {'frames': frames}, preprocess)}.npy"
     if not path.exists():
-        policies = load_for_cores(artifact, len(samples))
-        every = everywhere(
-            policies, range(len(samples)), lambda p, i: p.predict_chunk(samples[i].frame_bgr(), samples[i].state)
-        )
+
+        def one(policy: Policy, i: int) -> np.ndarray:
+            return policy.predict_chunk(samples[i].frame_bgr(), samples[i].state)
+
+        every = everywhere(load_for_cores(artifact, len(samples)), range(len(samples)), one)
         planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))

@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +13,6 @@ from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import WorldError
 from rover_lib.workshop.progress import Progress, silent
-
-
-class Drives(Protocol):
-    """What can drive: an artifact's Policy, or anything else with this attribute and this method."""
-
-    chunk: int
-
-    def predict_chunk(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -87,7 +79,7 @@ def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tup
 
 
 def run_trials(
-    policy: Drives,
+    policy: Any,
     worlds: int = 40,
     seed: int = 10_000,
     replan_every: int = 8,
@@ -96,6 +88,7 @@ def run_trials(
 ) -> TrialReport:
     """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
 
+    policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`.
     replan_every: how many actions of each chunk are driven before the policy sees the next frame. Its state is the
     action commanded before, neutral at the start. keep_frames: how many (frame_bgr, state) pairs to keep at most; they
     are spread evenly over all that the policy was shown.
@@ -127,7 +120,7 @@ def run_trials(
     return TrialReport(hits, worlds, wilson_interval(hits, worlds), results, seen)
 
 
-def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
+def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
     """Do `run_trials` for several policies at once, on a thread for each core.
 
     Worlds and results are the same as one by one.
@@ -137,7 +130,7 @@ def run_trials_of(policies: Mapping[str, Drives], worlds: int = 40, **options: A
         return {name: trial.result() for name, trial in running.items()}
 
 
-def _drive(policy: Drives, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
+def _drive(policy: Any, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
     state: np.ndarray = np.zeros(2, np.float32)
     pairs = []
     nearest = world.balloon_seen()[0]

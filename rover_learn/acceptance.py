@@ -22,7 +22,7 @@ CHANCE = 0.05
 LEAST_EPISODES = 6  # with 5, all changed the same way, the chance is 2 in 32
 EXACT = 12  # most episodes for which all 2 ** 12 combinations of signs are tried; else DRAWN at random
 DRAWN = 10_000
-KINDS = ("old", "new")
+OLD, NEW = KINDS = ("old", "new")
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def verdict(judged: Sequence[Judged]) -> dict[str, Any]:
             "change_points": float(np.mean(changes)) if changes else None,
             "chance": chance_of(changes) if changes else None,
         }
-    better, why = _said(kinds)
+    better, why = _judge(kinds)
     rule = (
         f"better: on new held-out episodes nearer to the human than chance explains (randomisation test over episodes, "
         f"below {CHANCE:g}), and on old ones not further away in that sense; at least {LEAST_EPISODES} of each"
@@ -92,43 +92,31 @@ def verdict(judged: Sequence[Judged]) -> dict[str, Any]:
     return {"better": better, "why": why, "rule": rule, "kinds": kinds}
 
 
-def _said(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
+def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
     few = [f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES]
     if few:
-        return None, (
-            f"undecided whether it is better: held out were only {' and '.join(few)} episodes, and below "
-            f"{LEAST_EPISODES} of a kind no change is more than chance; record more, or let it drive"
-        )
+        return None, f"undecided: only {' and '.join(few)} held-out episodes, of at least {LEAST_EPISODES} each"
     moved = {kind: kinds[kind]["change_points"] for kind in KINDS if kinds[kind]["chance"] < CHANCE}
-    if moved.get("old", 0) > 0:
-        return False, f"not better: on the old episodes it is {moved['old']:.2f} points further from the human"
-    if moved.get("new", 0) > 0:
-        return False, f"worse: on the new episodes it is {moved['new']:.2f} points further from the human"
-    if "new" not in moved:
-        return None, "undecided whether it is better: on the new episodes the difference may be chance"
+    if moved.get(OLD, 0) > 0:
+        return False, f"not better: on the old episodes it is {moved[OLD]:.2f} points further from the human"
+    if moved.get(NEW, 0) > 0:
+        return False, f"worse: on the new episodes it is {moved[NEW]:.2f} points further from the human"
+    if NEW not in moved:
+        return None, "undecided: on the new episodes the difference may be chance"
     return (
         True,
-        f"better: on the new episodes it is {-moved['new']:.2f} points nearer to the human, and no worse on the old",
+        f"better: on the new episodes it is {-moved[NEW]:.2f} points nearer to the human, and no worse on the old",
     )
 
 
 def summary(content: Mapping[str, Any]) -> str:
     """The content of finetune.json as text for people."""
     metrics = content["metrics"]
-    learned = metrics["learned_from"]
-    lines = [
-        f"learned from {learned['demonstrations']} frames of old demonstrations, {learned['new_demonstrations']} of "
-        f"new ones and {learned['corrections']} of corrections; {learned['not_imitated']} that no human drove left out"
-    ]
-    if rows := metrics["held_out"]:
-        actions = [key[len("after_") : -len("_pct")] for key in rows[0] if key.startswith("after_")]
-        lines.append(f"errors on held-out episodes, % of the recorded range, before and after ({', '.join(actions)})")
-        for row in rows:
-            pairs = (
-                f"{format_pct(row[f'before_{a}_pct']).strip()} to {format_pct(row[f'after_{a}_pct']).strip()}"
-                for a in actions
-            )
-            lines.append(f"{row['kind']} {row['episode']}: {'; '.join(pairs)}")
+    counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in metrics["learned_from"].items())
+    lines = [f"frames: {counts}"]
+    for row in metrics["held_out"]:
+        errors = [f"{key.removesuffix('_pct')} {format_pct(row[key]).strip()}" for key in row if key.endswith("_pct")]
+        lines.append(f"{row['kind']} {row['episode']}, error: {', '.join(errors)}".replace("_", " "))
     for kind, each in metrics["verdict"]["kinds"].items():
         if each["episodes"]:
             lines.append(

@@ -1,6 +1,7 @@
 """The commands that teach policies. `rover` has them by entry points of pyproject.toml."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,30 +16,46 @@ if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
 
 
+def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of a training whose recipe is a section of params.yml."""
+    for option in (
+        AS_JSON,
+        click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]"),
+        click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]"),
+        click.option(
+            "--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml]."
+        ),
+        click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml]."),
+        click.option("--runs-dir", type=FILE, default="runs", show_default=True),
+        click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/."),
+    ):
+        command = option(command)
+    return command
+
+
+def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json: bool) -> None:
+    from rover_lib.onboard.stage import read_stage
+
+    content = read_stage(folder / f"{stage}.json", stage)
+    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
+
+
 @click.command(short_help="Teach a smaller policy, or train one for INT8.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
 @click.option(
     "--size", callback=size_option, metavar="WIDTHxHEIGHT", help="The student's picture [default: its teacher's]."
 )
-@click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers [default: all].")
-@click.option(
-    "--feedforward", type=int, metavar="N", help="Keep the N most important units of each feed-forward [default: all]."
-)
+@click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers.")
+@click.option("--feedforward", type=int, metavar="N", help="Keep the N most important units of each feed-forward.")
 @click.option(
     "--backbone-channels",
     type=float,
     metavar="SHARE",
-    help="Keep this share, such as 0.5, of the channels inside the backbone's blocks [default: all].",
+    help="Keep this share, such as 0.5, of the channels inside the backbone's blocks.",
 )
-@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
-@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml].")
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml].")
 @click.option("--qat", is_flag=True, help="Train it for INT8 at the end; without a new shape, CHECKPOINT itself.")
-@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
-@AS_JSON
+@of_a_recipe
 @with_source
 def distill(
     checkpoint: Path,
@@ -59,34 +76,23 @@ def distill(
     from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.stage import read_stage
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
-    recipe = DistillRecipe.of(
-        params(), steps=steps, phases=phases_of(shape, options["qat"]), samples=samples, seed=seed
-    )
+    given = {"steps": steps, "samples": samples, "seed": seed}
+    recipe = DistillRecipe.of(params(), phases=phases_of(shape, options["qat"]), **given)
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal_bar(), **options)
-    content = read_stage(folder / "distill.json", "distill")
-    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
+    show_stage(folder, "distill", summary, as_json)
 
 
 @click.command(short_help="Train a policy further, from takeovers.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
-@click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/.")
-@click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option(
     "--weight", type=Number(min=0, min_open=True), help="Weight of a frame of a correction [default: params.yml]."
 )
-@click.option(
-    "--samples", type=click.IntRange(min=1), help="Maximum number of frames of each kind [default: params.yml]."
-)
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps of both phases [default: params.yml].")
-@click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
-@AS_JSON
+@of_a_recipe
 def finetune(
     checkpoint: Path,
     episodes: tuple[Path, ...],
@@ -108,12 +114,10 @@ def finetune(
     from rover_learn.finetune import FinetuneRecipe
     from rover_learn.finetune import finetune as learn_on
     from rover_lib.onboard.params import params
-    from rover_lib.onboard.stage import read_stage
 
     recipe = FinetuneRecipe.of(params(), steps=steps, correction_weight=weight, samples=samples, seed=seed)
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
-    content = read_stage(folder / "finetune.json", "finetune")
-    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
+    show_stage(folder, "finetune", summary, as_json)
 
 
 @click.command(short_help="Make many runs from one sheet, and compare them.")

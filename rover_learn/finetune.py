@@ -15,22 +15,21 @@ together at a fiftieth of the rate. The run's folder gets best_model.pth, pretra
 Letters: n samples, B batch, C chunk, A actions.
 """
 
-import math
 import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from rover_learn import lessons as lessons_module
 from rover_learn import phases, training
-from rover_learn.acceptance import Judged, verdict
-from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Part, judged_ranges, plans_of
-from rover_learn.phases import FromZero, Positive, Recipe, Room, Share, Taught, Weight, Within, Work, make_run
+from rover_learn.acceptance import NEW, OLD, Judged, verdict
+from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Pool, judged_ranges, plans_of
+from rover_learn.phases import Recipe, Work, free_folder, make_run
 from rover_learn.student import not_a_cars
 from rover_learn.training import Resumable
 from rover_lib.onboard.car.picture import is_squeezed
@@ -44,45 +43,27 @@ from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import (
-    Episode,
-    Recordings,
-    Sample,
-    Source,
-    frame_rate_hz,
-    is_another_rate,
-    pick_evenly,
-)
-from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, pick_evenly
 from rover_lib.workshop.run.session import check_sizes, training_device
 
-OLD, NEW = "old", "new"
-TOGETHER_SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
+SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneRecipe(Recipe):
-    """How a policy goes on learning: the section `finetune` of params.yml.
-
-    samples: at most this many frames of each folder's demonstrations, and as many of its corrections. rate: the second
-    phase has a fiftieth of it. correction_weight: a frame of a correction is drawn this many times as often as one of a
-    demonstration. focus: new frames on which the policy planned something else than the human did are drawn more often,
-    in proportion to this power of how far off it was; with 0 all are drawn alike.
-    to_parent: the share of an old demonstration's loss that is the distance to what the policy planned there before;
-    the rest, and all of the loss elsewhere, is the distance to what was recorded. held_out_share: the share of new
-    episodes that judge; the old ones are split as for everything else. judged_frames: of each held-out episode.
-    """
+    """How a policy goes on learning: the section `finetune` of params.yml, which explains each number."""
 
     SECTION, ERROR, PHASES = "finetune", FinetuneError, ("transformer", "together")
 
-    transformer_steps: FromZero
-    together_steps: FromZero
-    correction_weight: Positive
-    focus: Weight
-    to_parent: Share
-    held_out_share: Annotated[float, Within("from 0 to below 1", 0, math.nextafter(1, 0))]
+    transformer_steps: int
+    together_steps: int
+    correction_weight: float
+    focus: float
+    to_parent: float
+    held_out_share: float
 
 
 def finetune(
@@ -105,25 +86,15 @@ def finetune(
     folder appears only when it is complete. Raises FinetuneError for a name, a device or recordings that cannot be
     used; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
-    folder, where = run_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
-    if folder.exists():
-        raise _is_there(folder)
+    folder, where = free_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
     recipe = recipe or FinetuneRecipe.of(params())
     parent, material = _open_work(checkpoint, episodes, recipe, progress)
     work = _Work(origin=parent, material=material, recipe=recipe, device=where, progress=progress)
-    with make_run(folder, parent.config) as new:
-        if folder.exists():  # another process has just made it
-            raise _is_there(folder)
-        taught = _train_phases(work)
-        _leave(new, name, work, taught)
-        if folder.exists():  # another command made it meanwhile; what was learned is kept for another name
-            raise _is_there(folder)
-    shutil.rmtree(taught.folder, ignore_errors=True)  # a process that learns the same may have removed it already
+    with make_run(folder, parent.config, FinetuneError) as new:
+        weights, losses, unfinished = _train_phases(work)
+        _leave(new, name, work, weights, losses)
+    shutil.rmtree(unfinished, ignore_errors=True)  # a process that learns the same may have removed it already
     return folder
-
-
-def _is_there(folder: Path) -> FinetuneError:
-    return FinetuneError(f"{folder}: is there already", remedy="give another --name, or move that run away")
 
 
 # --- what is learned from ---------------------------------------------------------------------------------------------
@@ -187,10 +158,8 @@ def _open_work(
 ) -> tuple[Checkpoint, _Material]:
     """Read the checkpoint and the recordings, and check that they belong together."""
     if str(checkpoint).endswith((".pt", ".onnx.zip")):
-        raise FinetuneError(
-            f"{checkpoint}: is an artifact, whose weights are for driving and not for training",
-            remedy="give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder",
-        )
+        remedy = "give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder"
+        raise FinetuneError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
     parent = load_checkpoint(checkpoint)
     _refuse_no_car(parent)
     check_sizes(parent)
@@ -204,13 +173,9 @@ def _open_work(
     read = [load_recordings(source, parent.config.chunk, p["sync_s"], progress) for source in sources]
     policies = [parent.recorded_as(recordings.layout) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
-        raise FinetuneError(
-            "the recordings name, order or time their states and actions differently", found=", ".join(places)
-        )
+        raise FinetuneError("the recordings name, order or time states and actions differently", found=places)
     _refuse_no_car(policies[0])
-    _refuse_another_car(read)
-    _refuse_another_camera(read)
-    _refuse_another_rate(read, policies[0].config.rate_hz)
+    _refuse_unlike(read, policies[0].config.rate_hz)
     return policies[0], _part_episodes(read, recipe)
 
 
@@ -220,10 +185,8 @@ def _part_episodes(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Mater
     old = [e for e in read[0].episodes if not e.by_policy]
     new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
     if not new:
-        raise FinetuneError(
-            f"{read[0].root}: no new episode: in none of them a policy drove",
-            remedy="give the new recordings too, after the old ones",
-        )
+        remedy = "give the new recordings too, after the old ones"
+        raise FinetuneError(f"{read[0].root}: no new episode: in none of them a policy drove", remedy=remedy)
     taught: list[tuple[str, tuple[Sample, ...]]] = []
     held_out = []
     if old:
@@ -234,11 +197,8 @@ def _part_episodes(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Mater
             held_out.append(_HeldOut(name, OLD, _driven_by_humans(samples, old)))
     driven = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
     if not driven:
-        raise FinetuneError(
-            f"a human drove in none of the {len(new)} new episodes",
-            found=f"{sum(len(e.samples) for _, e in new)} frames of a policy or of nobody",
-            remedy="a policy cannot learn from its own drives: take over where it drives wrong",
-        )
+        remedy = "a policy cannot learn from its own drives: take over where it drives wrong"
+        raise FinetuneError("no human drove in the new episodes", found=len(new), remedy=remedy)
     count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
     judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
     held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
@@ -266,46 +226,26 @@ def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) ->
 
 def _refuse_no_car(policy: Checkpoint) -> None:
     if found := not_a_cars(policy.config):
-        raise FinetuneError(
-            f"{policy.path}: only a policy of one camera, steering and throttle can learn from recordings of a car",
-            found=found,
-            remedy="if it is one, name its numbers so in the dataset's meta/info.json",
-        )
+        remedy = "if it is of one camera, steering and throttle, name them so in the dataset's meta/info.json"
+        raise FinetuneError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
 
 
-def _refuse_another_car(read: Sequence[Recordings]) -> None:
-    first = read[0].episodes[0]
-    car = first.samples[0].car
-    for recordings in read:
+def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
+    """Raise FinetuneError for recordings of another car, camera or rate than the first's, or the policy's plans."""
+    shapes = [r.episodes[0].samples[0].frame_bgr().shape[1::-1] for r in read]  # all pictures of a set have one
+    for recordings, (width, height) in zip(read, shapes, strict=True):
+        what = ""
+        if is_squeezed((width, height), shapes[0]):
+            what, found = "another camera", f"{width}x{height} beside {shapes[0][0]}x{shapes[0][1]}"
         for episode in recordings.episodes:
-            if not episode.samples[0].car.drives_like(car):
-                raise FinetuneError(
-                    f"{episode.path}: was recorded with another car than {first.path}",
-                    remedy="a policy drives one car: give recordings of that one alone",
-                )
-
-
-def _refuse_another_camera(read: Sequence[Recordings]) -> None:
-    """Compare the first picture of each set of recordings, because all pictures of a set have one shape."""
-    shapes = [r.episodes[0].samples[0].frame_bgr().shape[:2] for r in read]
-    height, width = shapes[0]
-    for recordings, (own_height, own_width) in zip(read, shapes, strict=True):
-        if is_squeezed((own_width, own_height), (width, height)):
-            raise FinetuneError(
-                f"{recordings.root}: its camera has another shape than that of {read[0].root}",
-                found=f"{own_width}x{own_height} beside {width}x{height}",
-                remedy="a policy looks through one camera: give recordings of that one alone",
-            )
-
-
-def _refuse_another_rate(read: Sequence[Recordings], plans_hz: float) -> None:
-    for episode in (episode for recordings in read for episode in recordings.episodes):
-        if is_another_rate(found_hz := frame_rate_hz(episode.samples), plans_hz):
-            raise FinetuneError(
-                f"{episode.path}: the policy plans {plans_hz:g} steps a second",
-                found=f"{episode.id} of {found_hz:.1f} frames a second",
-                remedy="give recordings of that rate alone: a camera halves its own in the dark",
-            )
+            rate_hz = recorded.frame_rate_hz(episode.samples)
+            if not episode.samples[0].car.drives_like(read[0].episodes[0].samples[0].car):
+                what, found = "another car", episode.id
+            elif recorded.is_another_rate(rate_hz, plans_hz):
+                what, found = "another rate", f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan"
+        if what:
+            remedy = f"give recordings of one car, one camera and {plans_hz:g} Hz; in the dark, a camera is slower"
+            raise FinetuneError(f"{recordings.root}: was recorded with {what}", found=found, remedy=remedy)
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
@@ -318,82 +258,53 @@ class _Work(Work):
     material: _Material
 
 
-def _train_phases(work: _Work) -> Taught:
-    """Train both phases. What the policy sees in each of the recordings stays in the cache, for its next training."""
+def _train_phases(work: _Work) -> tuple[dict[str, Tensor], dict[str, list[float]], Path]:
+    """Train both phases. Returns weights by LeRobot's names, the losses by phase, and the folder of the saved phases.
+
+    What the policy sees in each of the recordings stays in the cache, for its next training.
+    """
     sources = [lessons_module, phases, training, preprocess, act]
     recipe, parent, ranges = work.recipe, work.origin, judged_ranges(work.material.action_range())
+    units = torch.from_numpy(1 / ranges).to(work.device)
     every = []
     for kind, samples in work.material.taught:
         folder = cache_root() / f"lessons-{key_of(work.sees(samples) | {'kind': kind}, *sources)}"
-        lessons = _make_lessons(work, kind, samples, folder)
+        with Resumable(folder, work.progress) as saved:
+            lessons = Lessons.open(folder, samples, parent.config, parent, work.rng(f"states, {kind}"))
+            lessons.ask(saved, parent, work.rng(kind), work.device)
         every.append((kind, lessons))
         if kind == DEMONSTRATIONS:
             remedy = "give first the recordings that it was trained on"
             lessons.refuse_stranger(parent, ranges, FinetuneError, "the old", remedy)
     whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
     own = cache_root() / f"finetune-{key_of(whole, sys.modules[__name__], *sources)}"
-    room = _Room(work, ranges, every)
+    weights = np.concatenate([_weights(recipe, kind, each, units) for kind, each in every])
+    pool = Pool([(each, kind != DEMONSTRATIONS) for kind, each in every], weights)
+
+    def loss(plans: Tensor, batch: Batch) -> Tensor:
+        """The mean absolute error, in units of the recorded range. plans: (B, C, A)."""
+        share, driven = batch.share_of_old(recipe.to_parent), batch.driven()
+        to_parent = ((plans - batch.planned()).abs() * units * share).sum()
+        to_recorded = ((plans - batch.recorded()).abs() * units * driven * (1 - share)).sum()
+        counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
+        return (to_parent + to_recorded) / (counted * len(units))
+
     with Resumable(own, work.progress) as saved:
         policy = BatchedPolicy(parent.config, parent.weights).to(work.device)
         policy.thaw()
-        room.train(
-            saved, "transformer", policy.model, recipe.rate, lambda b: room.loss(policy.plan(b.seen(), b.states()), b)
-        )
-        slow = recipe.rate / TOGETHER_SLOWER
-        room.train(saved, "together", policy, slow, lambda b: room.loss(policy(b.pictures(), b.states()), b))
+        work.train_policy(saved, policy, pool, loss, seen="maps", slower=SLOWER)
         losses = dict(saved.losses)
-    weights = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
-    return Taught(weights, losses, own)
+    return {name: weight.float() for name, weight in parent.weights.items()} | policy.weights(), losses, own
 
 
-def _make_lessons(work: _Work, kind: str, samples: tuple[Sample, ...], folder: Path) -> Lessons:
-    """Make or complete the lessons: what the policy sees and plans on these samples before it learns."""
-    with Resumable(folder, work.progress) as saved:
-        lessons = Lessons.open(folder, samples, work.origin.config, work.origin, work.rng(f"states, {kind}"))
-        lessons.ask(saved, work.origin, work.rng(kind), work.device)
-    return lessons
-
-
-class _Room(Room):
-    """Draws batches from all lessons, and computes the loss."""
-
-    def __init__(self, work: _Work, ranges: np.ndarray, lessons: Sequence[tuple[str, Lessons]]):
-        super().__init__(work, ranges)
-        self.lessons = lessons
-        counts = [len(each) for _, each in lessons]
-        weights = np.concatenate([self._weights(kind, each) for kind, each in lessons])
-        self.shares = weights / weights.sum()
-        self.places = np.repeat(np.arange(len(lessons)), counts)
-        self.rows = np.concatenate([np.arange(count) for count in counts])
-
-    def _weights(self, kind: str, lessons: Lessons) -> np.ndarray:
-        """Return how often each sample is drawn, relative to a demonstration's 1, (n,)."""
-        recipe = self.work.recipe
-        if kind == DEMONSTRATIONS:
-            return np.ones(len(lessons))
-        planned, driven = lessons.plans[2 * np.arange(len(lessons))], ~lessons.data.is_pad
-        off = (np.abs(planned - lessons.data.chunks) * self.units.cpu().numpy()).mean(2)
-        off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
-        return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
-
-    def batch(self, rng: np.random.Generator) -> Batch:
-        count = len(self.rows)
-        chosen = rng.choice(count, min(self.work.recipe.batch, count), replace=False, p=self.shares)
-        views = rng.integers(2, size=len(chosen))
-        parts = []
-        for place, (kind, lessons) in enumerate(self.lessons):
-            own = self.places[chosen] == place
-            if own.any():
-                parts.append(Part(lessons, self.rows[chosen][own], views[own], kind != DEMONSTRATIONS))
-        return Batch(parts, rng, self.work.device)
-
-    def loss(self, plans: Tensor, batch: Batch) -> Tensor:
-        """Return the mean absolute error, in units of the recorded range. plans: (B, C, A)."""
-        share, driven = batch.share_of_old(self.work.recipe.to_parent), batch.driven()
-        to_parent = ((plans - batch.planned()).abs() * self.units * share).sum()
-        to_recorded = ((plans - batch.recorded()).abs() * self.units * driven * (1 - share)).sum()
-        counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
-        return (to_parent + to_recorded) / (counted * len(self.units))
+def _weights(recipe: FinetuneRecipe, kind: str, lessons: Lessons, units: Tensor) -> np.ndarray:
+    """Return how often each sample is drawn, relative to a demonstration's 1, (n,)."""
+    if kind == DEMONSTRATIONS:
+        return np.ones(len(lessons))
+    planned, driven = lessons.plans[2 * np.arange(len(lessons))], ~lessons.data.is_pad
+    off = (np.abs(planned - lessons.data.chunks) * units.cpu().numpy()).mean(2)
+    off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
+    return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
 
 
 # --- judging and leaving ----------------------------------------------------------------------------------------------
@@ -418,13 +329,13 @@ def _judge(work: _Work, weights: dict[str, Tensor]) -> list[Judged]:
     return judged
 
 
-def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
+def _leave(new: Path, name: str, work: _Work, weights: dict[str, Tensor], losses: dict[str, list[float]]) -> None:
     """Judge the policy, and write its files and finetune.json into `new`, which becomes the run's folder."""
     parent, material = work.origin, work.material
-    judged = _judge(work, taught.weights)
+    judged = _judge(work, weights)
     errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
     loss = float(np.mean(errors)) / 100 if errors else float("nan")
-    hashes = work.write_policy(new, name, parent.config, taught.weights, loss, material.recordings[-1].root.name)
+    hashes = work.write_policy(new, name, parent.config, weights, loss, material.recordings[-1].root.name)
     write_stage(
         new / "finetune.json",
         "finetune",
@@ -433,7 +344,7 @@ def _leave(new: Path, name: str, work: _Work, taught: Taught) -> None:
             "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
             "held_out": [each.row() for each in judged],
             "verdict": verdict(judged),
-            "losses": taught.losses,
+            "losses": losses,
             "warnings": not_judged(material.action_range()),
             "files_sha256": hashes,
         },

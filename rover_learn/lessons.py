@@ -188,8 +188,11 @@ class Lessons:
     def each_once(self) -> Iterator[np.ndarray]:
         """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
         for block in range(self.blocks):
-            rows = _rows(block, len(self))
+            rows = self._rows(block)
             yield self.pictures(rows, rows % len(VIEWS))
+
+    def _rows(self, block: int) -> np.ndarray:
+        return np.arange(block * BLOCK, min((block + 1) * BLOCK, len(self)))
 
     def apart(self, folder: Path) -> "Lessons":
         """Return the same lessons with tokens of their own, still empty, in a folder.
@@ -209,7 +212,7 @@ class Lessons:
         blocks = saved.steps("teacher", self.blocks, rng, frames=self.frames, maps=self.maps, plans=self.plans)
         for block in blocks:
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
-            rows, grid = _rows(block, len(self)), (self.maps.shape[1], self.maps.shape[2])
+            rows, grid = self._rows(block), (self.maps.shape[1], self.maps.shape[2])
             pictures = [self.samples[i].frame_bgr() for i in rows]
             self.frames.append(np.stack([prepare_frame(p, *self.frames.shape[:2]) for p in pictures]))
             (size,) = teacher.config.image_sizes
@@ -244,12 +247,8 @@ class Lessons:
         """Compute the student's own feature maps of every sample in both views, as far as they are missing."""
         device = student.image_scale.device
         for block in saved.steps("tokens", self.blocks, rng, tokens=self.tokens):
-            frames = torch.from_numpy(self.frames[_rows(block, len(self))]).to(device)
+            frames = torch.from_numpy(self.frames[self._rows(block)]).to(device)
             self.tokens.append(student.features(torch.stack([frames, frames.flip(2)], 1).flatten(0, 1)).half().cpu())
-
-
-def _rows(block: int, count: int) -> np.ndarray:
-    return np.arange(block * BLOCK, min((block + 1) * BLOCK, count))
 
 
 class Part(NamedTuple):
@@ -313,3 +312,30 @@ class Batch:
     def driven(self) -> Tensor:
         """Whether that was driven and is no padding, (B, C, 1)."""
         return self._join([~p.lessons.data.is_pad[p.rows] for p in self.parts])[..., None]
+
+
+class Pool:
+    """All lessons of a training, from which batches are drawn.
+
+    lessons: each with whether it was recorded after the teacher was trained. weights: how often each sample is drawn,
+    (n of all lessons,); None: all alike.
+    """
+
+    def __init__(self, lessons: Sequence[tuple[Lessons, bool]], weights: np.ndarray | None = None):
+        self.lessons = lessons
+        counts = [len(each) for each, _ in lessons]
+        self._places = np.repeat(np.arange(len(lessons)), counts)
+        self._rows = np.concatenate([np.arange(count) for count in counts])
+        self._shares = None if weights is None else weights / weights.sum()
+
+    def batch(self, count: int, rng: np.random.Generator, device: torch.device) -> Batch:
+        """Draw samples, each at most once and in one of its views."""
+        most = len(self._rows)
+        chosen = rng.choice(most, min(count, most), replace=False, p=self._shares)
+        views = rng.integers(len(VIEWS), size=len(chosen))
+        parts = []
+        for place, (lessons, new) in enumerate(self.lessons):
+            own = self._places[chosen] == place
+            if own.any():
+                parts.append(Part(lessons, self._rows[chosen][own], views[own], new))
+        return Batch(parts, rng, device)

@@ -1,29 +1,27 @@
-"""What every training in phases on lessons shares: its recipe, its place in the cache, and what it leaves.
+"""What distilling and finetuning share: a recipe of checked numbers, the phases, and what they leave.
 
-class DistillRecipe(Recipe): ...
 recipe = DistillRecipe.of(params(), steps=200)
-with make_run(folder, config) as new:
-    room.train(saved, "transformer", policy.model, recipe.rate, loss)
+with make_run(folder, config, DistillError) as new:
+    work.train_policy(saved, policy, pool, loss, seen="maps", slower=10)
     hashes = work.write_policy(new, name, config, weights, error, "episodes")
 """
 
 import math
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Self, get_type_hints
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_learn.lessons import Batch
+from rover_learn.lessons import Batch, BatchedPolicy, Pool
 from rover_learn.student import gmac
-from rover_learn.training import Resumable, threads
+from rover_learn.training import Phase, Resumable, threads
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.act import ActConfig
@@ -31,30 +29,19 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
 from rover_lib.workshop.swap_folder import build_beside
 from rover_lib.workshop.untrusted import quote
 
-
-class Within(NamedTuple):
-    """What a number of a recipe may be, in words and in figures."""
-
-    words: str
-    least: float
-    most: float = math.inf
-
-
-TINY = math.ulp(0.0)  # the smallest number above 0
-Count = Annotated[int, Within("at least 1", 1)]
-FromZero = Annotated[int, Within("at least 0", 0)]
-Weight = Annotated[float, Within("at least 0", 0)]
-Positive = Annotated[float, Within("above 0", TINY)]
-Share = Annotated[float, Within("from 0 to 1", 0, 1)]
+# Least and most of a recipe's numbers. Of the others, steps may be 0, whole numbers are at least 1, and rates above 0.
+LIMITS = {"seed": (0, math.inf), "to_parent": (0, 1), "held_out_share": (0, 0.999)}
+LIMITS |= dict.fromkeys(("focus", "to_teacher", "to_recorded"), (0, math.inf))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """How a policy is trained: a section of params.yml.
+    """How a policy is trained: a section of params.yml, which explains each number.
 
     samples: learned from at most. rate: learning rate of the first phases. judged_frames: of the held-out episodes, at
     most. seed: of all that is drawn at random. Each of PHASES has its number of steps, `<phase>_steps`.
@@ -64,28 +51,24 @@ class Recipe:
     ERROR: ClassVar[type[RoverError]]
     PHASES: ClassVar[tuple[str, ...]]
 
-    samples: Count
-    batch: Count
-    rate: Positive
-    judged_frames: Count
-    seed: FromZero
+    samples: int
+    batch: int
+    rate: float
+    judged_frames: int
+    seed: int
 
     def __post_init__(self):
         """Raise ERROR for what is no number, or not within its limits."""
-        hints = get_type_hints(type(self), include_extras=True)
-        for name, value in vars(self).items():
-            of_type, limits = hints[name].__origin__, hints[name].__metadata__[0]
-            whole = of_type is int
-            what, like = ("a whole number", "10") if whole else ("a finite number", "1.0e-3; 1e-3 is text in YAML")
-            if not (is_whole if whole else is_number)(value):
-                remedy = f"write it like {like}"
-                raise self.ERROR(f"{self._where()}: {name} must be {what}", found=quote(value), remedy=remedy)
-            if not limits.least <= value <= limits.most:
-                raise self.ERROR(f"{self._where()}: {name} must be {limits.words}", found=quote(value))
-
-    @classmethod
-    def _where(cls) -> str:
-        return f"params.yml: {cls.SECTION}"
+        for each in fields(self):
+            value, whole = getattr(self, each.name), each.type is int
+            least, most = LIMITS.get(each.name, (1 if whole else math.ulp(0.0), math.inf))
+            least = 0 if each.name.endswith("_steps") else least
+            if not (is_whole if whole else is_number)(value) or not least <= value <= most:
+                what = "a whole number" if whole else "a number, written like 1.0e-3,"
+                limits = f"from {least:g} to {most:g}" if most < math.inf else f"of at least {least:g}"
+                limits = "above 0" if 0 < least < 1 else limits
+                where = f"params.yml: {self.SECTION}: {each.name}"
+                raise self.ERROR(f"{where} must be {what} {limits}", found=quote(value))
 
     @classmethod
     def of(
@@ -97,11 +80,12 @@ class Recipe:
         that cannot be.
         """
         values = params[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
-        known = [f.name for f in fields(cls)]
-        if unknown := sorted(set(values) - set(known)):
-            raise cls.ERROR(f"{cls._where()}: there is no {unknown[0]!r}", remedy=f"known are {', '.join(known)}")
-        if missing := sorted(set(known) - set(values)):
-            raise cls.ERROR(f"{cls._where()}: {missing[0]} is missing")
+        known = {f.name for f in fields(cls)}
+        if wrong := sorted(known ^ set(values)):
+            what = "is missing" if wrong[0] in known else "is unknown"
+            raise cls.ERROR(
+                f"params.yml: {cls.SECTION}: {wrong[0]} {what}", remedy=f"it has {', '.join(sorted(known))}"
+            )
         recipe = cls(**values)
         return recipe if steps is None else recipe.of_steps(steps, phases)
 
@@ -134,10 +118,6 @@ class Work:
         """Return a phase's source of random numbers, the same in every process."""
         return np.random.default_rng([self.recipe.seed, zlib.crc32(phase.encode())])
 
-    def described(self) -> dict[str, Any]:
-        """Return the recipe and the device, as a stage's params."""
-        return asdict(self.recipe) | {"device": self.device.type}
-
     def sees(self, samples: Sequence[Sample]) -> dict[str, Any]:
         """Return what the lessons on these samples depend on, as a part of their key in the cache."""
         recorded = ("state", "chunk", "is_pad")
@@ -148,6 +128,34 @@ class Work:
             "at": [self.device.type, self.recipe.seed],
             "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
         }
+
+    def train(
+        self, saved: Resumable, phase: str, module: nn.Module, rate: float, pool: Pool, loss: Callable[[Batch], Tensor]
+    ) -> None:
+        """Train a module for the phase's number of steps in the recipe, or continue where that was interrupted."""
+        rng, steps = self.rng(phase), getattr(self.recipe, f"{phase}_steps")
+        saved.train(
+            Phase(phase, steps, rate), module, rng, lambda _: pool.batch(self.recipe.batch, rng, self.device), loss
+        )
+
+    def train_policy(
+        self,
+        saved: Resumable,
+        policy: BatchedPolicy,
+        pool: Pool,
+        loss: Callable[[Tensor, Batch], Tensor],
+        *,
+        seen: str,
+        slower: float,
+    ) -> None:
+        """Train the transformer on what its backbone sees, `seen` of the lessons, then all together so much slower."""
+        model, rate = policy.model, self.recipe.rate
+        self.train(saved, "transformer", model, rate, pool, lambda b: loss(policy.plan(b.seen(seen), b.states()), b))
+        self.train(saved, "together", policy, rate / slower, pool, lambda b: loss(policy(b.pictures(), b.states()), b))
+
+    def described(self) -> dict[str, Any]:
+        """Return the recipe and the device, as a stage's params."""
+        return asdict(self.recipe) | {"device": self.device.type}
 
     def write_policy(
         self, folder: Path, name: str, config: ActConfig, weights: dict[str, Tensor], loss: float, recordings: str
@@ -161,48 +169,21 @@ class Work:
             "device": self.device.type,
             "seed": self.recipe.seed,
         }
-        policy = self.origin
-        origin = {f"{self.ROLE}_sha256": policy.sha256, f"{self.ROLE}_format": policy.format}
+        origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}
         return write_both(folder, config, weights, loss, origin | {self.VERB: self.described()}, **settings)
 
 
-class Room(ABC):
-    """Where a policy learns from lessons, batch by batch. ranges: each action's, (A,); errors are divided by them."""
-
-    def __init__(self, work: Work, ranges: np.ndarray):
-        self.work, self.units = work, torch.from_numpy(1 / ranges).to(work.device)
-
-    @abstractmethod
-    def batch(self, rng: np.random.Generator) -> Batch:
-        """Draw the next samples, each with one of its views."""
-
-    def train(
-        self, saved: Resumable, phase: str, module: nn.Module, rate: float, loss: Callable[[Batch], Tensor]
-    ) -> None:
-        """Train a module for the phase's number of steps in the recipe, or go on where that was interrupted."""
-        rng, steps = self.work.rng(phase), getattr(self.work.recipe, f"{phase}_steps")
-        saved.train(phase, steps, rate, module, rng, lambda: loss(self.batch(rng)))
-
-
-@dataclass(frozen=True, eq=False)
-class Taught:
-    """A policy that has learned.
-
-    weights: by LeRobot's names without the leading `model.`. losses: by phase. folder: where the phases are saved.
-    notes: what it was made to do without, by part. unrounded: the weights before quantization-aware training, if any.
-    """
-
-    weights: dict[str, Tensor]
-    losses: dict[str, list[float]]
-    folder: Path
-    notes: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
-    unrounded: dict[str, Tensor] | None = None
+def free_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path:
+    """Return a run's folder, which is not there yet. Raises `error` if it is, or for a name that cannot be."""
+    folder = run_folder(runs_dir, name, error)
+    if folder.exists():
+        raise error(f"{folder}: is there already", remedy="give another --name, or move that run away")
+    return folder
 
 
 @contextmanager
-def make_run(
-    folder: Path, config: ActConfig, replaced: Callable[[Path], Iterable[Path]] = lambda _: ()
-) -> Iterator[Path]:
-    """Build a run's folder beside it, as `build_beside`, with as many threads as a policy of that config gains from."""
-    with build_beside(folder, replaced) as new, threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
+def make_run(folder: Path, config: ActConfig, error: type[RoverError]) -> Iterator[Path]:
+    """Build a run's folder beside it, with as many threads as a policy of that config gains from."""
+    with build_beside(folder) as new, threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
         yield new
+        free_folder(folder.parent, folder.name, error)  # another command may have made it meanwhile

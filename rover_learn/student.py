@@ -51,34 +51,22 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     """
     c = teacher.config
     if found := not_a_cars(c):
-        raise DistillError(
-            f"{teacher.path}: only a policy of one camera, steering and throttle can teach from recordings of a car",
-            found=found,
-            remedy="if it is one, say which number is what: --action-names",
-        )
+        remedy = "if it is of one camera, steering and throttle, say which number is what: --action-names"
+        raise DistillError(f"{teacher.path}: is not a car's policy", found=found, remedy=remedy)
     ((height, width),) = c.image_sizes
-    wanted = {
-        "height": (shape.height, height),
-        "width": (shape.width, width),
-        "decoder layers": (shape.decoder_layers, c.decoder_layers),
-        "feed-forward": (shape.feedforward, c.feedforward),
-    }
-    for name, (own, teachers) in wanted.items():
-        if own is not None and not 1 <= own <= teachers:
+    own = (shape.height, shape.width, shape.decoder_layers, shape.feedforward)
+    teachers = (height, width, c.decoder_layers, c.feedforward)
+    for name, value, most in zip(("height", "width", "decoder layers", "feed-forward"), own, teachers, strict=True):
+        if value is not None and not 1 <= value <= most:
+            remedy = "a student is a part of its teacher; train a larger policy on recordings instead"
             raise DistillError(
-                f"a student's {name} must be from 1 to its teacher's, {teachers}",
-                found=own,
-                remedy="a student is a part of its teacher; train a larger policy on recordings instead",
+                f"a student's {name} must be from 1 to its teacher's, {most}", found=value, remedy=remedy
             )
     if (share := shape.backbone_channels) is not None:
         if not 0 < share <= 1:
-            raise DistillError(
-                "the share of the backbone's channels must be above 0, at most 1", found=share, remedy="0.5 keeps half"
-            )
+            raise DistillError("the share of the backbone's channels must be above 0, at most 1", found=share)
         if BACKBONES[c.backbone][0] != "basic":
-            raise DistillError(
-                "channels can be left out of ResNets of basic blocks only", found=c.backbone, remedy="leave that out"
-            )
+            raise DistillError("channels can be left out of ResNets of basic blocks only", found=c.backbone)
     smaller = teacher.at_size(shape.height or height, shape.width or width).config
     return replace(
         smaller,

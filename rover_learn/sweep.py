@@ -218,10 +218,9 @@ def open_cluster(address: str | None = None, workers: int | None = None) -> Iter
         if address:
             client = Client(address, timeout=10)
         else:
-            count = workers or max(1, (os.cpu_count() or 1) // 2)
             # A run's memory is its kernels', which Dask does not see, so a limit would only end the wrong processes.
             here = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None, "silence_logs": 40}
-            client = Client(LocalCluster(count, **here))
+            client = Client(LocalCluster(workers or max(1, (os.cpu_count() or 1) // 2), **here))
     except (OSError, ValueError, TimeoutError) as error:
         remedy = "start one: dask scheduler; dask worker tcp://HOST:8786 --nthreads 1"
         raise RoverError(f"{address}: no Dask scheduler answers", found=type(error).__name__, remedy=remedy) from None
@@ -270,15 +269,12 @@ def _note_failure(future: "Future", failed: dict[str, str]) -> None:
 
 
 def write_report(jobs: Sequence[Job], folder: Path | str, failed: Mapping[str, str]) -> dict[str, Any]:
-    """Write sweep.json into the sweep's folder, and return its content.
+    """Write sweep.json into the sweep's folder, and return its content: a row for each complete run.
 
-    It has a row for each complete run: its settings, and the figures of its static INT8 artifact. error_pct is the
-    largest of the actions' errors against FP32, to_recorded_pct the largest against what the driver did. best is true
-    unless another run is at least as good in error to the recordings, time and size, and better in one of them.
+    error_pct is the largest of the actions' errors of static INT8 against FP32, to_recorded_pct the largest against
+    what the driver did.
     """
     rows = [_row(job, Path(folder) / job.name) for job in jobs if (Path(folder) / job.name / TIMED).is_file()]
-    for row in rows:
-        row["best"] = not any(_beats(other, row) for other in rows)
     metrics = {"runs": rows, "failed": dict(failed), "missing": len(jobs) - len(rows) - len(failed)}
     return write_stage(Path(folder) / REPORT, "sweep", params={"mode": MODE}, metrics=metrics, inputs={})
 
@@ -294,27 +290,17 @@ def _row(job: Job, run: Path) -> dict[str, Any]:
         "settings": job.settings,
         "error_pct": worst([mode[f"{action}_mae_pct"] for action in compared["action_range"]]),
         "to_recorded_pct": worst([mode.get(f"{action}_vs_recorded_pct") for action in compared["action_range"]]),
-        "hits": mode["hits"],
-        "trials": mode["trials"],
-        "size_mb": mode["size_mb"],
+        **{key: mode[key] for key in ("hits", "trials", "size_mb")},
         "latency_p50_ms": timed["metrics"]["artifacts"][MODE]["latency_p50_ms"],
         "host": timed["env"]["host"],
     }
 
 
-def _beats(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether one row is at least as good as the other in everything known of both, and better in something."""
-    keys = ("to_recorded_pct", "latency_p50_ms", "size_mb")
-    pairs = [(one[k], other[k]) for k in keys if one[k] is not None and other[k] is not None]
-    return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
-
-
 def table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the rows as text, the smallest error to the recordings first. A star marks a run that no other beats."""
-    lines = [["", "run", "to recorded %", "to FP32 %", "p50 ms", "MB", "hits"]]
+    """Return the rows as text, the smallest error to the recordings first."""
+    lines = [["run", "to recorded %", "to FP32 %", "p50 ms", "MB", "hits"]]
     for row in sorted(rows, key=lambda r: (r["to_recorded_pct"] is None, r["to_recorded_pct"])):
-        hits = "-" if not row["trials"] else f"{row['hits']} of {row['trials']}"
-        figures = [number(row["to_recorded_pct"], ".2f"), number(row["error_pct"], ".2f")]
-        times = [number(row["latency_p50_ms"]), number(row["size_mb"])]
-        lines.append(["*" if row["best"] else "", row["name"], *figures, *times, hits])
+        errors = [number(row[key], ".2f") for key in ("to_recorded_pct", "error_pct")]
+        hits = f"{row['hits']} of {row['trials']}" if row["trials"] else "-"
+        lines.append([row["name"], *errors, number(row["latency_p50_ms"]), number(row["size_mb"]), hits])
     return align(lines)

@@ -18,8 +18,7 @@ turned over.
 import math
 import shutil
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,29 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_learn import training as training_module
-from rover_learn.training import (
-    ACTION,
-    IMAGE,
-    IS_PAD,
-    STATE,
-    Frames,
-    Given,
-    Resumable,
-    RowFile,
-    batch_of,
-    driving_error,
-    error_of,
-    frames_of,
-    in_memory,
-    optimiser,
-    policy_loss,
-    recorded_spread,
-    seed_inside,
-    swap_states,
-    threads,
-    to_cpu,
-)
+from rover_learn import training as loop
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Best, Frames, Given, Phase, Resumable, RowFile
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -62,37 +40,34 @@ from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import episodes as episodes_module
+from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
-from rover_lib.workshop.recordings.samples import (
-    ACTION_NAMES,
-    Recordings,
-    Source,
-    car_of,
-    frame_rate_hz,
-    is_another_rate,
-    pick_evenly,
-)
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source, pick_evenly
 from rover_lib.workshop.recordings.turning import measure_sides
 from rover_lib.workshop.run.session import training_device
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-# Below this width, two threads wait for each other longer than they compute: 40 times slower on a busy machine.
-SMALL_DIM = 256
-RESNET18_MACS = 37e3  # multiply-accumulates per pixel of the picture
+SMALL_DIM = 256  # below it, two threads wait for each other longer than they compute
 PLANNED_HZ = 30.0  # of the user's trainer
-JUDGE_EVERY, PATIENCE = 50, 8  # steps of the transformer; judgements without a better one, after which it stops
+SIZES = {
+    "small": ActConfig(
+        image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
+    ),
+    "full": ActConfig(),
+}
+# A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
+# hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
+FULL_VERSION = 1
 
 
 @dataclass(frozen=True)
 class TrainingRecipe:
-    """How long and how fast each phase trains.
+    """How long and how fast each phase trains: an entry of params.yml's section `train`, which explains each number.
 
-    *_rate: the learning rates. samples: how many of the recordings' samples are used at most; feature_samples: how many
-    of these train the transformer. judged: how many other samples give best_val_loss. at: (height, width) of the
-    pictures in all three phases; then `carry_steps` follow at the policy's own size. None: its own size from the start.
+    at: (height, width) of the pictures in all phases but the last; None: the policy's own, and no last phase.
     """
 
     backbone_steps: int
@@ -104,11 +79,28 @@ class TrainingRecipe:
     samples: int
     feature_samples: int
     judged: int
-    backbone_rate: float = 1e-3
-    transformer_rate: float = 5e-4
-    transformer_warmup: int = 0  # in steps; 0 stands for a twentieth of transformer_steps
+    backbone_rate: float
+    transformer_rate: float
+    transformer_warmup: int = 0
     at: tuple[int, int] | None = None
     carry_steps: int = 0
+
+    @classmethod
+    def of(cls, size: str, device: str) -> "TrainingRecipe":
+        """Return the recipe of params.yml for that size; with cuda's own values, if it has some.
+
+        Raises TrainingError for names and values that it does not have.
+        """
+        recipes = params()["train"]
+        values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
+        try:
+            recipe = cls(**values | {"at": tuple(values["at"]) if values.get("at") else None})
+            numbers = [value for name, value in asdict(recipe).items() if name != "at"]
+            if not all(0 <= value < math.inf for value in numbers) or recipe.batch < 1:
+                raise ValueError("a number below 0, or an empty batch")
+        except (TypeError, ValueError) as error:
+            raise TrainingError(f"params.yml: train: {size}", found=error) from None
+        return recipe
 
     def of_steps(self, steps: int) -> "TrainingRecipe":
         """Return the same recipe with `steps` steps in all, and at least one in each phase that it has."""
@@ -123,46 +115,6 @@ class TrainingRecipe:
         judged = min(self.judged, max(8, steps))
         counts: dict[str, Any] = {**shorter, **batches}
         return replace(self, **counts, samples=samples, feature_samples=features, judged=judged, transformer_warmup=0)
-
-
-SIZES = {
-    "small": ActConfig(
-        image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
-    ),
-    "full": ActConfig(),
-}
-SMALL = TrainingRecipe(200, 600, 40, 16, 16, 16, samples=4000, feature_samples=2400, judged=500)
-FULL = TrainingRecipe(
-    *(200, 250, 20),
-    *(32, 32, 8),
-    samples=100_000,
-    feature_samples=2400,
-    judged=96,
-    transformer_rate=2e-4,
-    transformer_warmup=75,
-    at=(180, 320),
-    carry_steps=30,
-)
-FULL_GPU = replace(
-    FULL,
-    backbone_steps=1000,
-    transformer_steps=3000,
-    transformer_warmup=300,
-    together_steps=200,
-    together_batch=16,
-    carry_steps=200,
-    feature_samples=6000,
-    judged=500,
-)
-RECIPES = {
-    ("small", "cpu"): SMALL,
-    ("small", "cuda"): SMALL,
-    ("full", "cpu"): FULL,
-    ("full", "cuda"): FULL_GPU,
-}
-# A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
-# hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
-FULL_VERSION = 1
 
 
 def train(
@@ -195,7 +147,7 @@ def train(
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if (steps is not None and steps < 1) or seed < 0:
         raise TrainingError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
-    recipe = RECIPES[size, device]
+    recipe = TrainingRecipe.of(size, device)
     if steps is not None:
         recipe = recipe.of_steps(steps)
     p = params()["calibration"]
@@ -212,7 +164,7 @@ def train(
         "split": p,
         "version": FULL_VERSION,
     }
-    sources = sys.modules[__name__], training_module, preprocess, act_module, episodes_module
+    sources = sys.modules[__name__], loop, preprocess, act_module, episodes_module
     key = key_of(made_of, *(() if size == "full" and steps is None else sources))
     unfinished = cache_root() / f"training-{key}"
 
@@ -242,16 +194,16 @@ def train(
 def _rate_hz(recordings: Recordings) -> float:
     """Return the steps per second of plans. Raises EpisodeError for recordings that this training is not for."""
     layout = recordings.layout
-    car_of(recordings.samples)
+    recorded.car_of(recordings.samples)
     if layout.action_names != ACTION_NAMES or layout.state_names != ACTION_NAMES or len(layout.cameras) != 1:
         raise EpisodeError(
             f"{recordings.root}: rover train is for cars of steering and throttle with one camera",
             found=layout.words(),
             remedy=f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}",
         )
-    rates = [found for e in recordings.episodes if (found := frame_rate_hz(e.samples)) is not None]
+    rates = [found for e in recordings.episodes if (found := recorded.frame_rate_hz(e.samples)) is not None]
     found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
-    return float(round(found_hz)) if layout.rate_hz or is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
+    return float(round(found_hz)) if layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:
@@ -266,169 +218,89 @@ def _turned(recordings: Recordings, progress: Progress) -> Recordings:
     )
 
 
-@dataclass
-class _Best:
-    """The best weights so far, by their error on other episodes. A part of a training's saved state.
-
-    stale: how often they were not beaten since.
-    """
-
-    error: float = math.inf
-    stale: int = 0
-    weights: dict[str, Tensor] = field(default_factory=dict)
-
-    def see(self, error: float, module: nn.Module) -> None:
-        self.stale += 1
-        if error < self.error:
-            weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
-            self.error, self.stale, self.weights = error, 0, weights
-
-    def state_dict(self) -> dict[str, Any]:
-        return dict(vars(self))
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-
-
 @dataclass(frozen=True)
 class _Training:
-    """What every phase works with. plan: the number of steps and the cost of a step of each phase; see `_plan`."""
+    """What every phase works with. weights: (2,), one divided by each action's spread, on the training's device."""
 
-    size: ActConfig  # with the pictures' size in the three phases; the policy's own may be larger
+    size: ActConfig  # with the pictures' size in the first phases; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
     judges: Frames  # of other episodes
     recipe: TrainingRecipe
-    loss_weights: Tensor  # (2,), on the device where training takes place
+    weights: Tensor
     rng: np.random.Generator
     saved: Resumable
-    plan: dict[str, tuple[int, int]]
 
     @property
     def device(self) -> torch.device:
-        return self.loss_weights.device
-
-    def rows(self, batch: int, of: int) -> np.ndarray:
-        """Draw `batch` of the numbers below `of`, each at most once."""
-        return self.rng.choice(of, min(batch, of), replace=False)
+        return self.weights.device
 
     def batch(self, count: int) -> dict[str, Tensor]:
-        """Draw the next batch of `count` frames."""
-        return batch_of(self.data, self.rows(count, len(self.data)), self.rng, self.device)
+        """Draw the next batch of `count` frames, each at most once."""
+        rows = self.rng.choice(len(self.data), min(count, len(self.data)), replace=False)
+        return loop.batch_of(self.data, rows, self.rng, self.device)
 
-    def steps(self, phase: str, **parts: Any) -> Iterator[int]:
-        count, cost = self.plan[phase]
-        return self.saved.steps(phase, count, self.rng, cost, **parts)
+    def loss(self, batch: dict[str, Tensor]) -> Tensor:
+        return loop.policy_loss(self.policy, batch, self.weights)
 
-    def judge(self, policy: "ACTPolicy", maps: Any = None) -> float:
-        """Return the policy's mean error on the judges, in units of the spreads.
+    def judge(self, maps: RowFile | None = None) -> float:
+        """Return the policy's mean error on the judges, in units of the spreads; it stays in training.
 
-        maps: a RowFile of their features, for a policy that takes those.
+        maps: their feature maps, for a policy that takes those.
         """
-        judges = self.judges if maps is None else replace(self.judges, images=maps)
-        units = self.loss_weights.cpu().numpy()
+        judges: Any = self.judges if maps is None else replace(self.judges, images=maps)
+        units = self.weights.cpu().numpy()
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
-        errors = [driving_error(policy, judges, rows, units, maps is not None) for rows in every]
+        errors = [loop.driving_error(self.policy, judges, rows, units, maps is not None) for rows in every]
+        self.policy.train()
         return float(np.average(errors, weights=[len(rows) for rows in every]))
-
-    def train(
-        self, phase: str, rate: float, module: nn.Module, loss: Callable[[], Tensor]
-    ) -> tuple[torch.optim.Optimizer, Any]:
-        count, cost = self.plan[phase]
-        return self.saved.train(phase, count, rate, module, self.rng, loss, cost)
 
 
 def _train(
-    recordings: Recordings,
-    size: ActConfig,
-    recipe: TrainingRecipe,
-    seed: int,
-    device: torch.device,
-    saved: Resumable,
+    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
 ) -> dict[str, Any]:
     """Train, and return everything in the checkpoint except its config."""
     p = params()["calibration"]
     parts = split(recordings, p["held_out_share"], p["seed"])
-    rng = np.random.default_rng([seed, 77])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
-    samples = pick_evenly(parts.calibration, recipe.samples)
-    data = frames_of(samples, *first.image_sizes[0])
+    samples, judging = pick_evenly(parts.calibration, recipe.samples), pick_evenly(parts.choosing, recipe.judged)
+    data, judges = loop.frames_of(samples, *first.image_sizes[0]), loop.frames_of(judging, *size.image_sizes[0])
     if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
-        data = in_memory(data, "reading frames", saved.progress)
-    judging = pick_evenly(parts.choosing, recipe.judged)
-    judges = frames_of(judging, *size.image_sizes[0])
-    spread = recorded_spread(data)
-    loss_weights = torch.from_numpy(1 / spread).to(device)
-    plan = _plan(size, first, recipe, len(data), len(judges))
-    saved.work = sum(count * cost for count, cost in plan.values())
-
-    with seed_inside(seed):
+        data = loop.in_memory(data, "reading frames", saved.progress)
+    spread = loop.recorded_spread(data)
+    with loop.seed_inside(seed):
         policy = lerobot_act(size)
         # Start with plans near the mean action: those of an untrained head are wild.
         with torch.no_grad():
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
-        judges_first = frames_of(judging, *first.image_sizes[0])
-        training = _Training(first, policy, data, judges_first, recipe, loss_weights, rng, saved, plan)
+        training = _Training(
+            size=first,
+            policy=policy,
+            data=data,
+            judges=loop.frames_of(judging, *first.image_sizes[0]),
+            recipe=recipe,
+            weights=torch.from_numpy(1 / spread).to(device),
+            rng=np.random.default_rng([seed, 77]),
+            saved=saved,
+        )
         _train_backbone(training)
         _train_transformer(training)
-        last = "all together"
-        apart = to_cpu({k: v.clone() for k, v in policy.state_dict().items()})
         if recipe.at:
-            _train_together(training, last)  # do not keep its optimiser, which is twice as large as the policy
-            training = replace(training, data=frames_of(samples, *size.image_sizes[0]))
-            last = "at full size"
-        optimizer, scheduler = _train_together(training, last)
-        if not recipe.at:  # at another size, what was before is no alternative
-            together = training.judge(policy)
-            after = {k: v.clone() for k, v in policy.state_dict().items()}
-            policy.load_state_dict(apart)
-            if together <= training.judge(policy):
-                policy.load_state_dict(after)
-        for step in training.steps("judging"):
-            rows = np.arange(len(judges))[step * recipe.batch : (step + 1) * recipe.batch]
-            saved.losses["judging"].append(driving_error(policy, judges, rows))
+            _train_together(training, "all together", recipe.together_steps)
+            training = replace(training, data=loop.frames_of(samples, *size.image_sizes[0]))
+            optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
+        else:
+            optimizer, scheduler = _train_together_or_not(training)
+    firsts = range(0, len(judges), recipe.batch)
+    errors = [loop.driving_error(policy, judges, np.arange(len(judges))[a : a + recipe.batch]) for a in firsts]
     return {
         "epoch": recipe.carry_steps or recipe.together_steps,
         "model_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()},
-        "optimizer_state_dict": to_cpu(optimizer.state_dict()),
+        "optimizer_state_dict": loop.to_cpu(optimizer.state_dict()),
         "scheduler_state_dict": scheduler.state_dict(),
-        "best_val_loss": np.mean(saved.losses["judging"]),
-    }
-
-
-def _plan(
-    size: ActConfig, first: ActConfig, recipe: TrainingRecipe, frames: int, judges: int
-) -> dict[str, tuple[int, int]]:
-    """Return each phase's number of steps, and the cost of one in 10^9 multiply-accumulates.
-
-    The costs are only for the progress bar, so they are rough.
-    """
-
-    def g(config: ActConfig, passes: int, batch: int, backbone: bool = True, transformer: bool = True) -> int:
-        ((height, width),) = config.image_sizes
-        tokens = math.prod(config.grid(height, width)) + 2
-        per_token = 4 * config.dim**2 + 2 * config.dim * config.feedforward
-        seen = config.encoder_layers * tokens + config.vae_layers * (config.chunk + 2)
-        seen += config.decoder_layers * config.chunk
-        macs = backbone * RESNET18_MACS * height * width + transformer * per_token * seen
-        return max(1, round(passes * batch * macs / 1e9))
-
-    batch = recipe.batch
-    features = -(-min(frames, recipe.feature_samples) // batch)
-    forward = g(first, 1, batch, transformer=False)
-    train = 3  # passes: forward, backward to the inputs, and backward to the weights
-    return {
-        "backbone": (recipe.backbone_steps, train * forward),
-        "statistics": (16 if frames >= 16 * batch else 4, forward),
-        "features, plain": (features, forward),
-        "features, mirrored": (features, forward),
-        "features, judges": (-(-judges // batch), forward),
-        "transformer": (recipe.transformer_steps, g(first, train, recipe.transformer_batch, backbone=False)),
-        "all together": (recipe.together_steps, g(first, train, recipe.together_batch)),
-        "at full size": (recipe.carry_steps, g(size, train, recipe.together_batch)),
-        "judging": (-(-judges // batch), g(size, 1, batch)),
+        "best_val_loss": np.mean(errors),
     }
 
 
@@ -450,23 +322,24 @@ class _ChunkFromFeatures(nn.Module):
 
 def _train_backbone(training: _Training) -> None:
     """Phase one: train the backbone with live batch norm, then measure on the data the statistics that stay frozen."""
-    recipe = training.recipe
     import torchvision
 
+    recipe = training.recipe
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
     model = _ChunkFromFeatures(live, training.size).to(training.device).train()
-
-    def loss() -> Tensor:
-        batch = training.batch(recipe.batch)
-        return error_of(model(batch[IMAGE]), batch, training.loss_weights)
-
-    training.train("backbone", recipe.backbone_rate, model, loss)
-    norms = [m for m in live.modules() if isinstance(m, nn.BatchNorm2d)]
-    for norm in norms:
+    training.saved.train(
+        Phase("backbone", recipe.backbone_steps, recipe.backbone_rate),
+        model,
+        training.rng,
+        batch=lambda _: training.batch(recipe.batch),
+        loss=lambda batch: loop.error_of(model(batch[IMAGE]), batch, training.weights),
+    )
+    for norm in (m for m in live.modules() if isinstance(m, nn.BatchNorm2d)):
         norm.reset_running_stats()
         norm.momentum = None  # torch then takes the plain mean over the batches below
-    for _ in training.steps("statistics", backbone=live):
+    count = 16 if len(training.data) >= 16 * recipe.batch else 4
+    for _ in training.saved.steps("statistics", count, training.rng, backbone=live):
         with torch.no_grad():
             live(training.batch(recipe.batch)[IMAGE])
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
@@ -475,17 +348,32 @@ def _train_backbone(training: _Training) -> None:
 
 def _train_transformer(training: _Training) -> None:
     """Phase two: train all but the backbone on features that are computed once, of each frame as it is and mirrored."""
-    policy, backbone = training.policy, training.policy.model.backbone.eval()
-    chosen = np.asarray(pick_evenly(range(len(training.data)), training.recipe.feature_samples))
-    views = {view: _features(training, view, chosen, backbone) for view in ("plain", "mirrored")}
-    judged = _features(replace(training, data=training.judges), "judges", np.arange(len(training.judges)), backbone)
+    policy, recipe, data = training.policy, training.recipe, training.data
+    backbone = policy.model.backbone.eval()
+    chosen = np.asarray(pick_evenly(range(len(data)), recipe.feature_samples))
+    views = [_features(training, view, data, chosen, backbone) for view in ("plain", "mirrored")]
+    judged = _features(training, "judges", training.judges, np.arange(len(training.judges)), backbone)
+
+    def batch(step: int) -> dict[str, Tensor]:
+        kept = training.rng.choice(len(chosen), min(recipe.transformer_batch, len(chosen)), replace=False)
+        rows = chosen[kept]
+        states, chunks = loop.swap_states(data, rows, training.rng), data.chunks[rows].copy()
+        if step % 2:  # mirrored
+            states[:, 0] *= -1
+            chunks[:, :, 0] *= -1
+        arrays = {IMAGE: views[step % 2][kept], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
+        return {name: torch.from_numpy(array).to(training.device) for name, array in arrays.items()}
+
     policy.model.backbone = Given()
-    with threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        _transformer_steps(training, chosen, views, judged)
+    policy.train()
+    phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
+    with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
+        best = Best(lambda: training.judge(judged))
+        training.saved.train(phase, policy, training.rng, batch, training.loss, best)
     policy.model.backbone = backbone
 
 
-def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
+def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
     """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file.
 
     view: 'plain', 'mirrored', or 'judges', which are plain too. chosen: (n,) row numbers.
@@ -493,52 +381,34 @@ def _features(training: _Training, view: str, chosen: np.ndarray, backbone: nn.M
     batch, (size,) = training.recipe.batch, training.size.image_sizes
     channels = training.policy.model.encoder_img_feat_input_proj.in_channels
     maps = RowFile(training.saved.folder / f"{view}.rows", (channels, *training.size.grid(*size)))
-    for step in training.steps(f"features, {view}", maps=maps):
-        images = training.data.images[chosen[step * batch : (step + 1) * batch]]
+    for step in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, maps=maps):
+        images = data.images[chosen[step * batch : (step + 1) * batch]]
         images = images[:, :, ::-1] if view == "mirrored" else images
         with torch.no_grad():
             maps.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())
     return maps
 
 
-def _transformer_steps(training: _Training, chosen: np.ndarray, views: dict[str, RowFile], judged: RowFile) -> None:
-    policy, data, recipe = training.policy, training.data, training.recipe
-    parameters = [p for p in policy.parameters() if p.requires_grad]
-    optimizer, scheduler = optimiser(
-        parameters, recipe.transformer_rate, recipe.transformer_steps, recipe.transformer_warmup
-    )
-    best = _Best()
-    for step in training.steps("transformer", policy=policy, optimizer=optimizer, scheduler=scheduler, best=best):
-        if best.stale >= PATIENCE:
-            continue  # it learns by heart
-        policy.train()
-        kept = training.rows(recipe.transformer_batch, len(chosen))
-        rows = chosen[kept]
-        states, chunks = swap_states(data, rows, training.rng), data.chunks[rows].copy()
-        if step % 2:
-            states[:, 0] *= -1
-            chunks[:, :, 0] *= -1
-        batch = {
-            IMAGE: torch.from_numpy(views["mirrored" if step % 2 else "plain"][kept]).to(training.device),
-            STATE: torch.from_numpy(states).to(training.device),
-            ACTION: torch.from_numpy(chunks).to(training.device),
-            IS_PAD: torch.from_numpy(data.is_pad[rows]).to(training.device),
-        }
-        loss = policy_loss(policy, batch, training.loss_weights)
-        training.saved.losses["transformer"].append(training_module.descend(loss, policy, optimizer, scheduler))
-        if (step + 1) % JUDGE_EVERY == 0:
-            best.see(training.judge(policy, judged), policy)
-    if best.weights:
-        policy.load_state_dict(best.weights)
-
-
-def _train_together(training: _Training, phase: str) -> tuple[torch.optim.Optimizer, Any]:
+def _train_together(training: _Training, name: str, steps: int) -> tuple[torch.optim.Optimizer, Any]:
     """Phase three: train all parameters at a tenth of the rate. Returns the optimiser and scheduler, to be saved."""
-    policy, recipe = training.policy, training.recipe
-    policy.train()
-    return training.train(
-        phase,
-        recipe.transformer_rate / 10,
-        policy,
-        lambda: policy_loss(policy, training.batch(recipe.together_batch), training.loss_weights),
+    training.policy.train()
+    return training.saved.train(
+        Phase(name, steps, training.recipe.transformer_rate / 10),
+        training.policy,
+        training.rng,
+        batch=lambda _: training.batch(training.recipe.together_batch),
+        loss=training.loss,
     )
+
+
+def _train_together_or_not(training: _Training) -> tuple[torch.optim.Optimizer, Any]:
+    """Phase three, whose result stays only if it is no worse than what was before."""
+    policy = training.policy
+    apart = {k: v.clone() for k, v in policy.state_dict().items()}
+    made = _train_together(training, "all together", training.recipe.together_steps)
+    together = training.judge()
+    after = {k: v.clone() for k, v in policy.state_dict().items()}
+    policy.load_state_dict(apart)
+    if together <= training.judge():
+        policy.load_state_dict(after)
+    return made

@@ -1,26 +1,25 @@
 """What every training on recordings needs: frames, batches, the loss, and a way to go on after it was killed.
 
     with Resumable(folder) as saved:
-        saved.train("backbone", 200, 1e-3, model, rng, lambda: loss_of(model))
+        saved.train(Phase("backbone", 200, 1e-3), model, rng, batch, loss)
 
 A training that is ended at any moment and started again gives the same weights, to the last bit, as one that was never
 ended.
 """
 
-import fcntl
 import math
 import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import repeat
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
@@ -32,10 +31,12 @@ from rover_lib.workshop.recordings.episodes import Sample
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
+B = TypeVar("B")
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
 SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
+JUDGE_EVERY, PATIENCE = 50, 8  # steps; judgements without a better one, after which it learns by heart
 SAVING_SHARE = 0.05  # saving takes at most this share of the time, however slow the disk
 
 
@@ -104,10 +105,8 @@ class RowFile:
         return self._rows
 
     def append(self, rows: np.ndarray | Tensor) -> None:
-        """Append rows, (n, *shape). Raises TrainingError for another shape."""
+        """Append rows, (n, *shape)."""
         array = np.ascontiguousarray(rows, self.dtype)
-        if array.shape[1:] != self.shape:
-            raise TrainingError(f"{self.path.name}: its rows are of another shape", found=array.shape[1:])
         self._file.seek(self._rows * self.row_bytes)
         data = array.data.cast("B")
         while data:
@@ -142,68 +141,86 @@ class Stateful(Protocol):
     def load_state_dict(self, state: Any) -> Any: ...
 
 
+@dataclass(frozen=True)
+class Phase:
+    """A part of a training: its name, number of steps, learning rate, and steps of warm-up, 0 for a twentieth."""
+
+    name: str
+    steps: int
+    rate: float
+    warmup: int = 0
+
+
+@dataclass
+class Best:
+    """The best weights so far, by their error on other episodes. A part of a training's saved state.
+
+    judge: returns the module's error now. stale: how often they were not beaten since.
+    """
+
+    judge: Callable[[], float]
+    error: float = math.inf
+    stale: int = 0
+    weights: dict[str, Tensor] = field(default_factory=dict)
+
+    def see(self, module: nn.Module) -> None:
+        """Judge the module, and keep its weights if they are better than all before."""
+        error = self.judge()
+        self.stale += 1
+        if error < self.error:
+            weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
+            self.error, self.stale, self.weights = error, 0, weights
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"error": self.error, "stale": self.stale, "weights": self.weights}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+
+
 class Resumable:
     """A training in phases that goes on where it was after Ctrl-C, kill -9 or a power cut at any moment.
 
     folder: has a file for each phase; remove it once the training's result is safe. Only one process at a time may
-    train in it. work: the cost of all steps together, in the unit of the cost given to `steps`, for one progress bar
-    over all phases, to be set before the first; without it each phase has its own bar. every_s: seconds between two
-    saves, more if saving is slow. losses: by phase, the values that the loop's body puts there; they are saved too.
+    train in it. every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase.
     """
 
     def __init__(
         self,
         folder: Path,
         progress: Progress = silent,
-        work: int = 0,
         every_s: float = SAVE_EVERY_S,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self.folder, self.every_s, self.clock = folder, every_s, clock
+        self.folder, self.progress, self.every_s, self.clock = folder, progress, every_s, clock
         self.losses: dict[str, list[float]] = defaultdict(list)
-        self.progress, self.work = progress, work
-        self._behind = 0  # work that an earlier process had done
-        self._bar: Any = None
-        self._ticks: Iterator[None] = iter(())
 
     def __enter__(self) -> "Resumable":
         """Make the folder and lock it. Raises TrainingError if another process trains in it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = (self.folder / "lock").open("w")
+        self._lock = FileLock(self.folder / "lock", timeout=0)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._lock.close()
-            raise TrainingError(
-                "another process trains the same", found=f"its lock on {self.folder}", remedy="wait for it or stop it"
-            ) from None
+            self._lock.acquire()
+        except Timeout:
+            raise TrainingError("another process trains the same", found=self.folder, remedy="wait for it") from None
         for left in self.folder.glob(".*.pt"):  # incomplete files of a process that was killed while it saved
             left.unlink()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if hasattr(self._bar, "close"):
-            self._bar.close()
-        self._lock.close()
+        self._lock.release()
 
-    def steps(
-        self, phase: str, count: int, rng: np.random.Generator, cost: int = 1, **parts: Stateful
-    ) -> Iterator[int]:
+    def steps(self, phase: str, count: int, rng: np.random.Generator, **parts: Stateful) -> Iterator[int]:
         """Yield the numbers of the steps of a phase that are still to be done; the loop's body does one of them.
 
         parts: everything that a step changes. Before the first step they are restored as they were saved, and so are
-        rng and torch's own random numbers: after a phase these are the same whichever process did it. cost: of a step.
+        rng and torch's own random numbers: after a phase these are the same whichever process did it.
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
-        if not self.work:
-            self._bar = None
-            self._behind = 0
-        self._behind += done * cost
         saved_s, took_s = self.clock(), 0.0
-        for step in range(done, count):
+        for step in self.progress(range(done, count), desc=f"training, {phase}", total=count, initial=done):
             yield step
-            self._advance(phase, cost, self.work or count * cost)
             now_s = self.clock()
             if step + 1 == count or now_s - saved_s >= max(self.every_s, took_s / SAVING_SHARE):
                 self._save(file, phase, step + 1, rng, parts)
@@ -212,33 +229,30 @@ class Resumable:
 
     def train(
         self,
-        phase: str,
-        count: int,
-        rate: float,
+        phase: Phase,
         module: nn.Module,
         rng: np.random.Generator,
-        loss: Callable[[], Tensor],
-        cost: int = 1,
+        batch: Callable[[int], B],
+        loss: Callable[[B], Tensor],
+        best: Best | None = None,
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Train a module for the steps of a phase that are still to be done, at this rate, and note each one's loss.
+        """Train a module for the steps of a phase that are still to be done, and note each one's loss.
 
-        loss: computes the next batch's. Returns the optimiser and its scheduler.
+        batch: draws a step's batch from rng. loss: of such a batch. best: if given, the module ends with the weights
+        that it judged best, and learns no longer once they are not beaten. Returns the optimiser and its scheduler.
         """
-        optimizer, scheduler = optimiser(module.parameters(), rate, max(count, 1))
-        for _ in self.steps(phase, count, rng, cost, module=module, optimizer=optimizer, scheduler=scheduler):
-            self.losses[phase].append(descend(loss(), module, optimizer, scheduler))
+        optimizer, scheduler = optimiser(module.parameters(), phase.rate, max(phase.steps, 1), phase.warmup)
+        parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
+        parts |= {"best": best} if best else {}
+        for step in self.steps(phase.name, phase.steps, rng, **parts):
+            if best and best.stale >= PATIENCE:
+                continue
+            self.losses[phase.name].append(descend(loss(batch(step)), module, optimizer, scheduler))
+            if best and (step + 1) % JUDGE_EVERY == 0:
+                best.see(module)
+        if best and best.weights:
+            module.load_state_dict(best.weights)
         return optimizer, scheduler
-
-    def _advance(self, phase: str, cost: int, total: int) -> None:
-        desc = f"training, {phase}"
-        if self._bar is None:  # not earlier, because only now it is known how much had been done before
-            left = max(0, total - self._behind)
-            self._bar = self.progress(repeat(None, left), desc=desc, total=total, initial=self._behind)
-            self._ticks = iter(self._bar)
-        elif hasattr(self._bar, "set_description"):
-            self._bar.set_description(desc, refresh=False)
-        for _ in range(cost):
-            next(self._ticks, None)
 
     def _save(self, file: Path, phase: str, step: int, rng: np.random.Generator, parts: dict[str, Stateful]) -> None:
         content = {
@@ -259,9 +273,8 @@ class Resumable:
         except TrainingError:
             raise
         except Exception as error:  # whatever a damaged file makes torch say
-            raise TrainingError(
-                f"{file}: cannot go on from it", found=error, remedy=f"remove {file.parent} to train from the beginning"
-            ) from error
+            remedy = f"remove {file.parent} to train from the beginning"
+            raise TrainingError(f"{file}: cannot go on from it", found=type(error).__name__, remedy=remedy) from error
         rng.bit_generator.state = content["numpy"]
         torch.set_rng_state(content["torch"])
         if content["cuda"]:

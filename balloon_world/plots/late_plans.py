@@ -7,8 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from rover_lib.onboard.drive.plan import Follower, Plan, Settings
-from rover_lib.workshop.plots.style import BLACK, BLUE, MIST, RED, SLATE, Note, legend, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLACK, BLUE, RED, SLATE, Note, legend, legend_below, new_figure
 
 HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
 
@@ -16,34 +15,6 @@ HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "
 def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
     """Return the rows without ensembling, of cars that were pushed or not. rows: of drive.json."""
     return [r for r in rows if r["ensemble"] is None and bool(r["pushes"]) == pushed]
-
-
-def throttle_over_age(rows: Sequence[Mapping[str, Any]], settings: Settings, chunk: int, rate_hz: float) -> Figure:
-    """Draw what the loop leaves of the throttle at each age of a plan, and the ages that each latency brings.
-
-    rows: of drive.json. chunk, rate_hz: of the policy's plans.
-    """
-    follower = Follower(settings, rate_hz)
-    follower.add(Plan(1, 0.0, 0.0, np.zeros((chunk, 2))), 0.0)
-    ages_s = np.arange(0, follower.stop_s() + 0.2, 0.001)
-    commands = [follower.command(float(age)) for age in ages_s]
-    ages = {r["latency_ms"]: (r["plan_age_min_ms"], r["plan_age_max_ms"]) for r in _late(rows) if r["compensate"]}
-    ages = {ms: ends for ms, ends in ages.items() if ends[0] is not None}
-    heights = (1.6, 0.3 + 0.22 * len(ages))
-    fig, axes = new_figure(2, height_in=2.6 + 0.26 * len(ages), sharex=True, height_ratios=heights)
-    upper, lower = axes[:, 0]
-    upper.plot(1e3 * ages_s, [100 * c.fade if c else 0 for c in commands], color=SLATE, lw=2)
-    upper.set_ylabel("throttle left (%)")
-    stop_ms = 1e3 * follower.stop_s()
-    for ax in axes[:, 0]:
-        ax.axvline(stop_ms, color=RED, ls="--", lw=1.2)
-    upper.annotate("stopped", (stop_ms, 60), (6, 0), textcoords="offset points", color=RED, fontsize=9)
-    for y, (low, high) in enumerate(ages.values()):
-        lower.plot([low, high], [y, y], "o-", color=BLACK, lw=4, ms=5)
-    lower.set_yticks(range(len(ages)), [f"{ms:g} ms" for ms in ages])
-    lower.set_ylim(len(ages) - 0.5, -0.5)
-    lower.set(xlabel="age of the plan in use, since its frame (ms)", ylabel="an inference takes", xlim=(-15, None))
-    return fig
 
 
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
@@ -101,21 +72,14 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return fig
 
 
-def plans_from_above(drives: Sequence[Mapping[str, Any]], tick: int | None = None) -> Figure | Note:
-    """Draw drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json.
-
-    tick: draw the cars at this moment, with what they drove until then; None draws whole drives.
-    """
+def plans_from_above(drives: Sequence[Mapping[str, Any]]) -> Figure | Note:
+    """Draw drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json."""
     if not drives:
         return Note("no drive was kept to be shown from above")
     fig, axes = new_figure(len(drives), height_in=0.5 + 3.1 * len(drives))
     for ax, drive in zip(axes[:, 0], drives, strict=True):
         label, colour, _, _ = HOW[drive["compensate"]]
-        until = len(drive["x_m"]) if tick is None else min(tick + 1, len(drive["x_m"]))
-        ax.plot(drive["x_m"][:until], drive["y_m"][:until], color=colour, lw=7, alpha=0.35, label="driven")
-        if tick is not None:
-            ax.plot(drive["x_m"], drive["y_m"], color=MIST, lw=1, zorder=0)
-            ax.plot(drive["x_m"][until - 1], drive["y_m"][until - 1], ">", color=colour, ms=11)
+        ax.plot(drive["x_m"], drive["y_m"], color=colour, lw=7, alpha=0.35, label="driven")
         for i, plan in enumerate(drive["plans"]):
             ax.plot(plan["x_m"], plan["y_m"], color=BLACK, lw=0.9, label=None if i else "a plan, from where it looked")
             ax.plot(plan["x_m"][0], plan["y_m"][0], "o", color=colour, mec=BLACK, mew=0.7, ms=5)

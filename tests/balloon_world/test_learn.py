@@ -88,13 +88,6 @@ def test_who_drove_is_in_the_recording_and_what_they_did_in_the_world(tmp_path):
     assert world.hit
 
 
-def test_nobody_takes_over_where_all_is_well(tmp_path):
-    found = drive_corrected(Straight(), tmp_path, 0, NotDrawn(CURVE), Experiment(human=Human(off=2.0)))
-    assert found == {"outcome": "left", "taken_over_s": None, "human_s": 0.0}
-    (episode,) = load_recordings(tmp_path, 32).episodes
-    assert {s.driver for s in episode.samples} == {POLICY}
-
-
 def test_demonstrations_are_whole_drives_or_cut(tmp_path):
     assert demonstrate(tmp_path, 0, NotDrawn(CURVE), 1.0) == pytest.approx(1.0, abs=1 / 30)
     whole_s = demonstrate(tmp_path, 1, NotDrawn(CURVE), 60.0)
@@ -137,11 +130,6 @@ def content_of(rows):
 def test_gates_are_of_the_last_round(corrected, demonstrated, alone, passed):
     rows = policies({"before": range(9), "corrected-1": corrected, "demonstrated-1": demonstrated}, alone)
     assert [row["passed"] for row in gates(rows)] == passed
-
-
-def test_of_few_worlds_nothing_is_promised():
-    rows = policies({"before": [1], "corrected-1": [], "demonstrated-1": []}, trials=4)
-    assert [row["passed"] for row in gates(rows)][:2] == [None, None]
 
 
 def test_what_is_shown_and_what_where_nothing_is(tmp_path):
@@ -224,9 +212,3 @@ def test_what_is_missing_is_said(tmp_path):
     with pytest.raises(WorldError, match="at least one round"):
         Experiment(rounds=0)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_of_something_else_is_left_alone(tmp_path):
-    (tmp_path / "mine").write_text("")
-    with pytest.raises(WorldError, match="not of this experiment"):
-        learn._begin(tmp_path, {})

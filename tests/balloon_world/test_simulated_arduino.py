@@ -2,7 +2,6 @@
 
 import contextlib
 import time
-from pathlib import Path
 
 import needs
 import pytest
@@ -98,10 +97,3 @@ def test_an_out_of_range_command_is_no_sign_of_life():
             raw.port.write(raw.command("D", 1500, 900))
             time.sleep(0.02)
         assert raw.send(b"").reason == "t"
-
-
-def test_unplugging_the_stand_in():
-    board = StandIn()
-    board.close()
-    board.close()
-    assert not Path(board.port).exists()

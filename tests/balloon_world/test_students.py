@@ -1,7 +1,6 @@
 """A teacher and its students side by side: rows, what is kept, and what is refused."""
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,8 +12,7 @@ from balloon_world.drives import SEED
 from balloon_world.students import gates_of, judge_students, recommendation, sentences, table
 from rover_learn import plots
 from rover_lib.cli import main
-from rover_lib.onboard.car.car import FILE_VARIABLE, Car, yaml_of
-from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
+from rover_lib.onboard.care.pi5 import Work, predict_ms
 from rover_lib.onboard.errors import DistillError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -116,23 +114,6 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     }  # fmt: skip
 
 
-def test_without_counts_all_are_estimated_alike_and_it_is_said(made):
-    counted(made.student, 20)
-    found = judge_students(made.teacher, [made.student], worlds=1)["metrics"]
-    late = [row["pushed_latency_ms"] for row in found["students"]]
-    assert late == pytest.approx([estimate_ms(15), estimate_ms(3)])
-    assert found["latency"] == "estimated" and found["students"][0]["instructions_g"] is None
-    assert "estimate" in found["notes"][0] and "teacher" in found["notes"][1]
-
-
-def test_a_student_that_is_not_counted_is_not_pushed(made):
-    counted(made.teacher, 90)
-    counted(made.student, 20)
-    artifact(made.student / "policy_static.pt", "student's", off=0.003)  # another one than was counted
-    row = judge_students(made.teacher, [made.student], worlds=1)["metrics"]["students"][1]
-    assert row["pushed_trials"] is row["pushed_latency_ms"] is row["instructions_g"] is None and row["hits"] == 1
-
-
 def test_what_was_driven_once_is_kept(made):
     judge_students(made.teacher, [made.student], worlds=2)
     assert len(made.driven) == 8
@@ -145,16 +126,6 @@ def test_what_was_driven_once_is_kept(made):
     artifact(made.student / "policy_static.pt", "student's", off=0.004)
     judge_students(made.teacher, [made.student], worlds=3)
     assert len(made.driven) == 6 and {off for off, *_ in made.driven} == {0.004}
-
-
-def test_what_another_car_drove_is_not_taken_for_this_ones(made, monkeypatch, tmp_path):
-    judge_students(made.teacher, [made.student], worlds=1)
-    made.driven.clear()
-    path = tmp_path / "car.yml"
-    path.write_text(yaml_of(replace(Car(), wheelbase_m=0.5)))
-    monkeypatch.setenv(FILE_VARIABLE, str(path))
-    judge_students(made.teacher, [made.student], worlds=1)
-    assert len(made.driven) == 4
 
 
 def test_where_there_is_no_world_nobody_drives(made):
@@ -176,14 +147,6 @@ def test_rows_are_drawn(made):
     rows = [row | {"computed_ms": None, "recorded_throttle_pct": None} for row in rows]
     work, _, errors = plots.frontier(rows, "fast").axes
     assert "multiply-accumulates" in work.get_xlabel() and len(errors.patches) == 4
-
-
-def test_losses_are_drawn_in_a_panel_for_each_phase():
-    one, other = {"backbone": [], "together": list(np.linspace(1, 0, 100))}, {"together": [1.0], "qat": [0.2, 0.1]}
-    figure = plots.losses({"one": one, "other": other})
-    assert [ax.get_title() for ax in figure.axes] == ["together", "qat"]
-    x, y = figure.axes[0].lines[0].get_data()
-    assert len(x) == 40 and np.allclose(y, 1 - (x - 1) / 99)
 
 
 def moved(made, name):

@@ -17,12 +17,10 @@ import pytest
 from needs import ended, until
 
 from balloon_world import car as car_module
-from balloon_world.car import KEEP_DRIVES, STAND_IN, CameraFeed, VirtualCar, _Car, _Pins
+from balloon_world.car import STAND_IN, CameraFeed, VirtualCar, _Car, _Pins
 from balloon_world.simulated_arduino import PinEvent
-from balloon_world.trial import wilson_interval
 from balloon_world.world import World
 from lab.arduino.emulator import BOARD
-from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import WorldError
 
@@ -76,12 +74,6 @@ def drive(link, action, condition):
     needs.keep_sending(lambda: link.send_action(*action), condition=condition)
 
 
-def test_straight_ahead():
-    distance, bearing = World(AHEAD).balloon_seen()
-    assert distance < 2
-    assert abs(bearing) < 0.02
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("board", BOARDS)
 @needs.real_time
@@ -93,21 +85,13 @@ def test_the_whole_chain_hits_a_balloon(board):
         before = np.abs(still[0].astype(float) - World(AHEAD).render()).mean()
         assert before < 4  # it sees that world, but for JPEG and noise
         assert not np.array_equal(*still)
-        assert (car.report().held, car.report().trials, car.report().wilson) == (True, 0, None)
+        assert (car.report().held, car.report().trials) == (True, 0)
         arm(link)
         drive(link, (0.0, 0.0), lambda: len(eye.jpegs) > 15)
         assert car.report().held  # nobody asked for motion yet
         drive(link, (0.0, THROTTLE), lambda: car.report().trials == 1)
         report = car.report()
         assert (report.hits, report.outcomes, report.seed, report.held) == (1, [(AHEAD, "hit")], AHEAD + 1, True)
-        assert report.wilson == wilson_interval(1, 1)
-        [hit] = report.drives
-        assert hit.nearest_m < 0.3
-        track = hit.trajectory
-        assert len(track.x_m) == pytest.approx(hit.duration_s * 30, abs=2)
-        assert np.abs(track.y_m).max() < 0.05
-        assert np.diff(track.x_m).min() >= 0
-        assert np.abs(track.throttle[2:] - THROTTLE).max() * PwmCalibration().us_per_unit("throttle") <= 4 + 1
         # The next world: held for a time, then let go with what is commanded.
         drive(link, (0.0, THROTTLE), lambda: not car.report().held)
         drive(link, (0.0, THROTTLE), lambda: car.report().speed_mps > 1)
@@ -117,30 +101,6 @@ def test_the_whole_chain_hits_a_balloon(board):
         report = car.report()
         assert report.frames == pytest.approx(len(eye.jpegs), abs=2)
         eye.close()
-
-
-@pytest.mark.slow
-@needs.real_time
-def test_it_stays_after_the_last_world():
-    with VirtualCar(seed=AHEAD, worlds=1, rate_hz=60, hold_s=0) as car, ServoLink(car.port) as link:
-        arm(link)
-        drive(link, (0.0, 0.9), lambda: car.report().finished)
-        drive(link, (0.0, 0.9), lambda: True)
-        time.sleep(0.1)
-        report = car.report()
-        assert (report.trials, report.held, report.seed, report.frames) == (1, True, AHEAD, 0)
-        assert len(report.drives[0].trajectory.x_m) == pytest.approx(report.drives[0].duration_s * 60, abs=2)
-
-
-def test_a_slow_reader_misses_frames_and_holds_nothing_up():
-    with VirtualCar(rate_hz=60) as car, Path(car.camera).open("rb", buffering=0) as pipe:
-        until(lambda: car.report().dropped > 20)
-        assert car.report().frames == 1
-        data = pipe.read(1 << 20)
-        assert data.startswith(b"\xff\xd8")
-        assert data.endswith(b"\xff\xd9")
-        assert data.count(b"\xff\xd8\xff") == 1
-        until(lambda: car.report().frames == 2)
 
 
 def test_it_needs_no_torch():
@@ -162,12 +122,6 @@ def test_when_its_process_dies():
         until(lambda: eye.ended)  # unplugged
     with pytest.raises(WorldError, match="was closed"):
         car.report()
-
-
-def test_what_killed_it_is_told(monkeypatch):
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(WorldError, match=r"has ended \(exit status 1\): it printed nothing; start a new one"):
-        VirtualCar()
 
 
 def test_it_ends_with_its_parent():
@@ -198,7 +152,7 @@ def test_when_its_process_hangs(monkeypatch):
         assert car.report().held
         monkeypatch.setattr(car_module, "ANSWER_S", 0.2)
         os.kill(car.pid, signal.SIGSTOP)
-        with pytest.raises(WorldError, match=r"did not answer within 0\.2 s"):
+        with pytest.raises(WorldError, match="did not answer"):
             car.report()
         os.kill(car.pid, signal.SIGCONT)
         monkeypatch.undo()
@@ -206,7 +160,7 @@ def test_when_its_process_hangs(monkeypatch):
         assert car.report().held  # and not the answer that came too late
 
 
-@pytest.mark.parametrize("wrong", [{"seed": -1}, {"rate_hz": 0}, {"worlds": 0}, {"hold_s": -1}])
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"hold_s": -1}])
 def test_numbers_that_make_no_drive(wrong):
     with pytest.raises(WorldError, match="a car needs"):
         VirtualCar(**wrong)
@@ -241,34 +195,22 @@ def test_a_pulse_counts_from_its_end_and_no_pulses_are_neutral():
     assert pins.action(3.0) == (0, 0)
 
 
-@pytest.mark.parametrize(("throttle_us", "moves"), [(124, False), (128, True)])
-def test_neutral_within_a_timer_step_is_no_motion(throttle_us, moves):
-    pins = _Pins(Board(pulse(1.0, "throttle", throttle_us)))
-    pins.collect()
-    pins.action(2.0)
-    assert pins.asked_for_motion == moves
-
-
-def test_what_is_kept_is_bounded():
+def test_world_follows_world_and_the_car_is_held_before_each():
     board = Board()
-    car = _Car(_Pins(board), 5, 30.0, None, 0.1)
+    car = _Car(_Pins(board), 5, 0.1)
     now = car._now
     board.events = [pulse(now, "steering", 2012), pulse(now, "throttle", 711)]
-    while car.trials < KEEP_DRIVES + 3:
-        now += 0.4
+    while car.trials < 3:
+        now += 0.05
         car.move(now)
     report = car.report()
-    assert len(report["drives"]) == KEEP_DRIVES
-    assert len(report["outcomes"]) == report["trials"]
-    assert report["seed"] == 5 + car.trials
-    released = [drive["released_s"] for drive in report["drives"]]
-    for (first, drive), second in zip(zip(released, report["drives"], strict=True), released[1:], strict=False):
-        assert second - first == pytest.approx(drive["duration_s"] + 0.1, abs=0.02)
+    assert report["trials"] == len(report["outcomes"]) == 3 and [seed for seed, _ in report["outcomes"]] == [5, 6, 7]
+    assert report["held"] and report["seed"] == 8
 
 
 def test_a_machine_that_stood_still_stops_the_world_too():
     board = Board()
-    car = _Car(_Pins(board), 5, 30.0, None, 0.1)
+    car = _Car(_Pins(board), 5, 0.1)
     board.events = [pulse(car._now, "throttle", 200)]
     car.move(car._now + 0.1)
     before = car.world.state.time_s
@@ -284,7 +226,7 @@ RED, GREEN, BLUE = (np.full((48, 64, 3), colour, np.uint8) for colour in ((0, 0,
 
 
 def colours(frames):
-    return ["bgr"[int(f.mean((0, 1)).argmax())] if f.max() > 100 else "black" for f in frames]
+    return ["bgr"[int(f.mean((0, 1)).argmax())] for f in frames]
 
 
 def test_a_feed_and_what_can_go_wrong_with_it(tmp_path):
@@ -298,9 +240,6 @@ def test_a_feed_and_what_can_go_wrong_with_it(tmp_path):
     feed.freeze()
     eye.frames(2)
     assert len(set(colours(eye.frames(10)))) == 1
-    feed.black()
-    eye.frames(2)
-    assert set(colours(eye.frames(10))) == {"black"}
     feed.show(BLUE)
     eye.frames(2)
     assert set(colours(eye.frames(5))) == {"b"}
@@ -319,27 +258,6 @@ def test_a_feed_and_what_can_go_wrong_with_it(tmp_path):
         assert colours(Eye(tmp_path / "camera").frames(3)) == ["r"] * 3
 
 
-def test_late_frames(tmp_path):
-    with CameraFeed(tmp_path / "camera", RED, rate_hz=100) as feed:
-        eye = Eye(tmp_path / "camera")
-        eye.frames(5)
-        feed.late_s = 0.3
-        time.sleep(0.05)
-        feed.show(BLUE)
-        shown = time.monotonic()
-        until(lambda: colours(eye.frames(1)) == ["b"])
-        assert 0.2 < time.monotonic() - shown < 3
-
-
-def test_a_feed_that_nobody_reads_in_time(tmp_path):
-    with CameraFeed(tmp_path / "camera", RED, rate_hz=100) as feed:
-        time.sleep(0.1)
-        assert (feed.written, feed.dropped) == (0, 0)  # nobody is there
-        with (tmp_path / "camera").open("rb", buffering=0):
-            until(lambda: feed.dropped > 5)
-            assert feed.written == 1
-
-
 def test_a_slow_reader_misses_no_picture(tmp_path):
     """Of two in turn, who takes every second frame would else see one of them alone, and call the camera frozen."""
     seen = []
@@ -347,7 +265,6 @@ def test_a_slow_reader_misses_no_picture(tmp_path):
     with CameraFeed(path, RED, BLUE, rate_hz=100) as feed, path.open("rb", buffering=0) as pipe:
         for count in range(1, 9):
             until(lambda count=count: feed.written == count)
-            dropped = feed.dropped
-            until(lambda dropped=dropped: feed.dropped > dropped)
+            time.sleep(0.03)  # three more frames are due, and refused
             seen.append(cv2.imdecode(np.frombuffer(pipe.read(1 << 20), np.uint8), cv2.IMREAD_COLOR))
     assert colours(seen) == ["r", "b"] * 4

@@ -9,11 +9,10 @@ import torch
 import torch.nn.functional as F
 from policies import memory_samples
 
-from rover_learn.channels import _choose, _leave_out, kept_of, without_channels
-from rover_learn.fake_quant import parameters
+from rover_learn.channels import _leave_out, without_channels
 from rover_learn.lessons import BatchedPolicy
 from rover_learn.refit import Gram
-from rover_lib.workshop.act import ACT, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -53,40 +52,6 @@ def test_channels_that_are_always_zero_are_not_there_and_nothing_changes(tiny, t
     assert (predictions(model, [inputs_of(s, thin.config) for s in samples]) - expected).abs().max() < 1e-5
 
 
-def test_a_channel_that_is_constant_but_not_zero_stays(thin):
-    """The convolution that reads the channel meets padding zeros at the picture's border, not the constant."""
-    weights = {k: v.clone() for k, v in thin.weights.items()}
-    weights["backbone.layer4.1.bn1.bias"][::2] = 1
-    steady, samples = replace(thin, weights=weights), memory_samples(2)
-    model = ACT(thin.config, weights)
-    assert model.backbone.layer4[1].body[0].weight.shape == (512, 512, 3, 3)
-    ours = predictions(model, [inputs_of(s, thin.config) for s in samples])
-    assert (ours - lerobots(steady, samples)).abs().max() < 1e-5
-
-
-def test_half_of_the_channels_is_half_of_the_blocks_arithmetic(tiny, thin):
-    whole, half = (multiply_accumulates(ACT(c.config, c.weights)) for c in (tiny, thin))
-    assert half["backbone.layer1"] * 2 == whole["backbone.layer1"]  # the other stages have shortcuts, which stay
-    assert 0.5 < half["backbone.layer4"] / whole["backbone.layer4"] < 0.51
-    assert {k: n for k, n in half.items() if "layer" not in k} == {k: n for k, n in whole.items() if "layer" not in k}
-
-
-def test_a_block_without_any_channel_is_its_shortcut(tiny):
-    weights = {k: v.clone() for k, v in tiny.weights.items()}
-    for part in PARTS:
-        weights[f"backbone.layer1.0.{part}"].zero_()
-    dead = replace(tiny, weights=weights)
-    ours = predictions(ACT(dead.config, weights), [inputs_of(s, dead.config) for s in memory_samples(1)])
-    assert (ours - lerobots(dead, memory_samples(1))).abs().max() < 1e-5
-
-
-def test_int8_that_can_be_trained_does_without_them_too(thin):
-    model = dict(ACT(thin.config, thin.weights, for_int8=True).named_parameters())
-    for name, (weight, bias) in parameters(thin.config, thin.weights):
-        assert torch.equal(weight.reshape(model[f"{name}.weight"].shape), model[f"{name}.weight"])
-        assert torch.equal(bias, model[f"{name}.bias"])
-
-
 def test_training_leaves_zeros_alone(thin):
     """If a channel's filter, batch norm and reader are all zero, none of them gets a gradient or decays."""
     weights = {k: v.clone() for k, v in thin.weights.items()}
@@ -108,13 +73,6 @@ def test_training_leaves_zeros_alone(thin):
             assert (now[1::2] != was[1::2]).any(), key
 
 
-@pytest.mark.parametrize(
-    ("channels", "share", "kept"), [(64, 0.5, 32), (64, 0.6, 32), (64, 0.65, 48), (512, 0.01, 16), (512, 1.0, 512)]
-)
-def test_counts_are_what_kernels_compute_at_once(channels, share, kept):
-    assert kept_of(channels, share) == kept
-
-
 def patches_of(h):
     return F.unfold(h, 3, padding=1).transpose(1, 2).flatten(0, 1)
 
@@ -132,15 +90,6 @@ def block():
     gram.add(patches_of(h))
     weights = {f"b.{name}": torch.rand(size, generator=generator) + 0.1 for name, size in sizes.items()}
     return SimpleNamespace(h=h, weights=weights, gram=gram.mean())
-
-
-def test_what_others_can_say_goes_first(block):
-    """Everything that varies is in four channels and their mixtures, so the four that stay must span it."""
-    kept = _choose(block.gram, block.weights["b.conv2.weight"], 4)
-    values = block.h.transpose(0, 1).flatten(1)
-    centred = values - values.mean(1, keepdim=True)
-    rank = torch.linalg.matrix_rank
-    assert rank(centred[kept]) == rank(centred) == 4 and 5 not in kept
 
 
 def test_the_reader_is_refitted_by_least_squares(block):

@@ -3,35 +3,26 @@
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
 from interrupted import interrupt, save_each_step
-from policies import INNER, TINY, lerobot_policy, of_a_cars_size, smooth_frame, trainer_content, with_few_channels
+from policies import of_a_cars_size, smooth_frame
 
 from rover_learn import finetune as finetune_module
 from rover_learn import training
 from rover_learn.finetune import FinetuneRecipe, finetune, human_samples
-from rover_learn.student import gmac
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import FinetuneError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_trainer
-from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Sample
-from rover_lib.workshop.run import pipeline, session
-from rover_lib.workshop.run.pipeline import make_artifact
 
 FRAMES = 24
 TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4
@@ -97,45 +88,11 @@ def episode_of(drivers, chunk=8, missing=()):
     return Episode("e", None, "", 1.0, len(drivers), len(drivers), tuple(samples), ())
 
 
-@given(
-    st.lists(st.sampled_from([POLICY, HUMAN, NOBODY]), min_size=1, max_size=40),
-    st.sets(st.integers(0, 39), max_size=3),
-    st.integers(1, 12),
-)
-def test_only_what_a_human_drove_is_learned_from(drivers, missing, chunk):
-    """Compare with the definition, frame by frame and step by step."""
-    if set(range(len(drivers))) <= missing:
-        return
-    episode = episode_of(drivers, chunk, missing)
-    others = {s.driver for s in episode.samples} != {HUMAN}
-    learned = {s.row - 100: s for s in human_samples(episode)}
-    assert set(learned) == {s.row - 100 for s in episode.samples if s.driver == HUMAN}
-    for row, sample in learned.items():
-        driven = True
-        for step in range(chunk):
-            at = row + step
-            driven &= at < len(drivers) and (not others or (at not in missing and drivers[at] == HUMAN))
-            assert sample.is_pad[step] == (not driven)
-
-
 def test_a_plan_that_began_before_the_takeover_is_not_taught():
     """A plan during a takeover has no step from after the human let go."""
     learned = human_samples(episode_of([POLICY] * 5 + [HUMAN] * 4 + [NOBODY] * 3 + [HUMAN] * 2))
     assert [s.row - 100 for s in learned] == [5, 6, 7, 8, 12, 13]
     assert [int((~s.is_pad).sum()) for s in learned] == [4, 3, 2, 1, 2, 1]
-
-
-def test_a_whole_drive_of_a_human_is_left_as_it_is():
-    episode = episode_of([HUMAN] * 9, missing={4})
-    assert human_samples(episode) == episode.samples
-    assert not episode.by_policy and episode_of([HUMAN, POLICY]).by_policy
-    assert not episode_of([HUMAN, NOBODY]).by_policy
-
-
-def test_the_state_of_the_first_correction_is_what_the_policy_did(new):
-    (episode, *_) = load_recordings(new, 32).episodes
-    first = human_samples(episode)[0]
-    assert first.row == 8 and np.allclose(first.state, episode.samples[7].chunk[0])
 
 
 # --- what it leaves ---
@@ -168,7 +125,7 @@ def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught
     } | {"corrections": 20}
     assert [(row["kind"], row["frames"]) for row in metrics["held_out"]] == [("old", 4)] * 2 + [("new", 4)]
     assert all(row[f"{when}_steering_pct"] > 0 for row in metrics["held_out"] for when in ("before", "after"))
-    assert metrics["verdict"]["better"] is None and "only 2 old and 1 new" in metrics["verdict"]["why"]
+    assert metrics["verdict"]["better"] is None and "2 old and 1 new" in metrics["verdict"]["why"]
     assert {phase: len(losses) for phase, losses in metrics["losses"].items()} == {"transformer": 6, "together": 3}
 
 
@@ -198,15 +155,6 @@ def assert_same(folder, other):
 
 
 @pytest.mark.slow
-def test_it_learns_what_the_human_did_and_keeps_what_it_could(checkpoint, old, new, recipe, tmp_path):
-    longer = replace(recipe, transformer_steps=150, together_steps=0, correction_weight=1000.0, to_parent=1.0)
-    folder = finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, recipe=longer, device="cpu")
-    metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
-    losses = metrics["losses"]["transformer"]
-    assert np.mean(losses[-30:]) < 0.85 * np.mean(losses[:10])
-
-
-@pytest.mark.slow
 def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old, new, recipe, tmp_path):
     """Episodes in which a policy drove count as new in any folder. `rover finetune` itself leaves a LeRobot folder."""
     both = tmp_path / "both"
@@ -221,41 +169,6 @@ def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old,
     assert set(weights) == set(load_checkpoint(taught / "pretrained_model").weights)
 
 
-@pytest.mark.slow
-def test_new_demonstrations_alone_are_learned_from_too(checkpoint, old, recipe, tmp_path):
-    more = record(tmp_path / "more", drives=2, offset=90)
-    short = replace(recipe, transformer_steps=1, together_steps=1, held_out_share=0.0)
-    folder = finetune(checkpoint, [old, more], "taught", runs_dir=tmp_path, recipe=short, device="cpu")
-    metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
-    assert metrics["learned_from"]["corrections"] == 0 and metrics["learned_from"]["new_demonstrations"] == 20
-    assert {row["kind"] for row in metrics["held_out"]} == {"old"}
-
-
-@pytest.mark.slow
-def test_a_policy_that_does_without_channels_learns_without_them(checkpoint, old, new, recipe, tmp_path):
-    """Channels that `rover distill --backbone-channels` left out stay zero, so the artifact stays as small."""
-    parent = load_checkpoint(checkpoint)
-    thin = with_few_channels(parent.weights, 4)
-    settings = {"learning_rate": 1e-3, "batch_size": 4, "data_dir": "", "output_dir": "", "device": "cpu", "seed": 0}
-    write_trainer(tmp_path / "best_model.pth", parent.config, thin, 0.1, {}, **settings)
-    folder = finetune(tmp_path / "best_model.pth", [old, new], "thin", runs_dir=tmp_path, recipe=recipe, device="cpu")
-    learned = load_checkpoint(folder / "best_model.pth")
-    blocks = {inner[1] for inner in map(INNER.fullmatch, thin) if inner}
-    assert len(blocks) == 8
-    for name in blocks:
-        for part in ("conv1.weight", "bn1.weight", "bn1.bias", "conv2.weight"):
-            before, after = (of[f"{name}.{part}"] for of in (thin, learned.weights))
-            if part == "conv2.weight":  # its inputs are the channels
-                before, after = before.transpose(0, 1), after.transpose(0, 1)
-            alive = before.reshape(len(before), -1).any(1)
-            assert torch.equal(after.reshape(len(after), -1).any(1), alive) and alive.sum() * 4 == len(alive)
-        assert not torch.equal(thin[f"{name}.conv2.weight"], learned.weights[f"{name}.conv2.weight"])
-    recipe = replace(pipeline.Recipe.of(params()), samples=8)
-    make_artifact(session.load(folder / "best_model.pth", old), folder / "policy_static.pt", recipe)
-    assert load_policy(folder / "policy_static.pt").manifest["gmac"] == pytest.approx(gmac(parent.config, thin))
-    assert (folder / "policy_static.pt").stat().st_size < 6e6  # it has 12 MB with all channels
-
-
 # --- what cannot be ---
 
 
@@ -266,40 +179,9 @@ def refused(says, checkpoint, episodes, tmp_path, **options):
     assert "\n" not in str(error.value) and sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"device": "tpu"}, "device must be"),
-        ({"name": "../better"}, "plain folder name"),
-        ({"name": ""}, "plain folder name"),
-    ],
-)
-def test_arguments_that_cannot_be_are_refused(checkpoint, old, new, tmp_path, options, says):
-    refused(says, checkpoint, [old, new], tmp_path, **options)
-
-
-def test_phases_that_another_process_has_removed_are_no_error(checkpoint, old, new, tmp_path, monkeypatch):
-    """A process that learns the same under another name uses the same folder, and may finish first."""
-    monkeypatch.setattr(finetune_module, "_train_phases", lambda work: SimpleNamespace(folder=tmp_path / "gone"))
-    monkeypatch.setattr(finetune_module, "_leave", lambda new, *_: (new / "finetune.json").touch())
-    assert finetune(checkpoint, [old, new], "better", runs_dir=tmp_path, device="cpu").is_dir()
-
-
 def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):
     (tmp_path / "runs" / "better").mkdir(parents=True)
     refused("is there already", checkpoint, [old, new], tmp_path)
-
-
-def test_a_run_that_another_process_made_meanwhile_is_not_overwritten(checkpoint, old, new, tmp_path, monkeypatch):
-    real = finetune_module._open_work
-    monkeypatch.setattr(
-        finetune_module,
-        "_open_work",
-        lambda *args: ((tmp_path / "runs" / "better").mkdir(parents=True), real(*args))[1],
-    )
-    with pytest.raises(FinetuneError, match="is there already"):
-        finetune(checkpoint, [old, new], "better", runs_dir=tmp_path / "runs", device="cpu")
-    assert [p.name for p in (tmp_path / "runs").iterdir()] == ["better"]
 
 
 def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):
@@ -308,18 +190,18 @@ def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_pa
 
 def test_drives_in_which_no_human_drove_teach_nothing(checkpoint, old, tmp_path):
     alone = record(tmp_path / "alone", drives=2, drivers=[POLICY] * 20 + [NOBODY] * 4)
-    refused("a human drove in none of the 2 new episodes", checkpoint, [old, alone], tmp_path)
+    refused("no human drove", checkpoint, [old, alone], tmp_path)
 
 
 def test_another_camera_is_refused(checkpoint, old, tmp_path):
     square = record(tmp_path / "square", drives=1, drivers=TAKEN_OVER, size=(64, 64))
-    refused("its camera has another shape", checkpoint, [old, square], tmp_path)
+    refused("another camera", checkpoint, [old, square], tmp_path)
 
 
 def test_recordings_of_another_rate_are_refused(checkpoint, old, tmp_path):
     """A plan has 30 steps a second: learned from 15, the car would do all of it in half the time."""
     dark = record(tmp_path / "dark", drives=2, drivers=TAKEN_OVER, offset=90, rate_hz=15)
-    refused("plans 30 steps a second, found episode_90 of 15.0 frames", checkpoint, [old, dark], tmp_path)
+    refused("another rate", checkpoint, [old, dark], tmp_path)
 
 
 def test_another_car_is_refused(checkpoint, old, tmp_path):
@@ -327,19 +209,7 @@ def test_another_car_is_refused(checkpoint, old, tmp_path):
     channel = replace(other.pwm.steering, neutral_pct=7.0)
     other = replace(other, pwm=replace(other.pwm, steering=channel))
     others = record(tmp_path / "other", drives=1, drivers=TAKEN_OVER, car=other)
-    refused("was recorded with another car", checkpoint, [old, others], tmp_path)
-
-
-def test_a_policy_of_two_wheels_is_not_taught_to_steer(checkpoint, old, new, tmp_path, monkeypatch):
-    """Each sample is also shown mirrored, with its first number negated; for a wheel's speed that is another drive."""
-    wheels = ("left", "right")
-    real = finetune_module.load_checkpoint
-    monkeypatch.setattr(
-        finetune_module,
-        "load_checkpoint",
-        lambda path: replace(c := real(path), config=replace(c.config, state_names=wheels, action_names=wheels)),
-    )
-    refused("found 1 cameras, of state left, right, of action left, right", checkpoint, [old, new], tmp_path)
+    refused("another car", checkpoint, [old, others], tmp_path)
 
 
 def test_the_same_recordings_twice_are_refused(checkpoint, old, tmp_path):
@@ -348,18 +218,6 @@ def test_the_same_recordings_twice_are_refused(checkpoint, old, tmp_path):
 
 def test_an_artifact_does_not_learn(old, new, tmp_path):
     refused("is an artifact", tmp_path / "policy_static.pt", [old, new], tmp_path)
-
-
-@pytest.mark.slow
-def test_a_policy_of_another_car_is_refused(old, new, recipe, tmp_path):
-    policy = lerobot_policy(**TINY)
-    with torch.no_grad():
-        policy.model.action_head.weight.zero_()
-        policy.model.action_head.bias.copy_(torch.tensor([-0.9, 0.6]))
-    torch.save(trainer_content(policy), tmp_path / "best_model.pth")
-    with pytest.raises(FinetuneError, match="worse than one action for all frames, found steering"):
-        finetune(tmp_path / "best_model.pth", [old, new], "x", runs_dir=tmp_path, recipe=recipe, device="cpu")
-    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.slow

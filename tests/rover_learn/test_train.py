@@ -1,0 +1,117 @@
+"""A tiny training of LeRobot's ACT leaves a checkpoint of the user's trainer, the same after a kill in any phase."""
+
+import numpy as np
+import pytest
+import torch
+from interrupted import interrupt
+from recorded import record_drives
+
+from rover_learn import train as train_module
+from rover_learn import training as training_module
+from rover_learn.train import SIZES, train
+from rover_lib.onboard.errors import RoverError, TrainingError
+from rover_lib.workshop.act import lerobot_act
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+
+pytestmark = pytest.mark.slow
+
+# the keys of the user's best_model.pth
+CHECKPOINT_KEYS = [
+    "epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config",
+]  # fmt: skip
+CONFIG_KEYS = {
+    "image_width", "image_height", "n_obs_steps", "chunk_size", "n_action_steps", "hidden_size", "n_encoder_layers",
+    "n_decoder_layers", "n_heads", "feedforward_dim", "dropout", "kl_weight", "vision_encoder", "pretrained_backbone",
+    "learning_rate", "weight_decay", "betas", "grad_clip", "num_epochs", "batch_size", "train_split", "data_dir",
+    "output_dir", "device", "seed", "log_freq", "save_freq", "num_workers",
+}  # fmt: skip
+
+
+# The full size's phases on a handful of small frames: trained at a quarter of the pixels, and carried to its own.
+CARRIED = "train: {small: {backbone_steps: 2, transformer_steps: 3, together_steps: 2, carry_steps: 2, batch: 4, "
+CARRIED += "transformer_batch: 4, together_batch: 2, samples: 40, feature_samples: 12, judged: 8, at: [36, 64]}}"
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    return record_drives(tmp_path_factory.mktemp("episodes"))
+
+
+@pytest.fixture(scope="module")
+def trained(drives, tmp_path_factory, set_params):
+    """A checkpoint of a few steps on the processor, in a cache of its own."""
+    set_params(CARRIED)
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROVER_CACHE", str(folder / "cache"))
+        return train(drives, folder / "best_model.pth", device="cpu")
+
+
+def test_the_checkpoint_is_the_trainers(trained):
+    checkpoint = torch.load(trained, weights_only=False)
+    assert list(checkpoint) == CHECKPOINT_KEYS and set(checkpoint["config"]) == CONFIG_KEYS
+    assert type(checkpoint["best_val_loss"]) is np.float64 and 0 < checkpoint["best_val_loss"] < 10
+    config = checkpoint["config"]
+    assert (config["image_height"], config["image_width"], config["chunk_size"]) == (72, 128, 32)
+    assert (config["hidden_size"], config["n_heads"], config["feedforward_dim"]) == (128, 4, 512)
+    assert "/" not in config["data_dir"] + config["output_dir"]
+    assert load_checkpoint(trained).config.image_sizes == ((72, 128),)
+    with pytest.raises(Exception, match="numpy"):  # as the user's own
+        torch.load(trained, weights_only=True)
+
+
+def test_lerobots_policy_takes_weights_and_optimiser(trained):
+    checkpoint, policy = torch.load(trained, weights_only=False), lerobot_act(SIZES["small"])
+    weights = checkpoint["model_state_dict"]
+    assert not policy.load_state_dict(weights, strict=True)[0]
+    assert all(torch.isfinite(v).all() for v in weights.values())
+    # LeRobot's own start, mean 0 and variance 1, would leave a backbone without pretrained weights dead.
+    assert not any(torch.all(v == 1) for k, v in weights.items() if k.endswith("running_var"))
+    state = checkpoint["optimizer_state_dict"]["state"]
+    trainable = [p for p in policy.parameters() if p.requires_grad]
+    assert sum(s["exp_avg"].numel() for s in state.values()) == sum(p.numel() for p in trainable)
+
+
+def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
+    torch.rand(3)  # the state of the global generator must not matter, nor change
+    before, out = torch.get_rng_state(), tmp_path / "killed.pth"
+    for kill_at in (2, 4, 6):  # in the second of backbone's steps, then of the transformer's and of all together's
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            interrupt(patch, training_module, "descend", kill_at)
+            train(drives, out, device="cpu")
+        assert not out.exists()
+    killed, whole = (torch.load(path, weights_only=False) for path in (train(drives, out, device="cpu"), trained))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(v, killed["model_state_dict"][k]) for k, v in whole["model_state_dict"].items())
+    assert killed["best_val_loss"] == whole["best_val_loss"]
+    assert killed["optimizer_state_dict"]["state"][0]["step"] == 2
+    assert not list((tmp_path / "cache").glob("training-*")), "what was saved on the way is of no use any more"
+    with monkeypatch.context() as patch:  # now it is taken from the cache
+        patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
+        assert train(drives, tmp_path / "again.pth", device="cpu").read_bytes() == out.read_bytes()
+    other = torch.load(train(drives, tmp_path / "other.pth", seed=1, device="cpu"), weights_only=False)
+    name = "model.action_head.weight"
+    assert not torch.equal(other["model_state_dict"][name], whole["model_state_dict"][name])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"size": "huge"}, "small, full"),
+        ({"device": "tpu"}, "device"),
+        ({"steps": 0}, "at least 1 step"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(drives, tmp_path, wrong, match):
+    with pytest.raises(TrainingError, match=match):
+        train(drives, tmp_path / "best_model.pth", **wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_recordings_are_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RoverError):
+        train(tmp_path / "empty", tmp_path / "best_model.pth", steps=3)
+    assert [p.name for p in tmp_path.iterdir()] == ["empty"]
