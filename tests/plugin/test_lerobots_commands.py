@@ -268,10 +268,12 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
             throttle()  # all that came since
             seen = Observation(events, [], at_s, at_s + 1.0)
             expected, human_us = (HUMAN, (1700, REST_US[1])) if happens is take_over else (STOPPED, REST_US)
-            wrong = judge(expected, seen, GATES, human_us=human_us).wrong
+            verdict = judge(expected, seen, GATES, human_us=human_us)
+            wrong = verdict.wrong
             if wrong and seen.stalled_ms():
                 raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {wrong}")
             assert wrong == []
+            print(f"{happens.__name__}: {verdict.figures}")
             if happens is stop:  # in the middle of a turn, or between two of them
                 record.process.send_signal(signal.SIGCONT)
                 needs.until(lambda: record.process.poll() is not None or record.waits_for_a_human(), 30)

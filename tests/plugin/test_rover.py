@@ -326,6 +326,7 @@ def test_a_hung_loop_leaves_a_stopped_car(make_rover, hangs):
     if verdict.wrong and seen.stalled_ms():
         raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {verdict.wrong}")
     assert verdict.wrong == []
+    print(f"{hangs.__name__}: throttle off after {verdict.figures['stopped_after_ms']:g} ms")
 
 
 # ---- lerobot-rollout, of LeRobot 0.6
