@@ -1,5 +1,52 @@
-"""python -m lerobot_robot_rover ARTIFACT FOLDER"""
+"""Pack an artifact into a folder that LeRobot takes for a pretrained policy.
 
-from lerobot_robot_rover.pack import main
+python -m lerobot_robot_rover runs/mine/policy_static.pt mine
+lerobot-record --policy.path=mine ...
+"""
 
-main(prog_name="python -m lerobot_robot_rover")
+import tempfile
+from pathlib import Path
+
+import click
+
+from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
+from lerobot_robot_rover.modeling_rover_artifact import RoverArtifactPolicy
+from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
+from rover_lib.onboard.errors import ParamsError, RoverError
+
+
+def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
+    """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
+
+    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, ParamsError for a folder
+    that exists. The folder appears complete, or not at all.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise ParamsError(f"{folder}: is there already", remedy="name a new folder")
+    config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
+    policy = RoverArtifactPolicy(config)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
+        new = Path(temporary) / folder.name
+        policy.save_pretrained(new)
+        for pipeline in make_rover_artifact_pre_post_processors(config):
+            pipeline.save_pretrained(new)
+        new.rename(folder)
+    return folder
+
+
+@click.command()
+@click.argument("artifact", type=click.Path(path_type=Path))
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--n-action-steps", type=click.IntRange(min=1), default=N_ACTION_STEPS, help="Actions used of a chunk.")
+def main(artifact: Path, folder: Path, n_action_steps: int) -> None:
+    """Pack ARTIFACT into the new FOLDER, for LeRobot's --policy.path."""
+    try:
+        click.echo(f"packed: {pack(artifact, folder, n_action_steps=n_action_steps)}")
+    except (RoverError, OSError) as error:
+        raise click.ClickException(str(error)) from None
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m lerobot_robot_rover")

@@ -28,6 +28,8 @@ class RoverArtifactConfig(PreTrainedConfig):
     n_action_steps: int = N_ACTION_STEPS
     threads: int | None = None
     device: str | None = field(default="cpu")
+    # LeRobot asks for these; an artifact looks at one moment.
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -49,18 +51,6 @@ class RoverArtifactConfig(PreTrainedConfig):
             if place.is_file():
                 return place
         raise ParamsError(f"{self.artifact}: not found", remedy="name a policy_<mode>.pt of a run")
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
 
     def get_optimizer_preset(self) -> OptimizerConfig:
         """Raise PolicyError: nothing in an artifact can be trained."""

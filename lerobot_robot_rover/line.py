@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 from weakref import WeakSet, WeakValueDictionary
 
-from rover_lib.onboard.car.servo_link import LinkError, ServoLink
+from rover_lib.onboard.car.servo_link import ServoLink
 
 # lerobot-rollout leaves out each number whose name does not end in .pos or .vel, and moves those in .pos to where they
 # were at the start. Recording and replaying use the same names, so that datasets can be merged.
@@ -28,7 +28,6 @@ class Line:
 
     transmitters: the teleoperators on the port; if there is one, a human may drive without arming anything.
     humans_action: whether a teleoperator has returned the human's own action, and the robot has not been given it yet.
-    drives_ended: how many drives have ended; what was planned for one is not for the next.
     before_drive: waits until the car can be armed; None while no robot is connected.
     """
 
@@ -36,16 +35,12 @@ class Line:
         self.port = port
         self.transmitters: WeakSet[object] = WeakSet()
         self.humans_action = False
-        self.drives_ended = 0
         self.before_drive: Callable[[], None] | None = None
         self._link: ServoLink | None = None
         self._users = 0
 
     def open(self) -> ServoLink:
-        """Return the link; the first user opens it.
-
-        Raises CarError for a bad car.yml, LinkError as ServoLink.open() does.
-        """
+        """Return the link, which the first user opens. Raises CarError, and LinkError, as ServoLink.open() does."""
         if self._link is None:
             link = ServoLink(self.port)
             link.open()
@@ -60,17 +55,27 @@ class Line:
             link, self._link = self._link, None
             link.close()
 
-    @property
-    def link(self) -> ServoLink:
-        """The open link. Raises LinkError if nobody has opened it."""
-        if self._link is None:
-            raise LinkError(f"{self.port}: the link is not open", remedy="connect() first")
-        return self._link
-
     def take_humans_action(self) -> bool:
         """Return whether the action that the robot is given now is the human's own. Asked again, it is not."""
         humans, self.humans_action = self.humans_action, False
         return humans
+
+
+class CarPart:
+    """What LeRobot asks of a robot and of a teleoperator alike. A car is measured once, by `rover calibrate`."""
+
+    is_calibrated = True
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
+        return dict(FEATURES)
+
+    def calibrate(self) -> None:
+        """Do nothing."""
+
+    def configure(self) -> None:
+        """Do nothing: the Arduino is told of the car when its port is opened."""
 
 
 def line_to(port: str) -> Line:
@@ -81,11 +86,6 @@ def line_to(port: str) -> Line:
     if line is None or os.path.realpath(line.port) != key:
         line = _lines[key] = Line(port)
     return line
-
-
-def count_ended_drives() -> int:
-    """Return how many drives of this process's robots have ended."""
-    return sum(line.drives_ended for line in list(_lines.values()))
 
 
 def wait_for_humans() -> None:

@@ -4,17 +4,19 @@ import logging
 import shutil
 import weakref
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch import Tensor
 
 from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig, not_trained
-from lerobot_robot_rover.line import count_ended_drives, wait_for_humans
+from lerobot_robot_rover.line import ACTIONS, wait_for_humans
 from lerobot_robot_rover.rollout import find_rollout
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime
@@ -23,8 +25,6 @@ from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.errors import ParamsError, PolicyError
 from rover_lib.onboard.params import params
-
-ACTIONS = ["steering", "throttle"]
 
 _log = logging.getLogger("rover")
 
@@ -44,8 +44,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits = this_car().limits
         self._queue: deque[Tensor] = deque()
-        self._planned_s, self._planned_in = 0.0, 0  # when the queue was filled, and after how many drives
-        self._plans = 0
+        self._planned_s, self._plans = 0.0, 0  # when the queue was filled
         self._process = PolicyProcess(config.file, threads=config.threads)
         self._close = weakref.finalize(self, self._process.close)  # at the program's end too
         self._process.__enter__()  # returns after the first inferences, which are slow
@@ -58,11 +57,9 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             _log.warning("the policy's process is not confined: %s", self._process.unconfined)
 
     def get_optim_params(self) -> dict:
-        """Raise PolicyError: nothing in an artifact can be trained."""
         raise not_trained()
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        """Raise PolicyError: an artifact has no loss."""
         raise not_trained()
 
     def reset(self) -> None:
@@ -76,12 +73,12 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk.
 
-        A chunk that is older than the stop_s of params.yml, or from before the car was disarmed, is dropped.
+        A chunk that is older than the stop_s of params.yml is dropped.
         """
-        if boottime() - self._planned_s > _stop_s() or self._planned_in != count_ended_drives():
+        if boottime() - self._planned_s > _stop_s():
             self._queue.clear()
         if not self._queue:
-            self._planned_s, self._planned_in = boottime(), count_ended_drives()
+            self._planned_s = boottime()
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
         return self._queue.popleft()
@@ -117,14 +114,21 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         return cls(config, **kwargs).eval()
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
-        shutil.copyfile(self.config.file, save_directory / self.config.file.name)
-        self.config._save_pretrained(save_directory)
+        """Write the artifact and a config that names it, and says what it sees and gives."""
+        file, manifest = self.config.file, self._process.manifest
+        inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
+        for c in manifest["cameras"]:
+            inputs[f"{OBS_IMAGES}.{c['name']}"] = PolicyFeature(FeatureType.VISUAL, (3, c["height"], c["width"]))
+        outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (2,))}
+        shutil.copyfile(file, save_directory / file.name)
+        config = replace(self.config, artifact=file.name, input_features=inputs, output_features=outputs)
+        config._save_pretrained(save_directory)
 
     def _check(self, manifest: dict[str, Any], dataset_meta: Any) -> None:
         """Raise PolicyError or ParamsError unless LeRobot's loop can run this artifact as `rover drive` would."""
         cameras = [camera["name"] for camera in manifest["cameras"]]
         names = manifest["state_names"], manifest["action_names"]
-        if names != (ACTIONS, ACTIONS) or len(cameras) != 1:
+        if names != ([*ACTIONS], [*ACTIONS]) or len(cameras) != 1:
             raise PolicyError(
                 "the rover has one camera, and steering and throttle as state and actions",
                 found=f"an artifact of {cameras}, {names[0]} and {names[1]}",
@@ -138,21 +142,12 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             )
         if sentence := another_car(manifest, this_car()):
             _log.warning(sentence)
-        rollout = find_rollout()
-        if rollout is not None and rollout.fps != rate_hz:
-            raise PolicyError(
-                f"this artifact's actions are {rate_hz:g} a second",
-                found=f"--fps={rollout.fps:g}",
-                remedy=f"--fps={rate_hz:g}",
-            )
+        for asks, option in ((find_rollout(), "--fps"), (dataset_meta, "--dataset.fps")):
+            if asks is not None and asks.fps != rate_hz:
+                remedy = f"{option}={rate_hz:g}"
+                raise PolicyError(f"this artifact's actions are {rate_hz:g} a second", found=asks.fps, remedy=remedy)
         if dataset_meta is None:
             return
-        if dataset_meta.fps != rate_hz:
-            raise PolicyError(
-                f"this artifact's actions are {rate_hz:g} a second",
-                found=f"a dataset of {dataset_meta.fps} frames a second",
-                remedy=f"--dataset.fps={rate_hz:g}",
-            )
         pictures = sorted(name for name in dataset_meta.features if name.startswith(OBS_IMAGES))
         if f"{OBS_IMAGES}.{self._camera}" not in pictures:
             without = "--dataset.video=true: LeRobot records no pictures otherwise"

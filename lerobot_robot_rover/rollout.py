@@ -6,7 +6,6 @@ from typing import Any
 from rover_lib.onboard.errors import ParamsError
 
 DAGGER = "DAggerStrategyConfig"
-STAYS = "a car has no initial position, so it stays where it is, whatever return_to_initial_position says"
 
 
 def find_rollout() -> Any:

@@ -14,9 +14,9 @@ import numpy as np
 from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover.line import ACTIONS, FEATURES, line_to, named, unnamed
-from lerobot_robot_rover.ride import HOLD_S, RATE_HZ, Ride
-from lerobot_robot_rover.rollout import DAGGER, STAYS, check_rollout, find_rollout
+from lerobot_robot_rover.line import ACTIONS, CarPart, line_to, named, unnamed
+from lerobot_robot_rover.ride import RATE_HZ, Ride
+from lerobot_robot_rover.rollout import DAGGER, check_rollout, find_rollout
 from rover_lib.onboard.car.camera import Camera, check_shape, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime, default_log
@@ -31,11 +31,6 @@ from rover_lib.onboard.drive.watch import find_unfinished_drive
 from rover_lib.onboard.errors import CameraError, ParamsError, PolicyError, TakenOver
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
-
-NO_PROMISE = (
-    "LeRobot's loop has no deadlines, knows no age of a plan and does not make up for its latency: an action holds for "
-    f"{HOLD_S * 1e3:g} ms, then the car stops; `rover drive` does more"
-)
 
 
 @RobotConfig.register_subclass("rover")
@@ -66,7 +61,7 @@ class RoverConfig(RobotConfig):
             raise ParamsError("camera_name must be a name, such as cam_front", found=repr(self.camera_name))
 
 
-class Rover(Robot):
+class Rover(CarPart, Robot):
     """A car with a camera and an Arduino, as LeRobot's commands drive and record it.
 
     With a `rover_transmitter` on the same port the human drives, and nothing is sent. Otherwise send_action() drives:
@@ -91,24 +86,9 @@ class Rover(Robot):
         """The state, which is the previous action, and the camera's picture, (height, width, 3)."""
         return {**self.action_features, self.config.camera_name: (self.config.height, self.config.width, 3)}
 
-    @cached_property
-    def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
-        return dict(FEATURES)
-
     @property
     def is_connected(self) -> bool:
         return self._open is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        """Do nothing: a car is measured once, by `rover calibrate`, which writes its car.yml."""
-
-    def configure(self) -> None:
-        """Do nothing: the Arduino is told of the car when its port is opened."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Open camera and Arduino. Nothing is armed yet: the first action does that.
@@ -141,9 +121,6 @@ class Rover(Robot):
             self._seen = 0  # number of the newest frame that LeRobot was given
             self._captured_s = self._looked_s = 0.0
             self._action, self._acted_s = NEUTRAL, 0.0
-            self._log.event(NO_PROMISE)
-            if rollout and rollout.return_to_initial_position:
-                self._log.event(STAYS)
             if not self._line.transmitters:
                 self._wait_for_human()
             self._line.before_drive = self._wait_for_human
@@ -210,8 +187,6 @@ class Rover(Robot):
         opened, self._open = self._open, None
         if opened:
             opened.close()
-
-    # ---- the parts
 
     def _check_connected(self) -> None:
         if not self._open:
@@ -293,4 +268,3 @@ class Rover(Robot):
         ride, self._ride = self._ride, None
         if ride:
             ride.end()
-            self._line.drives_ended += 1

@@ -3,13 +3,13 @@
 import logging
 import time
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover.line import FEATURES, line_to, named
+from lerobot_robot_rover.line import CarPart, line_to, named
+from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.service import CHECK_S
 from rover_lib.onboard.errors import ParamsError
@@ -31,7 +31,7 @@ class RoverTransmitterConfig(TeleoperatorConfig):
             raise ParamsError("the transmitter needs a port, the robot's", found=repr(self.port))
 
 
-class RoverTransmitter(Teleoperator):
+class RoverTransmitter(CarPart, Teleoperator):
     """The sticks of a human who drives the car in manual: the Arduino passes their pulses on, and measures them.
 
     LeRobot has no word for "not measured", and a lost signal is not a zero, so get_action() raises then. For one thread
@@ -49,11 +49,6 @@ class RoverTransmitter(Teleoperator):
         self._link: ServoLink | None = None
         self._withheld_s: float | None = None
 
-    @cached_property
-    def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
-        return dict(FEATURES)
-
     @property
     def feedback_features(self) -> dict[str, type]:
         """Empty: a transmitter cannot be told anything."""
@@ -62,16 +57,6 @@ class RoverTransmitter(Teleoperator):
     @property
     def is_connected(self) -> bool:
         return self._link is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        """Do nothing: `rover calibrate` measures the sticks' ends once, for car.yml."""
-
-    def configure(self) -> None:
-        """Do nothing."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Open the port and wait until the transmitter gives a signal; say so if it does not yet.
@@ -82,11 +67,9 @@ class RoverTransmitter(Teleoperator):
             raise DeviceAlreadyConnectedError(f"the transmitter at {self.config.port} is connected already")
         link = self._line.open()
         try:
-            told = False
+            if _sticks(link.latest()) is None:
+                _log.warning("before the human can drive: %s", link.remedy("s"))
             while _sticks(link.latest()) is None:
-                if not told:
-                    _log.warning("before the human can drive: %s", link.remedy("s"))
-                    told = True
                 time.sleep(CHECK_S)
         except BaseException:
             self._line.close()
@@ -98,16 +81,16 @@ class RoverTransmitter(Teleoperator):
 
         Raises LinkError if the signal is lost, if the Arduino does not pass the throttle on, or if the link is gone.
         """
-        if not self._link:
-            raise DeviceNotConnectedError(f"the transmitter at {self.config.port} is not connected: connect() first")
-        telemetry = self._link.latest()
+        link = self._connected()
+        telemetry = link.latest()
         sticks = _sticks(telemetry)
-        if telemetry is None or sticks is None:
-            raise self._lost(self._link)
-        actions = self._link.calibration.actions_from_pulses(*sticks)
-        if actions.steering is None or actions.throttle is None:
-            raise self._lost(self._link)
-        self._check_passed_on(telemetry)
+        actions = link.calibration.actions_from_pulses(*sticks) if sticks else None
+        if telemetry is None or actions is None or actions.steering is None or actions.throttle is None:
+            raise LinkError(
+                f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that",
+                remedy=f"{link.remedy('s')} and record this episode again; those before it are kept",
+            )
+        self._check_passed_on(telemetry, link.calibration.throttle)
         self._line.humans_action = True
         return named(actions.steering, actions.throttle)
 
@@ -116,26 +99,23 @@ class RoverTransmitter(Teleoperator):
 
     def disconnect(self) -> None:
         """Give the port back; it is closed once the robot has given it back too. Raises DeviceNotConnectedError."""
-        if not self._link:
-            raise DeviceNotConnectedError(f"the transmitter at {self.config.port} is not connected: connect() first")
+        self._connected()
         self._link = None
         self._line.humans_action = False
         self._line.close()
 
-    def _lost(self, link: ServoLink) -> LinkError:
-        return LinkError(
-            f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that",
-            remedy=f"{link.remedy('s')} and record this episode again; those before it are kept",
-        )
+    def _connected(self) -> ServoLink:
+        if not self._link:
+            raise DeviceNotConnectedError(f"the transmitter at {self.config.port} is not connected: connect() first")
+        return self._link
 
-    def _check_passed_on(self, telemetry: Telemetry) -> None:
+    def _check_passed_on(self, telemetry: Telemetry, channel: Channel) -> None:
         """Raise LinkError if the Arduino has withheld the throttle for longer than WITHHELD_S.
 
         It does so until the throttle has been at rest once after a reset, a lost signal or a takeover.
         """
         throttle = telemetry.receiver_throttle_us
-        moves = self._link is not None and self._link.calibration.throttle.moves
-        if not moves or throttle is None or not moves(throttle) or moves(telemetry.throttle_us):
+        if throttle is None or not channel.moves(throttle) or channel.moves(telemetry.throttle_us):
             self._withheld_s = None
             return
         self._withheld_s = telemetry.host_s if self._withheld_s is None else self._withheld_s
@@ -150,9 +130,6 @@ def _sticks(telemetry: Telemetry | None) -> tuple[int, int, int, int] | None:
     """Return the pulses of steering and throttle, and their periods, in microseconds; None if one was not measured."""
     if telemetry is None:
         return None
-    t = telemetry
-    steering_us, throttle_us = t.receiver_steering_us, t.receiver_throttle_us
-    periods_us = t.receiver_steering_period_us, t.receiver_throttle_period_us
-    if steering_us is None or throttle_us is None or periods_us[0] is None or periods_us[1] is None:
-        return None
-    return steering_us, throttle_us, periods_us[0], periods_us[1]
+    pulses = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
+    sticks = (*pulses, telemetry.receiver_steering_period_us, telemetry.receiver_throttle_period_us)
+    return None if None in sticks else sticks  # type: ignore[return-value]  # mypy does not see what `in` says

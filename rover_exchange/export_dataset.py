@@ -181,17 +181,19 @@ def _write(
     with no_progress_bars(), warnings.catch_warnings():
         # numpy warns when LeRobot computes statistics of yes and no
         warnings.filterwarnings("ignore", "Converting input from bool")
-        for episode in progress(episodes, desc="exporting", total=len(episodes)):
-            for rows in _parts(episode, size, recorded, left_out):
-                if len(rows) < SHORTEST:
-                    left_out["too_short"] += len(rows)
-                    continue
-                for sample, frame in rows:
-                    row = _row(episode, sample, frame, last=sample is rows[-1][0])
-                    dataset.add_frame({k: v for k, v in row.items() if k in dataset.features or k == "task"})
-                dataset.save_episode()
-                written.append((episode, rows[0][0].row, len(rows)))
-        dataset.finalize()
+        try:
+            for episode in progress(episodes, desc="exporting", total=len(episodes)):
+                for rows in _parts(episode, size, recorded, left_out):
+                    if len(rows) < SHORTEST:
+                        left_out["too_short"] += len(rows)
+                        continue
+                    for sample, frame in rows:
+                        row = _row(episode, sample, frame, last=sample is rows[-1][0])
+                        dataset.add_frame({k: v for k, v in row.items() if k in dataset.features or k == "task"})
+                    dataset.save_episode()
+                    written.append((episode, rows[0][0].row, len(rows)))
+        finally:  # else it would be done at some later time, in a folder that is gone
+            dataset.finalize()
     if not written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
     lengths = [count for _, _, count in written]

@@ -69,7 +69,8 @@ def _draw_who(ax: Axes, ticks: Mapping[str, np.ndarray]) -> None:
     """Draw who drove, as coloured bands."""
     for state, (label, colour) in STATES.items():
         if (driven := ticks["state"] == state).any():
-            ax.fill_between(ticks["t_s"], 0, 1, where=driven, step="post", color=colour, lw=0, label=label)
+            until_next = driven | np.append(False, driven[:-1])
+            ax.fill_between(ticks["t_s"], 0, 1, where=until_next, step="post", color=colour, lw=0, label=label)
     ax.set_yticks([])
     ax.set_ylim(0, 1)
 

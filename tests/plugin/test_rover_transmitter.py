@@ -1,13 +1,14 @@
 """The transmitter as a teleoperator: what is measured is given, what is not is refused, and the port has one owner."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from weakref import WeakValueDictionary
 
 import pytest
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, line
+from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitterConfig, line, rover_transmitter
 from lerobot_robot_rover.line import FEATURES, line_to, named, unnamed, wait_for_humans
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
@@ -64,141 +65,99 @@ def transmitter(tmp_path):
 
 
 def test_the_sticks_by_car_yml(transmitter):
-    assert isinstance(transmitter, RoverTransmitter) and not transmitter.is_connected and transmitter.is_calibrated
-    assert transmitter.action_features == FEATURES
-    assert transmitter.feedback_features == {}
+    assert transmitter.is_calibrated and transmitter.action_features == FEATURES
+    for ask in (transmitter.get_action, transmitter.disconnect):
+        with pytest.raises(DeviceNotConnectedError):
+            ask()
     transmitter.connect()
+    with pytest.raises(DeviceAlreadyConnectedError):
+        transmitter.connect()
     action = transmitter.get_action()
-    assert action == pytest.approx(named(0.5, 0.1), abs=2e-3)
-    assert CALIBRATION.pulses(**unnamed(action)) == DRIVEN
-
-
-def test_the_sticks_ends_are_the_ends(transmitter):
-    transmitter.connect()
-    Link.status = status(2190, 118)
+    assert action == pytest.approx(named(0.5, 0.1), abs=2e-3) and CALIBRATION.pulses(**unnamed(action)) == DRIVEN
+    Link.status = status(2190, 118)  # beyond the ends
     assert transmitter.get_action() == named(1.0, 0.0)
 
 
-def test_connected_once(transmitter):
-    for ask in (transmitter.get_action, transmitter.disconnect):
-        with pytest.raises(DeviceNotConnectedError, match=r"not connected: connect\(\) first"):
-            ask()
-    transmitter.connect()
-    with pytest.raises(DeviceAlreadyConnectedError, match="connected already"):
-        transmitter.connect()
-    transmitter.disconnect()
-    assert Link.opened == 0
-
-
-@pytest.mark.parametrize("lost", [(None, 120), (1456, None), (None, None)])
+@pytest.mark.parametrize(
+    "lost",
+    [
+        status(None, 120),
+        status(1456, None),
+        None,
+        replace(status(1456, 120), receiver_steering_period_us=2 * 21316),
+    ],
+)
 def test_a_lost_pulse_is_no_zero(transmitter, lost):
     transmitter.connect()
-    Link.status = status(*lost)
-    with pytest.raises(LinkError, match=r"was lost, and LeRobot cannot record that; .* record this episode again"):
-        transmitter.get_action()
-    Link.status = None
+    Link.status = lost
     with pytest.raises(LinkError, match="signal was lost"):
         transmitter.get_action()
 
 
-def test_a_period_that_is_none(transmitter):
-    transmitter.connect()
-    Link.status = replace(status(1456, 120), receiver_steering_period_us=2 * 21316)
-    with pytest.raises(LinkError, match="signal was lost"):
-        transmitter.get_action()
-
-
-def test_it_waits_for_a_signal_and_says_so(transmitter, monkeypatch, caplog):
-    Link.status = status(None, None)
-    waits = []
+@pytest.mark.parametrize("gives_up", [False, True])
+def test_it_waits_for_a_signal_and_says_so(transmitter, monkeypatch, caplog, gives_up):
+    Link.status, waits = status(None, None), []
 
     def sleep(seconds):
         waits.append(seconds)
+        if gives_up:
+            raise KeyboardInterrupt
         if len(waits) == 3:
             Link.status = status(1456, 120)
 
-    monkeypatch.setattr("time.sleep", sleep)
+    monkeypatch.setattr(rover_transmitter, "time", SimpleNamespace(sleep=sleep))
+    if gives_up:
+        with pytest.raises(KeyboardInterrupt):
+            transmitter.connect()
+        assert not transmitter.is_connected and Link.opened == 0
+        return
     transmitter.connect()
-    assert len(waits) == 3 and caplog.text.count("switch the transmitter on") == 1
-
-
-def test_no_port_is_kept_by_one_who_gave_up_waiting(transmitter, monkeypatch):
-    Link.status = status(None, None)
-
-    def sleep(seconds):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("time.sleep", sleep)
-    with pytest.raises(KeyboardInterrupt):
-        transmitter.connect()
-    assert not transmitter.is_connected and Link.opened == 0
+    assert len(waits) == 3 and caplog.text.count("transmitter on") == 1
 
 
 def test_a_throttle_that_the_car_does_not_get_is_no_data(transmitter):
     transmitter.connect()
-    for at_s, ends in ((1.0, False), (1.4, False), (1.6, True)):
+    for at_s in (1.0, 1.4):
         Link.status = status(1456, 170, at_s, pins=(1456, 120))
-        if ends:
-            with pytest.raises(LinkError, match=r"does not get the stick's throttle.*; let go of the throttle stick"):
-                transmitter.get_action()
-        else:
-            transmitter.get_action()
+        transmitter.get_action()
+    Link.status = status(1456, 170, 1.6, pins=(1456, 120))
+    with pytest.raises(LinkError, match="does not get"):
+        transmitter.get_action()
     Link.status = status(1456, 170, 1.7)  # it gets it
     transmitter.get_action()
     Link.status = status(1456, 170, 2.0, pins=(1456, 120))  # for a moment: the stick has just moved
     transmitter.get_action()
 
 
-def test_a_transmitter_wants_a_port():
-    with pytest.raises(ParamsError, match="the robot's"):
+def test_a_port_has_one_line_whichever_name_it_has(tmp_path):
+    with pytest.raises(ParamsError):
         RoverTransmitterConfig(port="")
-
-
-# ---- one port, one owner
-
-
-def test_who_names_the_same_port_has_the_same_line(tmp_path):
-    port = tmp_path / "ttyACM0"
-    port.touch()
-    (tmp_path / "by-id").symlink_to(port)
-    assert line_to(str(port)) is line_to(str(tmp_path / "by-id"))
-    assert line_to(str(port)) is not line_to(str(tmp_path / "other"))
-
-
-def test_a_port_that_another_device_has_got_is_another_line(tmp_path):
     port, by_id = tmp_path / "ttyACM0", tmp_path / "by-id"
     port.touch()
     by_id.symlink_to(port)
     before = line_to(str(by_id))
+    assert line_to(str(port)) is before is not line_to(str(tmp_path / "other"))
     by_id.unlink()  # it was unplugged, and what was plugged in then has its number
-    after = line_to(str(port))
-    assert after is not before and after.port == str(port) and line_to(str(port)) is after
+    assert line_to(str(port)) is not before
 
 
 def test_the_last_closes_it():
     shared = line_to(PORT)
-    with pytest.raises(LinkError, match="is not open"):
-        shared.link  # noqa: B018
-    first, second = shared.open(), shared.open()
-    assert first is second and Link.opened == 1
+    assert shared.open() is shared.open() and Link.opened == 1
     shared.close()
-    assert Link.opened == 1 and shared.link is first
+    assert Link.opened == 1
     shared.close()
     shared.close()
     assert Link.opened == 0
 
 
-def test_a_robot_knows_that_a_human_may_drive(tmp_path, transmitter):
-    rover = Rover(RoverConfig(port=PORT, calibration_dir=tmp_path))
+def test_the_robot_and_the_policy_know_that_a_human_may_drive(tmp_path, transmitter):
+    rover, waits = Rover(RoverConfig(port=PORT, calibration_dir=tmp_path)), []
     assert list(rover._line.transmitters) == [transmitter]
     transmitter.connect()
     transmitter.get_action()
     assert rover._line.take_humans_action() and not rover._line.take_humans_action()
-
-
-def test_a_policys_episode_waits_for_the_robots_human():
-    shared, waits = line_to(PORT), []
     wait_for_humans()
-    shared.before_drive = lambda: waits.append(1)
+    rover._line.before_drive = lambda: waits.append(1)
     wait_for_humans()
     assert waits == [1]

@@ -1,6 +1,6 @@
-"""A kit for Hailo's compiler: its networks compute what the policy does, and compile.py takes them to an artifact.
+"""A kit for Hailo's compiler, and compile.py, which makes an artifact of it.
 
-tests/onboard/policy/test_hailo_engine.py drives by such artifacts.
+That such artifacts compute what the policy does is seen in tests/onboard/policy/test_hailo_engine.py.
 """
 
 import json
@@ -11,84 +11,21 @@ import zipfile
 import hailo_standin
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
-import torch
 from hailo_kit import FRAMES, normalised, opened
-from policies import TINY, lerobot_policy, memory_samples, smooth_frame
+from policies import memory_samples
 
 from rover_exchange.hailo import compile as hailo_compile
 from rover_exchange.hailo import kit as kits
 from rover_exchange.hailo.networks import networks
 from rover_lib.onboard.errors import ArtifactError, QuantizeError
-from rover_lib.workshop.act import ACT, ActConfig, Affine, imagenet, inputs_of
+from rover_lib.workshop.act import ACT, imagenet, inputs_of
 
 
 @pytest.fixture
 def kit(hailo_kit, tmp_path, monkeypatch):
     hailo_standin.install(monkeypatch)
     return shutil.copytree(hailo_kit, tmp_path / "kit")
-
-
-def two_cameras() -> ACT:
-    """LeRobot's random weights, pre-norm and GELU; states, actions and each camera's colours normalised differently."""
-    sizes, names = {"cam_0": (72, 128), "cam_1": (64, 96)}, tuple("abcdef")
-    lerobot = lerobot_policy(
-        {f"observation.images.{c}": size for c, size in sizes.items()},
-        states=len(names),
-        actions=len(names),
-        **TINY,
-        pre_norm=True,
-        feedforward_activation="gelu",
-    )
-    state_norm, action_unnorm = (
-        Affine(tuple(s + 0.5 * i for i in range(len(names))), (0.1,) * len(names)) for s in (1.5, 0.3)
-    )
-    config = ActConfig(
-        cameras=tuple(sizes),
-        image_sizes=tuple(sizes.values()),
-        state_names=names,
-        action_names=names,
-        dim=TINY["dim_model"],
-        heads=TINY["n_heads"],
-        feedforward=TINY["dim_feedforward"],
-        encoder_layers=1,
-        decoder_layers=2,
-        vae_layers=1,
-        image_norm=(imagenet(), Affine((2.0,) * 3, (-1.0,) * 3)),
-        state_norm=state_norm,
-        action_unnorm=action_unnorm,
-        pre_norm=True,
-        activation="gelu",
-    )
-    return ACT(config, {name.removeprefix("model."): tensor for name, tensor in lerobot.state_dict().items()})
-
-
-def run(model: onnx.ModelProto, given: dict[str, np.ndarray]) -> list[np.ndarray]:
-    return onnxruntime.InferenceSession(model.SerializeToString()).run(None, given)
-
-
-@pytest.mark.slow
-def test_both_splits_in_onnx_runtime_are_the_policy():
-    policy, rng = two_cameras(), np.random.default_rng(0)
-    config = policy.config
-    frames = [torch.from_numpy(smooth_frame(rng, *size)) for size in config.image_sizes]
-    state = torch.from_numpy(rng.normal(size=(1, 6)).astype(np.float32))
-    with torch.inference_mode():
-        expected = policy(state, *frames).numpy()
-    pictures = {}  # as the model script normalises them: the definition, (pixel / 255 - mean) / std
-    for camera, norm, frame in zip(config.cameras, config.image_norm, frames, strict=True):
-        x = frame.permute(2, 0, 1)[None].double() / 255
-        x = x * torch.tensor(norm.scale)[:, None, None] + torch.tensor(norm.shift)[:, None, None]
-        pictures[f"frame_{camera}"] = x.float().numpy()
-    front, whole, rest = networks(policy)
-    features = zip(front.outputs, run(front.model, pictures), strict=True)
-    seen = {name: x[0].transpose(1, 2, 0) for name, x in features}
-    (split,) = run(rest, {"state": state.numpy(), **seen})
-    (actions,) = run(whole.model, {"state": policy.state_norm(state)[:, :, None, None].numpy(), **pictures})
-    assert expected.std() > 1e-2
-    for found in (split, policy.action_unnorm(torch.from_numpy(actions)).numpy()):
-        assert np.abs(found - expected).max() < 1e-5 * max(1, np.abs(expected).max())
 
 
 def test_networks_have_fixed_shapes_of_few_ranks(tiny):

@@ -2,8 +2,6 @@
 
 import json
 import math
-import re
-import shutil
 from datetime import datetime, timedelta
 
 import cv2
@@ -11,12 +9,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rover_exchange.export_dataset import export_dataset, usual_rate_hz
+from rover_exchange.export_dataset import usual_rate_hz
 from rover_exchange.tub import read_tub
 from rover_lib.cli import main
-from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.kinds import kinds_of
 from rover_lib.workshop.recordings.samples import frame_rate_hz
 
 LEFT = Car.of(
@@ -118,16 +115,15 @@ def test_an_episode_ends_where_records_are_missing(tmp_path):
     assert all(fault.handled == "left out" for fault in recordings.faults)
 
 
-@pytest.mark.parametrize("last_s", [0.0, 281.2], ids=["whole", "a hole"])
-def test_times_as_text(tmp_path, last_s):
-    """donkeycar 2 wrote each record's date: half a minute at 20 Hz, the last of it later."""
+def test_times_as_text(tmp_path):
+    """donkeycar 2 wrote each record's date; here with a hole."""
     root = old_tub(tmp_path / "tub", 40)
     for i in range(40):
         path = root / f"record_{i}.json"
-        when = datetime(2019, 4, 5, 20, 20, 6) + timedelta(seconds=i / 25 + (last_s if i >= 30 else 0))
+        when = datetime(2019, 4, 5, 20, 20, 6) + timedelta(seconds=i / 25 + (281.2 if i >= 30 else 0))
         path.write_text(json.dumps(json.loads(path.read_text()) | {"timestamp": str(when)}))
     recordings = read_tub(root, LEFT)
-    assert [len(e.samples) for e in recordings.episodes] == ([30, 9] if last_s else [40])
+    assert [len(e.samples) for e in recordings.episodes] == [30, 9]
     assert frame_rate_hz(recordings.episodes[0].samples) == pytest.approx(25)
 
 
@@ -137,7 +133,7 @@ def test_a_tub_that_drives_by_negative_throttle_is_asked_about(tmp_path):
     for row in rows[:35]:
         row["user/throttle"] = -0.2
     root = tub(tmp_path / "tub", rows)
-    with pytest.raises(EpisodeError, match=r"most throttles are negative.*--throttle negated"):
+    with pytest.raises(EpisodeError, match="--throttle negated"):
         read_tub(root, Car())
     negated = read_tub(root, Car(), throttle="negated").samples
     assert all(s.chunk[0, 1] == np.float32(0.2) for s in negated[:30])
@@ -148,8 +144,6 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     """A car's loop begins with two records at once, and holes leave runs of a few: their steps say nothing."""
     rows = records(40)
     rows[0]["_timestamp_ms"] += 40
-    rows[3]["_timestamp_ms"] += 25
-    rows[2]["_timestamp_ms"] += 20
     for row in rows[4:]:
         row["_timestamp_ms"] += 300
     slower = records(60, "21-08-21_1", 40, 1_629_500_100_000)[:20]
@@ -164,62 +158,39 @@ def test_what_is_broken_is_counted(tmp_path):
     def lines(rows):
         texts = [json.dumps(row) for row in rows]
         texts[3:8] = ["{", "[1]", '{"_index": 5}', texts[6].replace('"user/angle": ', '"user/angle": 7'), "\0\0"]
-        return texts
+        return ["\ufeff" + texts[0], *texts[1:], texts[-1]]
 
-    root = tub(tmp_path / "tub", records(40), per_catalog=40, lines=lines)
+    root = tub(tmp_path / "tub", records(40), deleted=["39"], per_catalog=40, lines=lines)
     (root / "images" / "20_cam_image_array_.jpg").unlink()
     (root / "images" / "21_cam_image_array_.jpg").write_bytes(b"\xff\xd8 cut")
     found = kinds(read_tub(root, LEFT))
-    assert found == {"broken_record": 5, "records_missing": 1, "frame_missing": 1, "broken_jpeg": 1}
-    (root / "catalog_0.catalog").write_text("{\n")
-    with pytest.raises(EpisodeError, match=r"no usable record in it \(broken_record 1 times"):
-        read_tub(root, LEFT)
+    expected = {"broken_record": 5, "records_missing": 1, "frame_missing": 1, "broken_jpeg": 1, "deleted_record": 2}
+    assert found == expected
     (root / "catalog_0.catalog").unlink()
     with pytest.raises(EpisodeError, match="catalog_missing"):
         read_tub(root, LEFT)
-    (root / "manifest.json").write_text('{"paths": "all"}\n')
-    with pytest.raises(EpisodeError, match="does not say which catalogs"):
-        read_tub(root, LEFT)
+    for manifest in ('{"paths": 1}', '{"paths": ["catalog_0.catalog"], "deleted_indexes": [[1, 2]]}', ""):
+        (root / "manifest.json").write_text(manifest)
+        with pytest.raises(EpisodeError, match="which catalogs"):
+            read_tub(root, LEFT)
     (root / "manifest.json").unlink()
     with pytest.raises(EpisodeError, match="no donkeycar tub"):
         read_tub(root, LEFT)
 
 
-def test_what_no_donkeycar_writes_is_told(tmp_path):
-    root = tub(tmp_path / "tub", records(40), deleted=["5"], per_catalog=20)
-    first, last = root / "catalog_0.catalog", root / "catalog_1.catalog"
-    first.write_text("\ufeff" + first.read_text() + last.read_text().replace('"_index": 20', '"_index": 7'))
-    shutil.copy(last, root / "catalog_2.catalog")
-    found = kinds(read_tub(root, LEFT))
-    assert found == {"deleted_record": 1, "records_missing": 1, "duplicate_record": 20, "catalog_not_listed": 1}
-    for path in (first, last):
-        path.write_text(re.sub(r'_ms": (.{10})', r'_ms": \1.', path.read_text()))
-    with pytest.raises(EpisodeError, match="come 5e-05 s after another; write their times in milliseconds"):
-        read_tub(root, LEFT)
-    (root / "manifest.json").write_text('{"paths": ["catalog_0.catalog"], "deleted_indexes": [[1, 2]]}')
-    with pytest.raises(EpisodeError, match="its deleted_indexes are no numbers of records, found a list of 2"):
-        read_tub(root, LEFT)
-
-
 @pytest.mark.slow
-def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path):
+def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatch):
     from rover_lib.workshop.recordings.episodes import load_recordings
 
     root = tub(tmp_path / "tub", records(50), deleted=[25])
+    (tmp_path / "car.yml").write_text(yaml_of(LEFT))
+    monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
+    done = CliRunner().invoke(main, ["import", str(root), str(tmp_path / "dataset")])
+    assert done.exit_code == 0, done.output
     recordings = read_tub(root, LEFT)
-    export_dataset(recordings, tmp_path / "dataset")
     again = load_recordings(tmp_path / "dataset", chunk=2)
     assert again.layout.rate_hz == 20 and again.samples[0].car.drives_like(LEFT)
     assert len(again.samples) == len(recordings.samples) == 48
     for ours, theirs in zip(recordings.samples, again.samples, strict=True):
         assert (ours.frame_bgr() == theirs.frame_bgr()).all()
         assert (ours.state == theirs.state).all() and (ours.chunk[0] == theirs.chunk[0]).all()
-
-
-def test_every_command_calls_it_a_tub(tmp_path):
-    roots = tub(tmp_path / "new", records(3)), old_tub(tmp_path / "old", 3)
-    for root in roots:
-        assert kinds_of(root) == ("tub",)
-        for command in (["inspect", root], ["export-dataset", root, tmp_path / "out"]):
-            result = CliRunner().invoke(main, [str(word) for word in command])
-            assert result.exit_code == 1 and "a donkeycar tub" in result.output
