@@ -17,7 +17,7 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-more watch run test test-fast check-release coverage lint notebooks-open lab count arm faults faults-cars random mutants pi firmware flash notebooks tables docs clean
+.PHONY: help demo demo-more watch run notebooks-open flash docs test test-fast lint check-release mutants count notebooks
 
 help:
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
@@ -25,24 +25,19 @@ help:
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make notebooks-open NAME=mine [AS=try1]     JupyterLab on a copy of a run's notebooks, with its outputs; the run stays"
 	@echo "make demo-more                              late plans, and a smaller policy that the demo's teaches: half an hour"
-	@echo "make firmware; make flash                   build the Arduino's firmware, and put it on the board"
+	@echo "make flash                                  build the Arduino's firmware, and put it on the board"
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
-	@echo "make test-fast                              what two minutes can prove"
+	@echo "make test-fast, make lint                   what two minutes can prove"
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
 	@echo "make check-release                          what takes two hours and a quiet machine"
+	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
 	@echo "make count NAME=demo [PEERS=1]              count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
-	@echo "make faults                                 what fails while driving, in virtual time and on pins"
-	@echo "make faults-cars                            the same on other cars, of lab/cars"
-	@echo "make random                                 10,000 drives with random faults, in virtual time"
-	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
-	@echo "make pi                                     the playbooks on an emulated Pi in a container: root, Debian 12"
-	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the notebooks,"
-	@echo "                                            and the JSON behind them into results/, and the pages' tables from it"
-	@echo "make tables                                 the pages' tables alone"
+	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the"
+	@echo "                                            notebooks, the JSON behind them into results/, the tables into pages"
 
 # ensurepip is called on its own because venv hides why it failed. If it fails (a full disk, no bundled wheels), the
 # pip of $(PYTHON) installs pip into the environment. An unfinished environment without pip gets one this way too.
@@ -107,37 +102,19 @@ check-release: lint $(DEMO)
 	$(MAKE) demo-more
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
-	$(MAKE) faults faults-cars random mutants pi
-
-coverage: $(DEMO)
-	$(VENV)/bin/pytest $(PACKAGES:%=--cov=%) --cov-report=term
+	$(LAB) faults runs/faults.json
+	for car in crawler inverted gamepad; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done
+	$(LAB) random runs/random.json
+	$(MAKE) mutants
+	$(LAB) pi runs/pi.json
 
 # NAME=full needs no checkpoint: it makes one. The last file that it makes is policy_static.onnx.zip.
 count: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/policy_static.onnx.zip || $(LAB) full runs/full $(if $(LEARNED),--learned)
 	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
 
-faults: $(READY)
-	$(LAB) faults runs/faults.json
-
-faults-cars: $(READY)
-	$(LAB) faults runs/faults-crawler.json --car lab/cars/crawler.yml
-	$(LAB) faults runs/faults-inverted.json --car lab/cars/inverted.yml
-	$(LAB) faults runs/faults-gamepad.json --car lab/cars/gamepad.yml
-
-random: $(READY)
-	$(LAB) random runs/random.json
-
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
-
-# This deploys the demo's artifact.
-pi: $(READY)
-	@test -f runs/demo/policy_static.pt || $(MAKE) demo
-	$(LAB) pi runs/pi.json
-
-firmware:
-	$(MAKE) -C firmware
 
 flash:
 	$(MAKE) -C firmware flash PORT='$(PORT)'
@@ -146,18 +123,8 @@ flash:
 notebooks-open: $(READY)
 	$(VENV)/bin/python -m rover_lib.workshop.run.copy_run '$(if $(filter file,$(origin NAME)),,$(NAME))' '$(if $(filter default,$(origin AS)),,$(AS))'
 
-# Their old names say the new ones and do it, for one release.
-lab arm:
-	@echo '`make $@` is now `make $(NEW_$@)`' >&2
-	@$(MAKE) $(NEW_$@)
-NEW_lab := notebooks-open
-NEW_arm := count
-
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish
-	$(MAKE) tables
-
-tables: $(READY)
 	$(VENV)/bin/python -m lab.repository.page_tables
 
 # The pages, and all that they link to. A link to anything else fails the build.
@@ -169,6 +136,3 @@ docs: $(READY)
 	cp --parents $(PAGES) runs/pages
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build
 	@echo 'open runs/site/index.html'
-
-clean:
-	rm -rf $(VENV) runs

@@ -1,8 +1,8 @@
 """Writes the tables in the pages: results from the JSON in results/, parameters from the notebooks.
 
-    python -m lab.repository.page_tables        # what `make tables` does
+    python -m lab.repository.page_tables        # what `make notebooks` does at its end
 
-A table stands in README.md or in a page of docs/ between `<!-- table NAME, by make tables -->` and `<!-- end -->`, each
+A table stands in README.md or in a page of docs/ between `<!-- table NAME, by page_tables -->` and `<!-- end -->`, each
 once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
 """
 
@@ -27,7 +27,7 @@ EXPLAINED = {  # the modes, in words that need no other page
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
 BEST = "static"
-PLACE = re.compile(r"(<!-- table (\w+), by make tables -->\n)(.*?)(<!-- end -->)", re.S)
+PLACE = re.compile(r"(<!-- table (\w+), by page_tables -->\n)(.*?)(<!-- end -->)", re.S)
 
 Row = tuple[str, ...]
 

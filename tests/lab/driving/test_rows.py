@@ -168,7 +168,7 @@ def test_a_fault_that_is_none():
 @pytest.mark.emulated
 @needs.simavr
 def test_some_faults_in_the_command(tmp_path):
-    """Two on the pins, of which one's line only the next start writes; `make faults` has all."""
+    """Two on the pins, of which one's line only the next start writes; `python -m lab faults` has all."""
     names = ["camera frozen", "Arduino loop hung", "SIGKILL"]
     done = CliRunner().invoke(main, ["faults", str(tmp_path / "f.json"), *(f"--only={name}" for name in names)])
     assert done.exit_code == 0, done.output

@@ -1,4 +1,4 @@
-"""What a deployment to an emulated Pi makes of what it sees, without a Pi: `make pi` has that."""
+"""What a deployment to an emulated Pi makes of what it sees, without a Pi: `python -m lab pi` has that."""
 
 import os
 from types import SimpleNamespace

@@ -24,7 +24,7 @@ def lines_of(root):
 
 
 def test_pages_say_what_results_and_notebooks_say():
-    """Fails where a number in a page was typed, results/ was published or a notebook changed without `make tables`."""
+    """Fails where a number in a page was typed, results/ was published or a notebook changed without `python -m lab.repository.page_tables`."""
     texts = tables.pages()
     assert tables.render_pages(texts, tables.ROOT) == texts
 
@@ -49,7 +49,7 @@ def test_each_parameter_of_each_notebook_is_in_the_table(checkout):
     ("change", "message"),
     [
         (lambda text: text.replace("<!-- table demo", "<!-- table dem"), "each table once, found .*dem'"),
-        (lambda text: text + "<!-- table faults, by make tables -->\n<!-- end -->", "each table once, found .*faults"),
+        (lambda text: text + "<!-- table faults, by page_tables -->\n<!-- end -->", "each table once, found .*faults"),
     ],
 )
 def test_pages_without_a_table_are_left_as_they_are(checkout, change, message):
