@@ -166,8 +166,8 @@ class _Deployment:
         with self.report.step(step or book):
             play = playbooks.run(book, self.pi, self.folder, {**self.variables, **variables})
             self.log.write(f"===== {step or book}\n{play.output}\n")
-            self.log.flush()
             if works and not play.ok:
+                self.log.write(f"===== its journal\n{playbooks.read_journal(self.pi)}\n")
                 raise EmulationError(f"{book}.yml failed, its output ends: {play.end}")
         return play
 
