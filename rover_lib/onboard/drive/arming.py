@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
@@ -192,8 +193,8 @@ class Arming:
 
             def prepare() -> None:
                 driving.enter_context(self._planner.without_rest())
-                if self._options.record:
-                    self._recorder = TakeoverRecorder(recording.enter_context(self._new_recorder()), self._mode)
+                if folder := self._options.record:
+                    self._recorder = TakeoverRecorder(recording.enter_context(self._recorder_in(folder)), self._mode)
                 driving.enter_context(boost_priority(self._log))
 
             self._armed = arm_by_plan(
@@ -225,12 +226,7 @@ class Arming:
         except Exception as error:
             self._log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
 
-    def _new_recorder(self) -> Recorder:
-        assert self._options.record, "asked for by the options"
-        about = About(
-            f"driven by {self._mode}",
-            arduino_port=self._link.port if self._link else "",
-            source="rover drive",
-            car=self._link.car if self._link else this_car(),
-        )
-        return Recorder(self._options.record, self._camera, about, rate_hz=self._options.hz, most_bytes=self._room)
+    def _recorder_in(self, folder: Path) -> Recorder:
+        port, car = (self._link.port, self._link.car) if self._link else ("", this_car())
+        about = About(f"driven by {self._mode}", arduino_port=port, source="rover drive", car=car)
+        return Recorder(folder, self._camera, about, rate_hz=self._options.hz, most_bytes=self._room)

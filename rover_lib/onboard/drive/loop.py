@@ -93,7 +93,6 @@ class Report:
     ended: str = ""
     status: str = "getting ready"  # one line for people
     memory_mb: float | None = None  # resident, of the loop's process and its children, at the end
-    memory_growth_mb: float | None = None  # since the first minute
     world: dict[str, Any] = field(default_factory=dict)  # figures of a simulated car, added to the summary
     late_ms: array = field(default_factory=lambda: array("f"), repr=False)
     plan_age_ms: array = field(default_factory=lambda: array("f"), repr=False)
@@ -121,7 +120,6 @@ class Report:
             "resent": self.resent,
             "seconds": round(self.seconds, 3),
             "memory_mb": self.memory_mb,
-            "memory_growth_mb": self.memory_growth_mb,
             "ended": self.ended,
             **self.world,
         }
@@ -186,15 +184,14 @@ class _Loop:
     clock: Callable[[], float]
     sleep: Callable[[float], None]
 
-    def __post_init__(self) -> None:
-        self.armed = False
-        self.start_s = 0.0
-        self.boot = 0  # number of the Arduino's start at which it was armed
-        self.sequence = 0  # number of the newest command
-        self.sent_s = 0.0
-        self.late: deque[tuple[float, float]] = deque()  # missed deadlines: when it was seen, seconds late
-        self.last: Order | None = None
-        self.port_stuck = False  # the port did not take the last command
+    armed: bool = False
+    start_s: float = 0.0
+    boot: int = 0  # number of the Arduino's start at which it was armed
+    sequence: int = 0  # number of the newest command
+    sent_s: float = 0.0
+    late: deque[tuple[float, float]] = field(default_factory=deque)  # missed deadlines: when it was seen, seconds late
+    last: Order | None = None
+    port_stuck: bool = False  # the port did not take the last command
 
     def arm(self) -> None:
         arm = self.hooks.arm or (self.link.arm if self.link else lambda: None)

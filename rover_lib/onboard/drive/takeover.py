@@ -176,7 +176,5 @@ class TakeoverRecorder:
 def _at_rest(telemetry: Telemetry, rest_us: tuple[int, int]) -> bool:
     sticks_us = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
     bands_us = STEERING_REST_US, THROTTLE_REST_US
-    return all(
-        us is not None and abs(us - at_us) <= band_us
-        for us, at_us, band_us in zip(sticks_us, rest_us, bands_us, strict=True)
-    )
+    near = zip(sticks_us, rest_us, bands_us, strict=True)
+    return all(us is not None and abs(us - at_us) <= band_us for us, at_us, band_us in near)
