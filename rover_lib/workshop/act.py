@@ -71,7 +71,7 @@ def _load(module: Layer, weight: Tensor, bias: Tensor) -> Layer:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    return _load(nn.Linear(*weight.shape[::-1], device="meta"), weight, bias)
+    return _load(nn.Linear(weight.shape[1], weight.shape[0], device="meta"), weight, bias)
 
 
 def layer_norm(w: Weights) -> nn.LayerNorm:

@@ -249,40 +249,33 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], 
     return (label if isinstance(label, str) else "", outcome), tables
 
 
-def _read_bytes(path: Path, faults: Faults) -> bytes | None:
-    """Return a data file's bytes. None, with a fault, if it is absent, empty, unreadable or too large."""
+def _read_bytes(path: Path, faults: Faults) -> bytes:
+    """Return a data file's bytes; none, with a fault, if it is absent, empty, unreadable or too large."""
     try:
-        data = read_plain(path, DATA_BYTES)
+        if data := read_plain(path, DATA_BYTES).strip():
+            return data
+        faults.add(path, "empty", "nothing in it")
     except FileNotFoundError:
         faults.add(path, "absent", "not there")
-        return None
     except OSError as e:
         faults.add(path, "unreadable", e.strerror or type(e).__name__)
-        return None
-    if not data.strip():
-        faults.add(path, "empty", "nothing in it")
-        return None
-    return data
+    return b""
 
 
 def _read_json(path: Path, faults: Faults) -> dict[str, Any]:
-    data = _read_bytes(path, faults)
-    if data is None:
+    if not (data := _read_bytes(path, faults)):
         return {}
     try:
-        content = json.loads(data)
+        if isinstance(content := json.loads(data), dict):
+            return content
+        faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
     except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
         faults.add(path, "broken_json", quote(str(e)))
-        return {}
-    if not isinstance(content, dict):
-        faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
-        return {}
-    return content
+    return {}
 
 
 def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[str, Any]]:
-    data = _read_bytes(path, faults)
-    if data is None:
+    if not (data := _read_bytes(path, faults)):
         return []
     # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
     table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines(), restval="missing")
@@ -355,29 +348,20 @@ def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Fa
         with picture.open("rb") as f:
             head = f.read(JPEG_HEAD)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
-            problem = _jpeg_problem(head, f.read())
+            tail = f.read()
     except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
         faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
         return None
-    if problem:
-        faults.add(picture, "broken_jpeg", problem)
+    # cv2 would only warn of a file that was cut short, and return a picture.
+    if not head.startswith(b"\xff\xd8") or not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
+        faults.add(
+            picture, "broken_jpeg", f"not a whole JPEG: it begins with {quote(head[:12])}, ends {quote(tail[-4:])}"
+        )
         return None
     try:
         return simplejpeg.decode_jpeg_header(head)[:2]
     except ValueError:
         return 0, 0
-
-
-def _jpeg_problem(head: bytes, tail: bytes) -> str | None:
-    """Say what is wrong with the two ends of a JPEG, None if nothing is.
-
-    cv2 would only warn of a file that was cut short, and return a picture.
-    """
-    if not head.startswith(b"\xff\xd8"):
-        return f"no JPEG: it begins with {quote(head[:12])}"
-    if not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
-        return "cut short: its end marker is missing"
-    return None
 
 
 def _actions_of(

@@ -329,8 +329,10 @@ def _open_local(root: Path) -> "LeRobotDataset":
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     class Local(LeRobotDataset):
-        def download(self, download_videos: bool = True) -> None:
+        def download(self, *_: Any, **__: Any) -> None:
             raise FileNotFoundError("frames of some of its episodes are not there")
+
+        _download = download  # as LeRobot 0.6 calls it
 
     with _as_episode_error(root, "LeRobot cannot read it"):
         return Local(f"local/{root.resolve().name}", root, revision="local", video_backend=BACKEND)

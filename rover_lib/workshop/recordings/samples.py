@@ -152,13 +152,10 @@ class Sample:
         try:
             return self.turned(read_jpeg(self.frame_path))
         except OSError as e:
-            raise EpisodeError(
-                f"{self.frame_path}: cannot be read ({e.strerror})", remedy="restore it or load again"
-            ) from None
+            what, found, remedy = f"cannot be read ({e.strerror})", None, "restore it or load again"
         except PictureError as e:
-            raise EpisodeError(
-                f"{self.frame_path}: {e.what}", found=e.found, remedy="delete it or record the episode again"
-            ) from None
+            what, found, remedy = e.what, e.found, "delete it or record the episode again"
+        raise EpisodeError(f"{self.frame_path}: {what}", found=found, remedy=remedy)
 
 
 def car_of(samples: Iterable[Any]) -> Car:
@@ -265,26 +262,19 @@ class Recordings:
 
     def driven_by_pct(self) -> dict[str, float]:
         """The percentage of samples at which each of `episode.DRIVERS` drove, without those who never did."""
-        count = len(self.samples)
-        return {who: round(100 * n / count, 1) for who, n in self._counted(s.driver for s in self.samples).items()}
-
-    @staticmethod
-    def _counted(words: Iterable[str]) -> dict[str, int]:
-        return dict(sorted(Counter(words).items()))
+        counted = _counted(s.driver for s in self.samples)
+        return {who: round(100 * n / len(self.samples), 1) for who, n in counted.items()}
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file that the samples came from, keyed by its path relative to `root`.
 
         Raises EpisodeError if one cannot be read any more.
         """
-        files = {path: None for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples))}
-        hashes = {}
-        for path in files:
-            try:
-                hashes[relative(path, self.root)] = sha256_of(path)
-            except OSError as e:
-                raise EpisodeError(f"{path}: cannot be read any more ({e.strerror})", remedy="load again") from None
-        return hashes
+        files = dict.fromkeys(path for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples)))
+        try:
+            return {relative(path, self.root): sha256_of(path) for path in files}
+        except OSError as e:
+            raise EpisodeError(f"{e.filename}: cannot be read any more ({e.strerror})", remedy="load again") from None
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
@@ -296,13 +286,17 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
-            "outcomes": self._counted(e.outcome or "not labelled" for e in self.episodes),
+            "outcomes": _counted(e.outcome or "not labelled" for e in self.episodes),
             "driven_by_pct": self.driven_by_pct(),
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
-            "faults": [{"file": f.file, "kind": f.kind, "count": f.count, "note": f.note} for f in self.faults],
+            "faults": [vars(f) for f in self.faults],
         }
+
+
+def _counted(words: Iterable[str]) -> dict[str, int]:
+    return dict(sorted(Counter(words).items()))
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:

@@ -24,7 +24,6 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder
 from rover_lib.workshop.judge.compare import LerobotEager
-from rover_lib.workshop.recordings.samples import Layout
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 INNER, OUTER, STATS = "policy_preprocessor.json", "policy_postprocessor.json", "stats.safetensors"
@@ -131,7 +130,6 @@ def weight(value):
     ("change", "says"),
     [
         (lambda c: c.pop("config"), "no 'config'"),
-        (lambda c: c["config"].pop("hidden_size"), "hidden_size"),
         (lambda c: c["config"].update(chunk_size="32"), "chunk_size"),
         (lambda c: c["config"].update(n_heads=7), "divisible"),
         (lambda c: c["config"].update(n_obs_steps=2), "n_obs_steps"),
@@ -142,11 +140,9 @@ def weight(value):
         (lambda c: c.update(best_val_loss="low"), "best_val_loss"),
         (lambda c: c["model_state_dict"].pop("model.action_head.bias"), "action_head.bias"),
         (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "unknown: extra"),
-        (lambda c: c["model_state_dict"].update({"other.extra": torch.zeros(1)}), "other.extra"),
         (weight(3), BIAS),
         (weight(torch.eye(8).to_sparse()), BIAS),
         (weight(torch.ones(64, dtype=torch.int64)), BIAS),
-        (weight(torch.full((64,), np.nan)), "NaN"),
         # finite here, but not in float32, in which the policy drives
         (weight(torch.full((64,), 1e300, dtype=torch.float64)), "NaN"),
     ],
@@ -385,10 +381,10 @@ def test_the_steps_own_type_of_a_feature_decides_how_it_is_normalised(policy, tm
     check_is(load_checkpoint(tmp_path), policy, theirs, outer)
 
 
-@pytest.mark.parametrize("missing", [(INNER,), (INNER, OUTER)])
-def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copied, missing):
-    for file in missing:
+def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copied):
+    for file in (INNER, OUTER):
         (copied / file).unlink()
+        refused(copied)
     assert "policy_preprocessor*" in refused(copied)
     edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
     assert load_checkpoint(copied).config.state_norm is None
@@ -475,8 +471,6 @@ def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
     write_lerobot(tmp_path / "ours", checkpoint.config, checkpoint.weights, {})
     again = load_checkpoint(tmp_path / "ours")
     assert replace(again.config, image_norm=checkpoint.config.image_norm) == checkpoint.config
-    arm = Layout(("cam_front",), tuple("abc"), ("steering", "throttle"), 30.0, (0, 1, 2))
-    assert checkpoint.recorded_as(arm).config.state_names == ("a", "b", "c")
 
 
 def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
