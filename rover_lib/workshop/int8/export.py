@@ -29,6 +29,11 @@ from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, int8_layers
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
+REASONS = {  # why another processor may answer otherwise: of FP32, and of INT8
+    False: "another processor sums in another order",
+    True: "float parts round differently on another processor, and flipped INT8 roundings grow over layers",
+}
+
 
 class TorchScript:
     """The policy as TorchScript, traced and frozen. A form of a policy predicts, and saves itself as an artifact."""
@@ -160,9 +165,7 @@ class Exporter:
         gaps = (actions[self.stored] - expected).abs().amax((0, 1)).tolist()
         for (name, most), gap in zip(limits.items(), gaps, strict=True):
             if not gap <= most:  # written so that NaN fails
-                raise QuantizeError(
-                    f"{path}: {name} of the written graph differs from the policy's by {gap:.3g}; nothing was written"
-                )
+                raise QuantizeError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
         allowed = {
             name: min(most, artifact.largest_tolerance(_mode(policy), name))
@@ -180,13 +183,7 @@ class Exporter:
             **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(module),
             "gmac": self.gmac,
-            "parity": {
-                "tolerance": allowed,
-                "reason": "float parts round differently on another processor, and flipped INT8 roundings grow over "
-                "layers"
-                if isinstance(policy, QuantizedPolicy)
-                else "another processor sums in another order",
-            },
+            "parity": {"tolerance": allowed, "reason": REASONS[isinstance(policy, QuantizedPolicy)]},
         }
         return form.save(path, manifest, vectors)
 

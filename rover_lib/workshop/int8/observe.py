@@ -35,6 +35,7 @@ from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 
+AGAIN = "calibrate again"
 BROKEN_INPUT = "check the checkpoint and the recordings"
 
 
@@ -95,9 +96,7 @@ class RangeObserver(UniformQuantizationObserverBase):
         """
         low, high = self.min_val.item(), self.max_val.item()
         if low > high:
-            raise QuantizeError(
-                "an observer saw nothing: the calibration did not reach its layer", remedy="calibrate again"
-            )
+            raise QuantizeError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
         if self.choice == "percentile":
             low, high = self._percentiles(low, high)
         elif self.choice == "histogram":
@@ -372,25 +371,18 @@ def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibr
     Raises QuantizeError for a calibration of another checkpoint, picture size, scheme or version.
     """
     if calibration.image_sizes != checkpoint.config.image_sizes:
-        raise QuantizeError(
-            f"the calibration was made with images of {calibration.image_sizes}, the policy takes "
-            f"{checkpoint.config.image_sizes} (height, width)",
-            remedy="calibrate again",
-        )
+        sizes = f"images of {calibration.image_sizes}, not {checkpoint.config.image_sizes} (height, width)"
+        raise QuantizeError(f"the calibration was made with {sizes}", remedy=AGAIN)
     if calibration.checkpoint != checkpoint.identity:
-        raise QuantizeError("the calibration was made with another checkpoint", remedy="calibrate again")
+        raise QuantizeError("the calibration was made with another checkpoint", remedy=AGAIN)
     if scheme.smooth != calibration.smooth:
-        raise QuantizeError(
-            f"the calibration was made with smooth {calibration.smooth}, the scheme has {scheme.smooth}"
-        )
+        raise QuantizeError(f"the calibration was made with smooth {calibration.smooth}, not {scheme.smooth}")
     torch.backends.quantized.engine = ENGINE
     prepared = _prepare(scale_model(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()
     names = {k for k in state if "activation_post_process" in k}
     if names != set(calibration.observers):
-        raise QuantizeError(
-            "the calibration's observers do not fit this graph", remedy="calibrate again with this version"
-        )
+        raise QuantizeError("the calibration's observers do not fit this graph", remedy=AGAIN)
     prepared.load_state_dict(state | calibration.observers)
     for m in prepared.modules():
         if isinstance(m, RangeObserver):

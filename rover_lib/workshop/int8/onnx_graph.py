@@ -372,7 +372,7 @@ def _reshape(w: _Writer, n: Node, result: Tensor) -> str:
 
 
 def _squeeze(w: _Writer, n: Node, result: Tensor) -> str:
-    return w._unary(str(n.target).capitalize(), n, w._ints(f"{n.name}_axes", [n.args[1]]))
+    return w._unary(str(n.target).capitalize(), n, w._ints(f"{n.name}_axes", _args(n)[1:]))
 
 
 def _cast(w: _Writer, n: Node, result: Tensor) -> str:

@@ -67,7 +67,7 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     """Draw one episode: what the cameras saw, and what was done; for a car also the pulses that its servos got."""
     samples = episode.samples
     shown = np.linspace(0, len(samples) - 1, pictures).round().astype(int)
-    lines = {name: [s.chunk[0, i] for s in samples] for i, name in enumerate(actions)}
+    lines: dict[str, Any] = {name: [s.chunk[0, i] for s in samples] for i, name in enumerate(actions)}
     if tuple(actions) == ACTION_NAMES:
         pulses = np.array([s.pulses_us or list(vars(s.car.pwm.pulses(*s.chunk[0].tolist())).values()) for s in samples])
         computed = "" if samples[0].pulses_us else ",\ncomputed"

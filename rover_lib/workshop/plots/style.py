@@ -82,7 +82,7 @@ class Note:
 
 def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
     """Make a figure and its (rows, columns) axes. pyplot is told to forget it, so only the caller shows it."""
-    size = {"figsize": (WIDTH_IN, height_in), "dpi": DPI, "layout": "constrained", "FigureClass": Drawn}
+    size: dict[str, Any] = {"figsize": (WIDTH_IN, height_in), "dpi": DPI, "layout": "constrained", "FigureClass": Drawn}
     fig, axes = plt.subplots(rows, columns, squeeze=False, **size, **options)
     plt.close(fig)
     for ax in axes.flat:

@@ -169,9 +169,8 @@ def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
     if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
-        raise QuantizeError(
-            f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json", remedy="quantize again"
-        )
+        what = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
+        raise QuantizeError(what, remedy="quantize again")
     return quantize(checkpoint, Scheme.of(made["scheme"]), Calibration.load(calibrated))
 
 

@@ -66,11 +66,9 @@ def _check_limits(policy: Checkpoint) -> None:
     for what, names in (("cameras", c.cameras), ("states", c.state_names), ("actions", c.action_names)):
         for name in names:
             if not is_name(name):
-                raise CheckpointError(
-                    f"{policy.path}: the names of {what} must have 1 to {NAME_LENGTH} characters and no '/'",
-                    found=quote(name),
-                    remedy="give them other names in the dataset's meta/info.json and the policy's config.json",
-                )
+                must = f"{policy.path}: the names of {what} must have 1 to {NAME_LENGTH} characters and no '/'"
+                remedy = "give them other names in the dataset's meta/info.json and the policy's config.json"
+                raise CheckpointError(must, found=quote(name), remedy=remedy)
 
 
 def check_sizes(policy: Checkpoint) -> None:
@@ -89,11 +87,8 @@ def check_sizes(policy: Checkpoint) -> None:
 def _within(policy: Checkpoint, what: str, value: float, limits: tuple[float, float]) -> None:
     least, most = limits
     if not least <= value <= most:
-        raise CheckpointError(
-            f"{policy.path}: {what} must be from {least:g} to {most:g}",
-            found=f"{value:g}",
-            remedy="such a policy cannot be made into an artifact",
-        )
+        must = f"{policy.path}: {what} must be from {least:g} to {most:g}"
+        raise CheckpointError(must, found=f"{value:g}", remedy="such a policy cannot be made into an artifact")
 
 
 def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
