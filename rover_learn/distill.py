@@ -116,7 +116,7 @@ def distill(
     opened = load(checkpoint, episodes, progress)
     config = student_config(opened.checkpoint, shape)
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
-    given = {"opened": opened, "config": config, "share": share, "qat": qat}
+    given: dict[str, Any] = {"opened": opened, "config": config, "share": share, "qat": qat}
     work = _Work(origin=opened.checkpoint, recipe=recipe, device=where, progress=progress, **given)
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
@@ -410,8 +410,8 @@ def _leave(new: Path, name: str, work: _Work, taught: _Taught) -> None:
     students[1] |= _int8_errors(work, taught.weights, rounded, held_out, planned)
     unrounded = None
     if taught.unrounded:
-        weights, *how = taught.unrounded
-        before = quantize(_checkpoint(work, weights), *how)
+        weights, before_scheme, before_calibration = taught.unrounded
+        before = quantize(_checkpoint(work, weights), before_scheme, before_calibration)
         unrounded = _int8_errors(work, weights, before, held_out, planned)
     chosen, driven = plans_of(own, choosing, work.progress), ~np.stack([s.is_pad for s in choosing])
     loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())

@@ -42,6 +42,13 @@ STRANGER = 2.0  # a policy with more than this many times the error of one const
 class BatchedPolicy(nn.Module):
     """LeRobot's own policy for many observations at once: raw states in, raw actions out, no dropout, latent zero."""
 
+    image_scale: Tensor
+    image_shift: Tensor
+    state_scale: Tensor
+    state_shift: Tensor
+    action_scale: Tensor
+    action_shift: Tensor
+
     def __init__(self, config: ActConfig, weights: dict[str, Tensor]):
         super().__init__()
         self.config = config
@@ -50,12 +57,6 @@ class BatchedPolicy(nn.Module):
         self.backbone = self.model.backbone
         self.model.backbone = Given()
         self.eval()
-        self.image_scale: Tensor
-        self.image_shift: Tensor
-        self.state_scale: Tensor
-        self.state_shift: Tensor
-        self.action_scale: Tensor
-        self.action_shift: Tensor
         norms = {"image": config.image_norm[0], "state": config.state_norm, "action": config.action_unnorm}
         for name, norm in norms.items():
             norm = norm or Affine((1.0,), (0.0,))
@@ -235,12 +236,9 @@ class Lessons:
         plans = self.plans[2 * np.arange(len(self))]
         planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
         if (planned > STRANGER * constant).all():
-            pairs = zip(teacher.config.action_names, planned, constant, strict=True)
-            raise error(
-                f"{teacher.path}: on {which} recordings its plans are worse than one action for all frames",
-                found=" and ".join(f"{a} {100 * p:.0f} % off instead of {100 * c:.0f} %" for a, p, c in pairs),
-                remedy=remedy,
-            )
+            found = f"{100 * planned.min():.0f} % off instead of {100 * constant.max():.0f} %"
+            what = f"{teacher.path}: on {which} recordings its plans are worse than one action for all frames"
+            raise error(what, found=found, remedy=remedy)
 
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
@@ -284,8 +282,7 @@ class Batch:
         """The states, (B, 2), with which the teacher planned.
 
         New recordings keep the side of their steering and a random share of its size: if nothing to steer to is in
-        sight, only the state says on which side it was, and the human in the recording steers more than the policy will
-        when it comes there.
+        sight, only the state says on which side it was, and the human steered more than the policy will.
         """
         each = []
         for p in self.parts:

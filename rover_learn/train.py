@@ -248,7 +248,8 @@ class _Training:
 
         maps: their feature maps, for a policy that takes those.
         """
-        judges: Any = self.judges if maps is None else replace(self.judges, images=maps)
+        images: Any = self.judges.images if maps is None else maps
+        judges = replace(self.judges, images=images)
         units = self.weights.cpu().numpy()
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
         errors = [loop.driving_error(self.policy, judges, rows, units, maps is not None) for rows in every]

@@ -227,5 +227,5 @@ def test_the_command_prints_what_it_learned_from_and_where_it_left_it(checkpoint
     ]  # fmt: skip
     result = CliRunner().invoke(main, [str(a) for a in ("finetune", checkpoint, old, new, *given_)])
     assert result.exit_code == 0, result.output
-    assert "8 of corrections" in result.output and f"done: {tmp_path / 'better'}" in result.output
+    assert "8 corrections" in result.output and f"done: {tmp_path / 'better'}" in result.output
     assert read_stage(tmp_path / "better" / "finetune.json", "finetune")["params"]["correction_weight"] == 3
