@@ -26,7 +26,6 @@ LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transforme
 # The chip's answers may be this many times as far from FP32 as what is allowed to torch's INT8. The chip rounds in
 # other places, and nobody knows by how much; a HEF that computes something else is hundreds of times as far off.
 STATIC_TIMES = 2.5
-COPIED = ("KIT.md", "compile.py")
 
 
 def write_kit(
@@ -60,7 +59,7 @@ def write_kit(
             onnx.save(network.model, folder / f"{name}.onnx")
             (folder / f"{name}.alls").write_text(model_script(name, network, policy.config, samples))
             described[name] = _describe(policy, name, network)
-        for name in COPIED:
+        for name in ("KIT.md", "compile.py"):
             shutil.copyfile(Path(__file__).with_name(name), folder / name)
         write_calibration(policy, chosen, folder, progress)
         content = {"schema": 1, "networks": described, "manifest": manifest}
@@ -101,19 +100,18 @@ def model_script(name: str, network: Network, config: ActConfig, samples: int) -
         lines.append(f"normalization{i} = normalization({mean}, {std}{layer})")
     lines += [
         f"model_optimization_config(calibration, batch_size=8, calibset_size={samples})",
-        "# 0 needs no GPU (zoo: detr_resnet_v1_18_bn, vit_small); with one, try optimization_level=2",
+        "# zoo, detr_resnet_v1_18_bn and vit_small; 0 needs no GPU, with one try optimization_level=2",
         "model_optimization_flavor(optimization_level=0, compression_level=0)",
-        "pre_quantization_optimization(equalization, policy=enabled)  # zoo: detr_resnet_v1_18_bn, vit_small",
-        "quantization_param({output_layer*}, precision_mode=a16_w16)  # zoo: detr_resnet_v1_18_bn",
+        "pre_quantization_optimization(equalization, policy=enabled)",
+        "quantization_param({output_layer*}, precision_mode=a16_w16)",
     ]
     if name == "whole":
         lines += [
-            "# zoo: vit_small, deit_base; of their sums, only those before a LayerNormalization have 16 bits",
+            "# zoo, vit_small and deit_base, where only sums before a LayerNormalization have 16 bits; and the state",
             "pre_quantization_optimization(ew_add_fusing, policy=disabled)",
             "pre_quantization_optimization(matmul_correction, layers={matmul*}, correction_type=zp_comp_block)",
             "model_optimization_config(negative_exponent, layers={*}, rank=0)",
             "quantization_param({ew_add*}, precision_mode=a16_w16)",
-            "# the state, which is small beside what it stands for (zoo: clip_vit_b_16_text_encoder)",
             f"quantization_param({layers['state']}, precision_mode=a16_w16)",
         ]
     return "\n".join(lines) + "\n"
