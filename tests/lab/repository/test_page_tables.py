@@ -24,7 +24,7 @@ def lines_of(root):
 
 
 def test_pages_say_what_results_and_notebooks_say():
-    """Fails where a number in a page was typed, results/ was published or a notebook changed without `python -m lab.repository.page_tables`."""
+    """Fails where a number in a page was typed, or results/ or a notebook changed without a new table."""
     texts = tables.pages()
     assert tables.render_pages(texts, tables.ROOT) == texts
 
