@@ -319,6 +319,8 @@ def _check_files(root: Path, features: Mapping[str, Any], cameras: list[str]) ->
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
             raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
+        if unknown := [name for name in columns if name not in features]:
+            raise _broken(f"{path}: has columns that {INFO} does not know: {quote_all(unknown)}")
 
 
 def _open_local(root: Path) -> "LeRobotDataset":

@@ -308,6 +308,7 @@ def said(**changes):
         ("image", DATA, later, "frames come at another rate"),
         ("image", "meta/info.json", said(fps=30), "30 frames a second, but 30 frames"),
         ("image", DATA, column("action"), "has no column action"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"].pop("index")), "does not know: index"),
         ("image", DATA, column("observation.state", [0.1, np.inf]), "throttle of 'observation.state' is inf"),
         ("image", DATA, column("observation.state", [30.0, 0.1]), "steering of 'observation.state' is 30"),
         # what LeRobot 0.4.0 wrote when it merged datasets
