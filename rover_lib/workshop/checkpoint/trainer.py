@@ -3,7 +3,6 @@
 Pickles are read with weights_only=True, and what that refuses is refused by name.
 """
 
-import json
 import re
 import zipfile
 from pathlib import Path
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.stage import plain
 from rover_lib.workshop.act import ActConfig, imagenet
 from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
@@ -46,10 +46,10 @@ def read_trainer(path: Path) -> Contents:
     weights, notes = name_weights(path, content["model_state_dict"])
     extra = {
         "normalisation_from": {"in": "ImageNet's, as the trainer does", "out": "none, as the trainer does"},
-        "epoch": _as_json(content.get("epoch")),
+        "epoch": plain(content.get("epoch")),
         "best_val_loss": _loss(path, content.get("best_val_loss")),
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
-        "trainer_config": _as_json(raw),
+        "trainer_config": plain(raw),
         "notes": notes,
     }
     return _config(path, raw, weights), weights, extra
@@ -102,18 +102,6 @@ def _loss(path: Path, value: Any) -> float | None:
         raise CheckpointError(
             f"{path}: best_val_loss is not a number", found=quote(value), remedy="save it as one, or leave it out"
         ) from None
-
-
-def _as_json(value: Any) -> Any:
-    """A value for the report, in JSON's types: what has none is only named."""
-
-    def name(part: Any) -> Any:
-        return part.item() if isinstance(part, np.generic) else quote(part)
-
-    try:
-        return json.loads(json.dumps(value, skipkeys=True, default=name))
-    except (ValueError, RecursionError):
-        return quote(value)
 
 
 def _numpy_scalars() -> list[Any]:

@@ -203,15 +203,13 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
             remedy="convert it to v2.1 by a LeRobot of that time, or use a newer version of this",
         )
     features, fps = info.get("features"), info.get("fps")
-    right = isinstance(features, dict) and all(_is_feature(f) for f in features.values())
+    try:
+        right = all(is_whole(n, 1, 10_000) for feature in features.values() for n in [1, *feature["shape"]])
+    except (AttributeError, TypeError, KeyError):
+        right = False
     if not right or not is_number(fps, 0, 1000) or not fps:
         raise _broken(f"{path}: lacks frames per second, or features with a dtype and a shape", quote(fps))
     return info
-
-
-def _is_feature(feature: Any) -> bool:
-    shape = feature.get("shape") if isinstance(feature, dict) else None
-    return isinstance(shape, list) and all(is_whole(n, 1, 10_000) for n in shape)
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, Any]]:
@@ -321,6 +319,8 @@ def _check_files(root: Path, features: Mapping[str, Any], cameras: list[str]) ->
             columns = parquet.read_schema(path).names
         if missing := [name for name in wanted if name not in columns]:
             raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
+        if unknown := [name for name in columns if name not in features]:
+            raise _broken(f"{path}: has columns that {INFO} does not know: {quote_all(unknown)}")
 
 
 def _open_local(root: Path) -> "LeRobotDataset":

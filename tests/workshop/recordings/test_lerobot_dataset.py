@@ -34,6 +34,7 @@ from rover_lib.workshop.run.session import load
 CHUNK, FPS, SIZE = 8, 20, (72, 128)
 CAR, SWAPPED = ("steering", "throttle"), ("throttle", "steering")
 EPISODES, FRAMES = 3, 10
+CAM = "observation.images.cam_front"
 
 # ---- what is refused before LeRobot is asked: quick ---------------------------------------------------------------
 
@@ -140,28 +141,19 @@ def make(root, kind="image", actions=CAR, states=CAR, fps=FPS, value=None):
     """EPISODES of FRAMES by LeRobot's writer. actions, states: the features' names. value: of every action."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    shape = {"dtype": "float32", "shape": (2,)}
-    made = LeRobotDataset.create(
-        "local/made",
-        fps,
-        {
-            "observation.images.cam_front": {
-                "dtype": kind,
-                "shape": (*SIZE, 3),
-                "names": ["height", "width", "channels"],
-            },
-            "observation.state": shape | {"names": list(states)},
-            "action": shape | {"names": list(actions)},
-        },
-        root=root,
-        use_videos=kind == "video",
-        video_backend="pyav",
-    )
+    row = {"dtype": "float32", "shape": (2,)}
+    features = {
+        CAM: {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]},
+        "observation.state": row | {"names": list(states)},
+        "action": row | {"names": list(actions)},
+    }
+    video = {"use_videos": kind == "video", "video_backend": "pyav"}
+    made = LeRobotDataset.create("local/made", fps, features, root=root, **video)
     rng = np.random.default_rng(0)
     for episode in range(EPISODES):
         for _ in range(FRAMES + episode):
             row = {
-                "observation.images.cam_front": smooth_frame(rng, *SIZE),
+                CAM: smooth_frame(rng, *SIZE),
                 "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
                 "action": rng.uniform(0, 0.5, 2).astype(np.float32) if value is None else np.float32(value),
                 "task": f"hit the {episode}. balloon",
@@ -206,7 +198,7 @@ def test_frames_states_and_chunks_are_lerobots_own_items(datasets, kind):
         assert np.array_equal(sample.is_pad, item["action_is_pad"].numpy())
         assert sample.time_s == pytest.approx(item["timestamp"].item())
         rgb = torch.from_numpy(np.ascontiguousarray(sample.frame_bgr()[..., ::-1])).permute(2, 0, 1).float() / 255
-        assert torch.equal(rgb, item["observation.images.cam_front"])
+        assert torch.equal(rgb, item[CAM])
         assert sample.state.dtype == sample.chunk.dtype == np.float32
     assert [e.label for e in recordings.episodes] == [f"hit the {i}. balloon" for i in range(EPISODES)]
     assert [e.frames for e in recordings.episodes] == [FRAMES, FRAMES + 1, FRAMES + 2]
@@ -246,7 +238,7 @@ def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
 
 
 DATA, EPISODES_AT = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
-VIDEO, CAM = "videos/observation.images.cam_front/", "observation.images.cam_front"
+VIDEO = f"videos/{CAM}/"
 
 
 def columns(*changes):
@@ -316,6 +308,7 @@ def said(**changes):
         ("image", DATA, later, "frames come at another rate"),
         ("image", "meta/info.json", said(fps=30), "30 frames a second, but 30 frames"),
         ("image", DATA, column("action"), "has no column action"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c["features"].pop("index")), "does not know: index"),
         ("image", DATA, column("observation.state", [0.1, np.inf]), "throttle of 'observation.state' is inf"),
         ("image", DATA, column("observation.state", [30.0, 0.1]), "steering of 'observation.state' is 30"),
         # what LeRobot 0.4.0 wrote when it merged datasets
