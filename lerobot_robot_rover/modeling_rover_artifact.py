@@ -121,8 +121,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             inputs[f"{OBS_IMAGES}.{c['name']}"] = PolicyFeature(FeatureType.VISUAL, (3, c["height"], c["width"]))
         outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (2,))}
         shutil.copyfile(file, save_directory / file.name)
-        config = replace(self.config, artifact=file.name, input_features=inputs, output_features=outputs)
-        config._save_pretrained(save_directory)
+        given: dict[str, Any] = {"artifact": file.name, "input_features": inputs, "output_features": outputs}
+        replace(self.config, **given)._save_pretrained(save_directory)
 
     def _check(self, manifest: dict[str, Any], dataset_meta: Any) -> None:
         """Raise PolicyError or ParamsError unless LeRobot's loop can run this artifact as `rover drive` would."""

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import av
 import cv2
 import numpy as np
+from av.video.stream import VideoStream
 from PIL import Image, ImageDraw, ImageFont
 
 from rover_exchange.moments import PERIOD_MS, Moment, moments_of
@@ -52,12 +53,13 @@ def write_film(path: Path, flight: Flight, episode: Path | None = None, progress
     if path.suffix not in FORMATS:
         raise RoverError(f"{path}: a film ends in {' or '.join(FORMATS)}", found=path.suffix or "no ending")
     form, moments = FORMATS[path.suffix], moments_of(flight, episode)
-    count, stream = 0, None
+    count = 0
+    stream: VideoStream | None = None
     with atomic_path(path) as temporary:
         with av.open(str(temporary), "w", options=form.container) as container:
             for picture in _pictures(flight, moments, form, progress):
                 if stream is None:
-                    stream: Any = container.add_stream(form.codec, form.rate_hz, options=form.options)
+                    stream = cast(VideoStream, container.add_stream(form.codec, form.rate_hz, options=form.options))
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"  # what browsers play
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
@@ -120,7 +122,8 @@ def _draw_panel(draw: ImageDraw.ImageDraw, moment: Moment, top: int, car: Car) -
         draw.rectangle((min(zero, column), y, max(zero, column), y + 18), FILL)
         text = f"{action:+.3f}"
         if pin_us is not None:
-            at = float(np.clip(zero + (one - zero) * car.pwm.channel(name).action(pin_us), 84, 264))
+            pin = car.pwm.channel(name).action(pin_us) or 0.0
+            at = float(np.clip(zero + (one - zero) * pin, 84, 264))
             draw.rectangle((at - 1, y, at + 1, y + 18), PIN)
             text += f" | {pin_us:.0f} us"
         draw.text((10, y), name, INK, font)
