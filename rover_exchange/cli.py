@@ -8,10 +8,10 @@ from typing import Any
 
 import click
 
-from rover_lib.cli.prepare import EPISODES, size_option
+from rover_lib.cli.prepare import size_option
 from rover_lib.onboard.cli import AS_JSON, FILE, LOG_DRIVE, open_view, show, sum_up, view_options
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import Output, PathTo, check_kind
+from rover_lib.onboard.kinds import Output, PathTo, check_kind, kinds_of
 from rover_lib.workshop.progress import terminal_bar
 
 SIZE = click.option(
@@ -19,44 +19,36 @@ SIZE = click.option(
 )
 
 
-@click.command("export-dataset", short_help="Write recordings as a LeRobotDataset v3.")
-@click.argument("episodes", type=EPISODES)
+@click.command("export-dataset", short_help="Write recordings, or a tub, as a LeRobotDataset v3.")
+@click.argument("recordings", type=FILE)
 @click.argument("out", type=FILE)
 @click.option("--video", is_flag=True, help="Write AV1 video: far smaller than images, but lossy [default: images].")
 @SIZE
+@click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a tub that drives forward by < 0.")
 @AS_JSON
-def export_dataset(episodes: Path, out: Path, as_json: bool, **options: Any) -> None:
-    """Write our recordings in EPISODES as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
+def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: bool, **options: Any) -> None:
+    """Write our RECORDINGS, or a donkeycar tub, as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
     lerobot-train trains at the size of the pictures: at the recorded size it takes 25 times as long as with sides a
     fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
     drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
+
+    A tub's steering and throttle become those of this machine's car (car.yml). Its deleted records and those at which a
+    pilot drove are left out, and episodes end where records are missing.
     """
     from rover_exchange.export_dataset import export_dataset as write
 
-    report = write(episodes, out, progress=terminal_bar(), **options)
-    _print_export(report, out, "exported", as_json)
+    source: Any = recordings
+    if "tub" in kinds_of(recordings):
+        from rover_exchange.tub import read_tub
+        from rover_lib.onboard.car.car import this_car
 
-
-@click.command("import", short_help="Write a donkeycar tub as a LeRobotDataset v3.")
-@click.argument("tub", type=PathTo("tub"))
-@click.argument("out", type=FILE)
-@SIZE
-@click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a car that drives forward by < 0.")
-@AS_JSON
-def import_tub(tub: Path, out: Path, size: tuple[int, int] | None, throttle: str | None, as_json: bool) -> None:
-    """Write the donkeycar tub in the folder TUB, of any age, as a LeRobotDataset v3 to the new folder OUT.
-
-    Steering and throttle become those of this machine's car (car.yml). Deleted records and those at which a pilot drove
-    are left out, and episodes end where records are missing. What was left out is printed, and kept in
-    OUT/rover_export.json.
-    """
-    from rover_exchange.export_dataset import export_dataset as write
-    from rover_exchange.tub import read_tub
-    from rover_lib.onboard.car.car import this_car
-
-    report = write(read_tub(tub, this_car(), terminal_bar(), throttle), out, size=size, progress=terminal_bar())
-    _print_export(report, out, "imported", as_json)
+        source = read_tub(recordings, this_car(), terminal_bar(), throttle)
+    elif throttle:
+        raise RoverError(f"{recordings}: --throttle is for donkeycar tubs", remedy="leave it out")
+    else:
+        check_kind(recordings, "recordings")
+    _print_export(write(source, out, progress=terminal_bar(), **options), out, "exported", as_json)
 
 
 def _print_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""Read a donkeycar tub as recordings, for `rover import`, which writes them as a LeRobotDataset.
+"""Read a donkeycar tub as recordings, for `rover export-dataset`, which writes them as a LeRobotDataset.
 
     recordings = read_tub("data/tub_1", this_car())
 

@@ -35,10 +35,12 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act as act_module
+from rover_lib.workshop import act_config
 from rover_lib.workshop.act import ActConfig, lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
@@ -164,7 +166,7 @@ def train(
         "split": p,
         "version": FULL_VERSION,
     }
-    sources = sys.modules[__name__], loop, preprocess, act_module, episodes_module
+    sources = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
     key = key_of(made_of, *(() if size == "full" and steps is None else sources))
     unfinished = cache_root() / f"training-{key}"
 

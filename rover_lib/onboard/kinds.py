@@ -87,7 +87,7 @@ def check_kind(path: Path | str, wanted: str) -> None:
         return
     refuse_part(path)
     if found[0] == "tub":
-        remedy = "rover import TUB OUT makes a LeRobotDataset of it"
+        remedy = "rover export-dataset TUB OUT makes a LeRobotDataset of it"
     raise KindError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 

@@ -185,7 +185,7 @@ def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatc
     root = tub(tmp_path / "tub", records(50), deleted=[25])
     (tmp_path / "car.yml").write_text(yaml_of(LEFT))
     monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
-    done = CliRunner().invoke(main, ["import", str(root), str(tmp_path / "dataset")])
+    done = CliRunner().invoke(main, ["export-dataset", str(root), str(tmp_path / "dataset")])
     assert done.exit_code == 0, done.output
     recordings = read_tub(root, LEFT)
     again = load_recordings(tmp_path / "dataset", chunk=2)
