@@ -67,7 +67,7 @@ class _Run:
         """Read a run's folder. Raises DistillError if it has no artifact."""
         artifact, counts = folder / ARTIFACT, None
         if not artifact.is_file():
-            raise DistillError(f"{artifact}: not there", remedy="'rover quantize' or 'rover run' makes it")
+            raise DistillError(f"{artifact}: not there", remedy="'rover run' makes it")
         if (folder / "arm.json").is_file():
             arm = read_stage(folder / "arm.json", "arm")
             row = arm["metrics"]["artifacts"].get(artifact.stem, {})
@@ -176,8 +176,7 @@ def _errors(
     """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
-        remedy = f"'rover quantize CHECKPOINT EPISODES --mode fp32 -o {reference}' makes it"
-        raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy=remedy)
+        raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
     taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
     return [errors_of(plans, taught, samples, recordings.action_range()) for plans in planned]

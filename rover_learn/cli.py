@@ -179,6 +179,6 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
     try:
         click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
     except KeyboardInterrupt:
-        click.echo("\nrover: stopped; the same command goes on where it was", err=True)
+        click.echo("\nrover: stopped; run it again to resume", err=True)
         raise click.exceptions.Exit(130) from None
     click.echo(f"next: rover run {output} {episodes.path} --name mine")

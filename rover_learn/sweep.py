@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,13 +136,17 @@ def _combinations(values: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         yield dict(zip(values, chosen, strict=True))
 
 
+def _distill() -> click.Command:
+    """Return `rover distill`, by its entry point: its module imports this one."""
+    (command,) = entry_points(group="rover.teach", name="distill")
+    return command.load()
+
+
 def _check_student(job: Job) -> None:
     """Raise ParamsError for an option that `rover distill` would refuse."""
-    from rover_learn.cli import distill
-
     if job.student:
         try:
-            distill.make_context("distill", job.distill_command())
+            _distill().make_context("distill", job.distill_command())
         except click.UsageError as error:
             raise ParamsError("a student of the sheet", found=error.format_message()) from None
 
@@ -157,7 +162,6 @@ def do(part: Callable[[Job, Path], None], job: Job, folder: Path, done: str) -> 
 
 def prepare(job: Job, folder: Path) -> None:
     """Teach the student, if the job has one, and make the run without its benchmark."""
-    from rover_learn.cli import distill
     from rover_lib.workshop.checkpoint.files import find_written
     from rover_lib.workshop.run.run import run
 
@@ -165,7 +169,7 @@ def prepare(job: Job, folder: Path) -> None:
     with _settings_of(job, folder):
         if job.student and not (folder / job.name / "distill.json").is_file():
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-                distill.main([*job.distill_command(), "--runs-dir", str(folder)], standalone_mode=False)
+                _distill().main([*job.distill_command(), "--runs-dir", str(folder)], standalone_mode=False)
         if job.student:
             checkpoint = find_written(folder / job.name)
         run(checkpoint, job.episodes, job.name, runs_dir=folder, timed=False, **job.notebooks)

@@ -110,6 +110,9 @@ def options_of(group: click.Command) -> set[str]:
 
 
 def refusal_of_make(words: list[str]) -> str:
+    """Say which target our Makefile lacks; another Makefile's (make -C) are not looked at."""
+    if "-C" in words:
+        return ""
     targets = set(" ".join(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.M)).split())
     return ", ".join(word for word in words if re.fullmatch(r"[a-z][a-z-]+", word) and word not in targets)
 

@@ -26,6 +26,7 @@ ONBOARD_NEEDS = {
     "numpy",
     "cv2",
     "simplejpeg",
+    "filelock",
     "serial",
     "yaml",
     "systemd_watchdog",

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 GATHERED = (
     "Makefile", "mkdocs.yml", "*.md", "docs", "pictures", "notebooks", "results", "params.yml", "lab/params.yml",
+    "ansible/roles/rover/meta/argument_specs.yml",
 )  # fmt: skip
 PACKAGES = ("rover_lib", "balloon_world")  # docs/api.md is made of their docstrings
 READMES = ("ansible/README.md", "firmware/README.md", "lab/README.md")

@@ -115,8 +115,8 @@ def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("rover_learn.train.train", interrupted)
-    result = rover("world", "train", tmp_path, tmp_path / "out.pth")
-    assert result.exit_code == 130 and "the same command goes on where it was" in result.output
+    result = rover("train", tmp_path, tmp_path / "out.pth")
+    assert result.exit_code == 130 and "resume" in result.output
 
 
 def test_debug_shows_the_traceback(tmp_path):

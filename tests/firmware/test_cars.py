@@ -6,7 +6,7 @@ from pathlib import Path
 import needs
 import pytest
 
-from lab.arduino.native import STEERING, THROTTLE, NativeArduino
+from lab.driving.native import STEERING, THROTTLE, NativeArduino
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.servo_link import State
 

@@ -4,7 +4,7 @@ import needs
 import pytest
 from test_vehicle import CAP_US, NEUTRAL, moved_after_ms
 
-from lab.arduino.native import STEERING, THROTTLE, NativeArduino
+from lab.driving.native import STEERING, THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State, frame
 
 pytestmark = needs.gcc

@@ -8,7 +8,7 @@ import itertools
 import needs
 import pytest
 
-from lab.arduino.native import THROTTLE, NativeArduino
+from lab.driving.native import THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State
 
 pytestmark = needs.gcc

@@ -8,7 +8,7 @@ import needs
 import pytest
 from click.testing import CliRunner
 
-from lab.arduino.native import NativeArduino
+from lab.driving.native import NativeArduino
 from rover_lib.onboard import cli
 from rover_lib.onboard.car import calibrate as module
 from rover_lib.onboard.car import car as car_module
