@@ -71,7 +71,7 @@ WRONG = [
     ("distill nothing.pth none --size 320 --name fast", "320x180"),
     ("world students runs/mine pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),
     # no device
-    ("drive policy_static.pt --dry-run --camera 99", "policy_static.pt: a record that no artifact has"),
+    ("drive policy_static.pt --dry-run --camera 99", "policy_static.pt: unknown record"),
     ("record out --port ttyNONE --camera 99", "99"),
     ("doctor --receiver --port ttyNONE", "ttyNONE"),
     # an output that would cost something else
