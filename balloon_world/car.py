@@ -35,7 +35,7 @@ from balloon_world.simulated_arduino import PinEvent
 from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 HOLD_S = 1.0
 STEPS_PER_S = 100  # steps of the physics a second, at least
@@ -200,17 +200,17 @@ class VirtualCar:
         """Start the process.
 
         board: 'module:function' that makes the car's Arduino in that process, with a port and pulses() as StandIn has.
-        Raises WorldError for numbers outside their ranges, or if the process does not start.
+        Raises TrainingError for numbers outside their ranges, or if the process does not start.
         """
         if seed < 0 or hold_s < 0:
-            raise WorldError("a car needs a seed and a hold from 0", found=f"{seed} and {hold_s}")
+            raise TrainingError("a car needs a seed and a hold from 0", found=f"{seed} and {hold_s}")
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
         self._talking, self._answers, self._asked = threading.Lock(), b"", 0
         options = {"seed": seed, "board": board, "hold_s": hold_s, "folder": str(self._folder), "parent": os.getpid()}
         command = (sys.executable, "-m", "balloon_world.car", json.dumps(options))
         env = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where the board's module is
-        self._process = Child("the virtual car", *command, error=WorldError, talks=True, env=env)
+        self._process = Child("the virtual car", *command, error=TrainingError, talks=True, env=env)
         self.pid = self._process.pid
         try:
             self.port: str = self._answer(START_S)["port"]
@@ -225,13 +225,13 @@ class VirtualCar:
         self.close()
 
     def check(self) -> None:
-        """Raise WorldError if the process has ended. Costs almost nothing."""
+        """Raise TrainingError if the process has ended. Costs almost nothing."""
         self._process.check()
 
     def report(self) -> CarReport:
         """Ask the process what the car has done so far, which takes up to a frame's time.
 
-        Raises WorldError if the process has ended or hangs.
+        Raises TrainingError if the process has ended or hangs.
         """
         with self._talking:
             self._asked += 1
@@ -263,7 +263,7 @@ class VirtualCar:
         while b"\n" not in self._answers:
             data = self._process.read(max(0.0, deadline - time.monotonic()))
             if not data:
-                raise WorldError(
+                raise TrainingError(
                     "the virtual car did not answer", found=f"{within_s:g} s", remedy="is it too busy here?"
                 )
             self._answers += data

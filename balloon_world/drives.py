@@ -27,7 +27,7 @@ from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.errors import DriveFault, WorldError
+from rover_lib.onboard.errors import DriveFault, TrainingError
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import plain
 from rover_lib.workshop.progress import Progress, silent
@@ -155,10 +155,10 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     policy: an artifact's Policy, or anything else with `rate_hz` and `predict_unclipped`. latency_s: from taking the
     newest frame to having its plan; with 0 the plan is there within the same tick. watch: called with every order when
     it is sent, before the car moves by it; if it returns true, somebody takes over and the drive ends after that tick.
-    Raises PolicyError for a plan that no car may be driven by, and WorldError for a latency that cannot be.
+    Raises PolicyError for a plan that no car may be driven by, and TrainingError for a latency that cannot be.
     """
     if not 0 <= latency_s <= LATENCY_MOST_S:
-        raise WorldError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=latency_s)
+        raise TrainingError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=latency_s)
     commanded = Commanded()
     car = TimedCar(world, policy, latency_s, commanded)
     pilot = WorldPilot(car, commanded, settings, policy.rate_hz, watch)

@@ -12,7 +12,7 @@ from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere,
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import find_stage, write_stage
 from rover_lib.workshop.judge.compare import GATED, gate
@@ -41,14 +41,14 @@ def measure_latencies(
     with LeRobot's temporal ensembling. shown_ms: for this latency, keep the world in which the drives with and without
     compensation differ most, with their plans.
     A drive.json that was made of the same policy and parameters is read, not made again.
-    Raises WorldError if there is no policy, no world or no latency.
+    Raises TrainingError if there is no policy, no world or no latency.
     """
     run_dir, p = Path(run_dir), params()
     artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
     if not artifact.is_file():
-        raise WorldError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
+        raise TrainingError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
     if not latencies_ms or worlds < 1:
-        raise WorldError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
+        raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     limit = p["gates"]["hits_lost_at_150_ms"]
     given = {
         "worlds": worlds,

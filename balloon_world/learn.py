@@ -36,7 +36,7 @@ from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
@@ -146,7 +146,7 @@ class Experiment:
     def __post_init__(self):
         if min(self.rounds, self.drives, self.worlds, self.other_worlds) < 1:
             found = f"{self.rounds}, {self.drives}, {self.worlds} and {self.other_worlds}"
-            raise WorldError("learning needs at least one round, drive and world", found=found)
+            raise TrainingError("learning needs at least one round, drive and world", found=found)
 
     def drive(self, policy: Policy, world: World, watch: Watch | None = None) -> Driven:
         return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch)
@@ -176,14 +176,14 @@ def run_experiment(
     run_dir: has best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: keeps what is
     recorded, learned and driven on the way; after an end at any moment, the same call goes on from there. A learn.json
     that was made from the same files and parameters is read, not made again.
-    Raises WorldError if the run lacks a file or out_dir belongs to another experiment.
+    Raises TrainingError if the run lacks a file or out_dir belongs to another experiment.
     """
     experiment = experiment or Experiment()
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
     path = run_dir / "learn.json"
     for name in (CHECKPOINT, EPISODES, ARTIFACT):
         if not (run_dir / name).exists():
-            raise WorldError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
+            raise TrainingError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
     how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
     given = plain(asdict(experiment) | how)
@@ -206,13 +206,13 @@ def read_experiment(run_dir: Path | str) -> dict[str, Any] | None:
 
 
 def _begin(out_dir: Path, made_of: dict[str, Any]) -> None:
-    """Note in out_dir which experiment it belongs to. Raises WorldError if it holds another one or something else."""
+    """Note in out_dir which experiment it belongs to. Raises TrainingError if it holds another one or other files."""
     path = out_dir / BEGUN
     if path.is_file() and json.loads(path.read_text()) == made_of:
         return
     if out_dir.is_dir() and any(out_dir.iterdir()):
         remedy = "remove it, or name another folder with --out"
-        raise WorldError(f"{out_dir}: exists, and is not of this experiment", remedy=remedy)
+        raise TrainingError(f"{out_dir}: exists, and is not of this experiment", remedy=remedy)
     out_dir.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(made_of, indent=2) + "\n")
@@ -235,7 +235,7 @@ class _Lab:
         human_s = sum(d["human_s"] for d in drives)
         if not human_s and number == 1:
             remedy = "drive more, later, or with more pushes"
-            raise WorldError(
+            raise TrainingError(
                 "nobody had to take over: there is nothing to learn from", found=len(drives), remedy=remedy
             )
         self._demonstrate(number, human_s)

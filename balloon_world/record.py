@@ -18,7 +18,7 @@ from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, exper
 from rover_lib.onboard.car import pwm as pwm_module
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.recording import episode as recording
 from rover_lib.onboard.recording.episode import SIMULATED, About, EpisodeWriter
 from rover_lib.workshop.cache import cache_folder, key_of
@@ -40,11 +40,11 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
 
     out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is.
     Returns out_dir. On one machine the same count and seed give the same bytes.
-    Raises WorldError for a count below 1, a negative seed, or an out_dir with something else in it.
+    Raises TrainingError for a count below 1, a negative seed, or an out_dir with something else in it.
     """
     out_dir = Path(out_dir)
     if count < 1 or seed < 0:
-        raise WorldError("a recording needs at least 1 episode and a seed from 0", found=f"{count} and {seed}")
+        raise TrainingError("a recording needs at least 1 episode and a seed from 0", found=f"{count} and {seed}")
     params = {
         "count": count,
         "seed": seed,
@@ -57,7 +57,7 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         if _marker_of(out_dir) == key:
             return out_dir
-        raise WorldError(
+        raise TrainingError(
             f"{out_dir}: exists and is not this recording", remedy="name another folder, or move it away first"
         )
     made = cache_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))

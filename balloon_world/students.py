@@ -24,7 +24,7 @@ from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy
@@ -64,10 +64,10 @@ class _Run:
 
     @classmethod
     def read(cls, folder: Path, name: str, shape: dict[str, Any]) -> "_Run":
-        """Read a run's folder. Raises DistillError if it has no artifact."""
+        """Read a run's folder. Raises TrainingError if it has no artifact."""
         artifact, counts = folder / ARTIFACT, None
         if not artifact.is_file():
-            raise DistillError(f"{artifact}: not there", remedy="'rover run' makes it")
+            raise TrainingError(f"{artifact}: not there", remedy="'rover run' makes it")
         if (folder / "arm.json").is_file():
             arm = read_stage(folder / "arm.json", "arm")
             row = arm["metrics"]["artifacts"].get(artifact.stem, {})
@@ -106,7 +106,7 @@ def judge_students(
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
     `run_trials`, and pushed at the latency computed for it. With 0 nobody drives, as there is no world for a real
     car's policy. held_out_frames: how many to judge with at most.
-    Raises DistillError for runs that do not belong together or lack a file, and whatever reading them raises.
+    Raises TrainingError for runs that do not belong together or lack a file, and whatever reading them raises.
     """
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
@@ -115,7 +115,7 @@ def judge_students(
     elif episodes:
         source = Source.of(episodes)
     else:
-        raise DistillError(f"{folder}: says nothing of its recordings", remedy="give --episodes")
+        raise TrainingError(f"{folder}: says nothing of its recordings", remedy="give --episodes")
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
     samples = pick_evenly(parts.held_out, held_out_frames)
@@ -153,20 +153,20 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
     """Read the teacher's run and its students', the teacher first, and check that they belong together."""
     names = [student.name for student in students]
     if not names or len({*names, TEACHER}) <= len(names):
-        raise DistillError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
+        raise TrainingError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     runs: list[_Run] = []
     for student in students:
         if not (student / "distill.json").is_file():
-            raise DistillError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
+            raise TrainingError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
         taught = read_stage(student / "distill.json", "distill")
         of_teacher, own = taught["metrics"]["students"]
         runs = runs or [_Run.read(folder, TEACHER, of_teacher)]
         runs.append(_Run.read(student, student.name, own))
         if runs[0].manifest["checkpoint"]["sha256"] not in taught["inputs"].values():
-            raise DistillError(f"{student}: is a student of another checkpoint than {folder / ARTIFACT} is made of")
+            raise TrainingError(f"{student}: is a student of another checkpoint than {folder / ARTIFACT} is made of")
         if runs[-1].manifest["checkpoint"]["sha256"] not in taught["metrics"]["files_sha256"].values():
             remedy = "'rover run' makes it anew"
-            raise DistillError(f"{student / ARTIFACT}: is not made of the student that was distilled", remedy=remedy)
+            raise TrainingError(f"{student / ARTIFACT}: is not made of the student that was distilled", remedy=remedy)
     return runs
 
 
@@ -176,7 +176,7 @@ def _errors(
     """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
     reference = folder / "policy_fp32.pt"
     if not reference.is_file():
-        raise DistillError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
+        raise TrainingError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
     taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
     return [errors_of(plans, taught, samples, recordings.action_range()) for plans in planned]

@@ -11,7 +11,7 @@ import numpy as np
 
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.progress import Progress, silent
 
 
@@ -67,10 +67,10 @@ class TrialReport:
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
     """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z).
 
-    Raises WorldError unless 0 <= hits <= trials and there is at least one trial.
+    Raises TrainingError unless 0 <= hits <= trials and there is at least one trial.
     """
     if not 0 <= hits <= trials or trials < 1:
-        raise WorldError("an interval needs 0 <= hits <= trials and a trial", found=f"{hits} of {trials}")
+        raise TrainingError("an interval needs 0 <= hits <= trials and a trial", found=f"{hits} of {trials}")
     share = hits / trials
     centre = share + z * z / (2 * trials)
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
@@ -92,12 +92,12 @@ def run_trials(
     replan_every: how many actions of each chunk are driven before the policy sees the next frame. Its state is the
     action commanded before, neutral at the start. keep_frames: how many (frame_bgr, state) pairs to keep at most; they
     are spread evenly over all that the policy was shown.
-    Raises WorldError for parameters outside their ranges, or if a plan's shape is wrong or its actions are not finite.
+    Raises TrainingError for parameters outside their ranges, a plan of a wrong shape, or actions that are not finite.
     """
     if worlds < 1 or seed < 0 or keep_frames < 0:
-        raise WorldError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
+        raise TrainingError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
     if not 1 <= replan_every <= policy.chunk:
-        raise WorldError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk", found=replan_every)
+        raise TrainingError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk", found=replan_every)
     seeds = range(seed, seed + worlds)
     results: list[WorldResult] = []
     seen: list[tuple[np.ndarray, np.ndarray]] = []
@@ -139,7 +139,7 @@ def _drive(policy: Any, world: World, replan_every: int) -> tuple[WorldResult, l
         pairs.append((frame, state))
         chunk = np.asarray(policy.predict_chunk(frame, state))
         if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
-            raise WorldError(
+            raise TrainingError(
                 "the policy must plan finite (steps, 2) actions", found=f"{chunk.shape} in world {world.seed}"
             )
         for steering, throttle in chunk[:replan_every]:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 _CAR = this_car()  # its wheelbase, focal length and limits of the throttle are used here
 
@@ -114,7 +114,7 @@ class World:
     def __init__(self, seed: int, shoves: int = 0, decoys: int = 0, left: int | None = None):
         if min(seed, shoves, decoys) < 0:
             found = f"{seed}, {shoves} and {decoys}"
-            raise WorldError("a world's seed, shoves and decoys must not be negative", found=found)
+            raise TrainingError("a world's seed, shoves and decoys must not be negative", found=found)
         self.seed = seed
         self.left = left or _CAR.left
         rng = np.random.default_rng([seed, 20_251])
@@ -150,13 +150,13 @@ class World:
         return self.outcome is not None
 
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
-        """Drive for dt seconds. Raises WorldError for an action outside its range, or if the drive has ended."""
+        """Drive for dt seconds. Raises TrainingError for an action outside its range, or if the drive has ended."""
         (_, least), _ = _CAR.limits
         if not (-1 <= steering <= 1 and least <= throttle <= 1):
             found = f"({steering}, {throttle})"
-            raise WorldError(f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=found)
+            raise TrainingError(f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=found)
         if self.done:
-            raise WorldError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
+            raise TrainingError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state
         wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
         wanted = throttle * SPEED_PER_THROTTLE_MPS

@@ -15,10 +15,6 @@ from rover_lib.workshop.run_program import run
 NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
 
 
-class DebianError(RoverError):
-    """Debian packages are needed but cannot be had."""
-
-
 def missing_packages(needs: Mapping[str, str]) -> list[str]:
     """Return which of these Debian packages this machine lacks.
 
@@ -41,17 +37,17 @@ def which(command: str) -> str | None:
 def install_packages(packages: Sequence[str], what: str) -> None:
     """Install Debian packages, if there are any to install. what: the thing that needs them, for the error.
 
-    Raises DebianError with the command to type if this is not root, or with apt-get's last lines if it fails.
+    Raises RoverError with the command to type if this is not root, or with apt-get's last lines if it fails.
     """
     if not packages:
         return
     command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
     if os.geteuid() != 0 or not shutil.which("apt-get"):
         missing = f"{what} needs the Debian packages {' '.join(packages)}, which are not here"
-        raise DebianError(missing, remedy=f"sudo {' '.join(command)}")
+        raise RoverError(missing, remedy=f"sudo {' '.join(command)}")
     print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
-    run("apt-get", "update", "--quiet", error=DebianError)
-    run(*command, error=DebianError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
+    run("apt-get", "update", "--quiet", error=RoverError)
+    run(*command, error=RoverError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
 
 
 def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
@@ -59,7 +55,7 @@ def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None
 
     Nothing on this machine is changed: apt uses its sources and keys, but its own lists, cache and status in the
     folder. packages: names, or apt's patterns. installed: the root of a system whose packages are left out. Raises
-    DebianError if the packages cannot be had.
+    RoverError if the packages cannot be had.
     """
     for subfolder in ("lists/partial", "archives/partial"):
         (folder / subfolder).mkdir(parents=True)
@@ -81,13 +77,13 @@ def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None
         "Debug::NoLocking": "true",
     }
     apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
-    run(*apt, "update", error=DebianError, remedy=NO_DEBIAN)
+    run(*apt, "update", error=RoverError, remedy=NO_DEBIAN)
     download = ["install", "--yes", "--download-only", "--no-install-recommends", *packages]
-    run(*apt, *download, error=DebianError, remedy=NO_DEBIAN)
+    run(*apt, *download, error=RoverError, remedy=NO_DEBIAN)
     return sorted((folder / "archives").glob("*.deb"))
 
 
 def unpack_packages(packages: Iterable[Path], folder: Path) -> None:
-    """Unpack the files of .deb packages into a folder without installing them. Raises DebianError."""
+    """Unpack the files of .deb packages into a folder without installing them. Raises RoverError."""
     for package in packages:
-        run("dpkg", "--extract", package, folder, error=DebianError, remedy=NO_DEBIAN)
+        run("dpkg", "--extract", package, folder, error=RoverError, remedy=NO_DEBIAN)

@@ -32,7 +32,7 @@ from rover_learn.phases import Recipe, Work, free_folder, make_run
 from rover_learn.student import StudentShape, gmac, initial_weights, student_config
 from rover_learn.training import Resumable
 from rover_lib.onboard.columns import align
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.stage import write_stage
@@ -66,7 +66,7 @@ class DistillRecipe(Recipe):
     absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
     """
 
-    SECTION, ERROR, PHASES = "distill", DistillError, ("backbone", "transformer", "together", "qat")
+    SECTION, ERROR, PHASES = "distill", TrainingError, ("backbone", "transformer", "together", "qat")
 
     backbone_steps: int
     transformer_steps: int
@@ -80,7 +80,7 @@ class DistillRecipe(Recipe):
     def __post_init__(self):
         super().__post_init__()
         if not self.to_teacher + self.to_recorded > 0:
-            raise DistillError("to_teacher and to_recorded are both 0", remedy="a student learns from one of them")
+            raise TrainingError("to_teacher and to_recorded are both 0", remedy="a student learns from one of them")
 
 
 def phases_of(shape: StudentShape, qat: bool) -> list[str]:
@@ -108,10 +108,10 @@ def distill(
     recipe: params.yml's if None. qat: quantization-aware training at the end; then the student may have its
     teacher's own shape, and that is all that is done. device: 'cpu', 'cuda' or None for the best there is.
     Ended at any moment and started again with the same arguments, it goes on and gives the same student. The folder
-    appears only when it is complete. Raises DistillError for a student, a device or recordings that cannot be, and for
+    appears only when it is complete. Raises TrainingError for a student, a device or recordings that cannot be, and for
     a run that is there; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes it.
     """
-    folder, where = free_folder(runs_dir, name, DistillError), training_device(device, DistillError)
+    folder, where = free_folder(runs_dir, name, TrainingError), training_device(device, TrainingError)
     recipe = recipe or DistillRecipe.of(params())
     opened = load(checkpoint, episodes, progress)
     config = student_config(opened.checkpoint, shape)
@@ -120,8 +120,8 @@ def distill(
     work = _Work(origin=opened.checkpoint, recipe=recipe, device=where, progress=progress, **given)
     if work.is_teacher and not qat:
         remedy = "give it a smaller picture, fewer layers or channels, or train it for INT8 with --qat"
-        raise DistillError("this student would be its teacher", remedy=remedy)
-    with make_run(folder, config, DistillError) as new:
+        raise TrainingError("this student would be its teacher", remedy=remedy)
+    with make_run(folder, config, TrainingError) as new:
         taught = _teach(work)
         _leave(new, name, work, taught)
     shutil.rmtree(taught.folder, ignore_errors=True)  # who learns the same under another name may have removed it
@@ -193,7 +193,7 @@ def _teach(work: _Work) -> _Taught:
         lessons = Lessons.open(folder, samples, work.config, work.origin, work.rng("states"))
         lessons.ask(saved, work.origin, work.rng("teacher"), work.device)
         remedy = "give recordings of the car and the camera that it was trained for"
-        lessons.refuse_stranger(work.origin, work.ranges(), DistillError, "these", remedy)
+        lessons.refuse_stranger(work.origin, work.ranges(), TrainingError, "these", remedy)
         backbone = _train_backbone(work, lessons, saved)
         losses = dict(saved.losses)
     with Resumable(own, work.progress) as saved:

@@ -33,7 +33,7 @@ from rover_learn.phases import Recipe, Work, free_folder, make_run
 from rover_learn.student import not_a_cars
 from rover_learn.training import Resumable
 from rover_lib.onboard.car.picture import is_squeezed
-from rover_lib.onboard.errors import FinetuneError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.recording.episode import HUMAN
@@ -56,7 +56,7 @@ DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonst
 class FinetuneRecipe(Recipe):
     """How a policy goes on learning: the section `finetune` of params.yml, which explains each number."""
 
-    SECTION, ERROR, PHASES = "finetune", FinetuneError, ("transformer", "together")
+    SECTION, ERROR, PHASES = "finetune", TrainingError, ("transformer", "together")
 
     transformer_steps: int
     together_steps: int
@@ -83,14 +83,14 @@ def finetune(
     params.yml. device: 'cpu', 'cuda', or None for the best that there is.
 
     If it is ended at any moment and started again with the same arguments, it goes on and gives the same policy. The
-    folder appears only when it is complete. Raises FinetuneError for a name, a device or recordings that cannot be
+    folder appears only when it is complete. Raises TrainingError for a name, a device or recordings that cannot be
     used; CheckpointError, EpisodeError, TrainingError; RoverError while another process makes a run of that name.
     """
-    folder, where = free_folder(runs_dir, name, FinetuneError), training_device(device, FinetuneError)
+    folder, where = free_folder(runs_dir, name, TrainingError), training_device(device, TrainingError)
     recipe = recipe or FinetuneRecipe.of(params())
     parent, material = _open_work(checkpoint, episodes, recipe, progress)
     work = _Work(origin=parent, material=material, recipe=recipe, device=where, progress=progress)
-    with make_run(folder, parent.config, FinetuneError) as new:
+    with make_run(folder, parent.config, TrainingError) as new:
         weights, losses, unfinished = _train_phases(work)
         _leave(new, name, work, weights, losses)
     shutil.rmtree(unfinished, ignore_errors=True)  # a process that learns the same may have removed it already
@@ -159,21 +159,21 @@ def _open_work(
     """Read the checkpoint and the recordings, and check that they belong together."""
     if str(checkpoint).endswith((".pt", ".onnx.zip")):
         remedy = "give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder"
-        raise FinetuneError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
+        raise TrainingError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
     parent = load_checkpoint(checkpoint)
     _refuse_no_car(parent)
     check_sizes(parent)
     sources = [Source.of(each) for each in episodes]
     if not sources:
-        raise FinetuneError("there are no recordings to learn from", remedy="give the old ones, then the new ones")
+        raise TrainingError("there are no recordings to learn from", remedy="give the old ones, then the new ones")
     places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
     if len(set(places)) < len(places):
-        raise FinetuneError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
+        raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     p = params()["calibration"]
     read = [load_recordings(source, parent.config.chunk, p["sync_s"], progress) for source in sources]
     policies = [parent.recorded_as(recordings.layout) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
-        raise FinetuneError("the recordings name, order or time states and actions differently", found=places)
+        raise TrainingError("the recordings name, order or time states and actions differently", found=places)
     _refuse_no_car(policies[0])
     _refuse_unlike(read, policies[0].config.rate_hz)
     return policies[0], _part_episodes(read, recipe)
@@ -186,7 +186,7 @@ def _part_episodes(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Mater
     new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
     if not new:
         remedy = "give the new recordings too, after the old ones"
-        raise FinetuneError(f"{read[0].root}: no new episode: in none of them a policy drove", remedy=remedy)
+        raise TrainingError(f"{read[0].root}: no new episode: in none of them a policy drove", remedy=remedy)
     taught: list[tuple[str, tuple[Sample, ...]]] = []
     held_out = []
     if old:
@@ -198,7 +198,7 @@ def _part_episodes(read: Sequence[Recordings], recipe: FinetuneRecipe) -> _Mater
     driven = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
     if not driven:
         remedy = "a policy cannot learn from its own drives: take over where it drives wrong"
-        raise FinetuneError("no human drove in the new episodes", found=len(new), remedy=remedy)
+        raise TrainingError("no human drove in the new episodes", found=len(new), remedy=remedy)
     count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
     judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
     held_out += [_HeldOut(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
@@ -227,11 +227,11 @@ def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) ->
 def _refuse_no_car(policy: Checkpoint) -> None:
     if found := not_a_cars(policy.config):
         remedy = "if it is of one camera, steering and throttle, name them so in the dataset's meta/info.json"
-        raise FinetuneError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
+        raise TrainingError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
 
 
 def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
-    """Raise FinetuneError for recordings of another car, camera or rate than the first's, or the policy's plans."""
+    """Raise TrainingError for recordings of another car, camera or rate than the first's, or the policy's plans."""
     shapes = [r.episodes[0].samples[0].frame_bgr().shape[1::-1] for r in read]  # all pictures of a set have one
     for recordings, (width, height) in zip(read, shapes, strict=True):
         what = ""
@@ -245,7 +245,7 @@ def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
                 what, found = "another rate", f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan"
         if what:
             remedy = f"give recordings of one car, one camera and {plans_hz:g} Hz; in the dark, a camera is slower"
-            raise FinetuneError(f"{recordings.root}: was recorded with {what}", found=found, remedy=remedy)
+            raise TrainingError(f"{recordings.root}: was recorded with {what}", found=found, remedy=remedy)
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ def _train_phases(work: _Work) -> tuple[dict[str, Tensor], dict[str, list[float]
         every.append((kind, lessons))
         if kind == DEMONSTRATIONS:
             remedy = "give first the recordings that it was trained on"
-            lessons.refuse_stranger(parent, ranges, FinetuneError, "the old", remedy)
+            lessons.refuse_stranger(parent, ranges, TrainingError, "the old", remedy)
     whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
     own = cache_root() / f"finetune-{key_of(whole, sys.modules[__name__], *sources)}"
     weights = np.concatenate([_weights(recipe, kind, each, units) for kind, each in every])

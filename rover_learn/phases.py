@@ -1,7 +1,7 @@
 """What distilling and finetuning share: a recipe of checked numbers, the phases, and what they leave.
 
 recipe = DistillRecipe.of(params(), steps=200)
-with make_run(folder, config, DistillError) as new:
+with make_run(folder, config, TrainingError) as new:
     work.train_policy(saved, policy, pool, loss, seen="maps", slower=10)
     hashes = work.write_policy(new, name, config, weights, error, "episodes")
 """

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from rover_learn.refit import Gram, refit_layer
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, expected_shapes, multiply_accumulates
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
@@ -45,28 +45,28 @@ class StudentShape:
 def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     """Return the student's config.
 
-    Raises DistillError for a student that exceeds its teacher in anything, for a backbone whose channels cannot be left
-    out, and for a teacher that cannot teach from a car's recordings; CheckpointError for an image size at which the
-    teacher's weights do not run.
+    Raises TrainingError for a student that exceeds its teacher in anything, for a backbone whose channels cannot be
+    left out, and for a teacher that cannot teach from a car's recordings; CheckpointError for an image size at which
+    the teacher's weights do not run.
     """
     c = teacher.config
     if found := not_a_cars(c):
         remedy = "if it is of one camera, steering and throttle, say which number is what: --action-names"
-        raise DistillError(f"{teacher.path}: is not a car's policy", found=found, remedy=remedy)
+        raise TrainingError(f"{teacher.path}: is not a car's policy", found=found, remedy=remedy)
     ((height, width),) = c.image_sizes
     own = (shape.height, shape.width, shape.decoder_layers, shape.feedforward)
     teachers = (height, width, c.decoder_layers, c.feedforward)
     for name, value, most in zip(("height", "width", "decoder layers", "feed-forward"), own, teachers, strict=True):
         if value is not None and not 1 <= value <= most:
             remedy = "a student is a part of its teacher; train a larger policy on recordings instead"
-            raise DistillError(
+            raise TrainingError(
                 f"a student's {name} must be from 1 to its teacher's, {most}", found=value, remedy=remedy
             )
     if (share := shape.backbone_channels) is not None:
         if not 0 < share <= 1:
-            raise DistillError("the share of the backbone's channels must be above 0, at most 1", found=share)
+            raise TrainingError("the share of the backbone's channels must be above 0, at most 1", found=share)
         if BACKBONES[c.backbone][0] != "basic":
-            raise DistillError("channels can be left out of ResNets of basic blocks only", found=c.backbone)
+            raise TrainingError("channels can be left out of ResNets of basic blocks only", found=c.backbone)
     smaller = teacher.at_size(shape.height or height, shape.width or width).config
     return replace(
         smaller,
@@ -147,7 +147,7 @@ def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor
         for x in inputs:
             model(*x)
     if not grams:
-        raise DistillError("choosing units needs frames", found="none", remedy="record more episodes")
+        raise TrainingError("choosing units needs frames", found="none", remedy="record more episodes")
     return {name: gram.mean() for name, gram in grams.items()}
 
 

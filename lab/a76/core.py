@@ -76,10 +76,6 @@ WAITING = 6  # by the clock the silence may be that many times longer, as the ma
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")])
 
 
-class CountError(RoverError):
-    """Instructions cannot be counted: there is no emulated core, a program failed on it, or the run is unfit."""
-
-
 # --- preparing --------------------------------------------------------------------------------------------------------
 
 
@@ -94,7 +90,7 @@ class Core:
 def prepare(progress: Progress = silent) -> Core:
     """Return everything that counting needs, from the cache or made now, which takes about half a minute.
 
-    Missing Debian packages are installed if this runs as root. Raises CountError or DebianError if anything cannot be
+    Missing Debian packages are installed if this runs as root. Raises RoverError if anything cannot be
     had.
     """
     steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, _userland)
@@ -107,7 +103,7 @@ def build_plugin() -> Path:
 
     def make(folder: Path) -> None:
         # The emulator's functions need no library here: they are resolved when it loads the plugin.
-        run("gcc", "-O3", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=CountError)
+        run("gcc", "-O3", "-Wall", "-shared", "-fPIC", "-o", folder / "count.so", PLUGIN, error=RoverError)
 
     return cache_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
@@ -131,21 +127,21 @@ def _make_userland(root: Path) -> None:
     # This proves that the packages work, and leaves the bytecode of everything that they import. To compile that takes
     # a third of a minute in the emulator.
     imports = [_python(root), "-c", "import torch, cv2, serial"]
-    run(*_qemu(root), *imports, error=CountError, env=_environment(root, root))
+    run(*_qemu(root), *imports, error=RoverError, env=_environment(root, root))
 
 
 def fetch_wheels(folder: Path, *what: object) -> None:
     """Fetch Python packages into a folder with uv, without installing them. what: packages, and further options of uv.
 
-    Dependencies are not fetched, so `what` must name them all. Raises CountError if they cannot be had.
+    Dependencies are not fetched, so `what` must name them all. Raises RoverError if they cannot be had.
     """
     beside = Path(sys.executable).parent / "uv"
     uv = str(beside) if beside.is_file() else shutil.which("uv")
     if not uv:
-        raise CountError("no uv to fetch Python packages with", remedy="pip install uv ('make count' has it)")
+        raise RoverError("no uv to fetch Python packages with", remedy="pip install uv ('make count' has it)")
     options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
     remedy = f"is the index within reach that has {' '.join(map(str, what))}?"
-    run(uv, "pip", "install", *options, *what, error=CountError, remedy=remedy)
+    run(uv, "pip", "install", *options, *what, error=RoverError, remedy=remedy)
 
 
 def _qemu(root: Path) -> list[str]:
@@ -245,7 +241,7 @@ def emulate(
 
     folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. stop: ends the
     program when set. watch: "memory=SECTION", see guest/count.c.
-    Raises CountError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
+    Raises RoverError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
     Whatever ends this function also ends the emulator.
     """
     plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
@@ -261,7 +257,7 @@ def emulate(
                 cwd=folder,
             )
         except OSError as e:
-            raise CountError(f"the emulator does not start: {e}") from None
+            raise RoverError(f"the emulator does not start: {e}") from None
     watched = _Watched(process.pid)
     assert process.stdout  # a pipe
     try:
@@ -273,7 +269,7 @@ def emulate(
         process.stdout.close()
     if code:
         end = last_words((folder / "stderr").read_text(errors="replace"))
-        raise CountError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
+        raise RoverError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
     sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
     more = {int(f.stem): np.fromfile(f, "<u8") for f in folder.glob("*.more")}
     return Emulation(sections, more, dict(watched.peak_mb), watched.emulator_mb)
@@ -307,13 +303,13 @@ def _read_to_the_end(stdout: IO[bytes], watched: _Watched, on_line: Callable[[st
         while True:
             ready = readable.select(SAMPLE_S)
             if stop.is_set():
-                raise CountError("stopped, because another count failed")
+                raise RoverError("stopped, because another count failed")
             watched.sample()
             if not ready:
                 silent_s = max(_cpu_s(watched.pid) - last_cpu_s, (time.monotonic() - last_s) / WAITING)
                 if silent_s > SILENCE_S:
                     after = watched.step or "its start"
-                    raise CountError(f"the emulated program printed nothing for {SILENCE_S} s after {after}")
+                    raise RoverError(f"the emulated program printed nothing for {SILENCE_S} s after {after}")
                 continue
             last_s, last_cpu_s = time.monotonic(), _cpu_s(watched.pid)
             content = os.read(stdout.fileno(), 65536)

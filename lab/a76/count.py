@@ -106,7 +106,7 @@ def count_artifact(
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
     samples: have frame_bgr() and state. If there are fewer than `counted`, which must be at least STEADY, they are
-    repeated from the first. on_step: called after each inference. stop: ends the count when set. Raises CountError with
+    repeated from the first. on_step: called after each inference. stop: ends the count when set. Raises RoverError with
     the last lines that the guest printed, if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from lab.a76.core import A76, Core, CountError, prepare
+from lab.a76.core import A76, Core, prepare
 from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, guest_of, side_by_side
 from lab.a76.report import LABEL, artifact_metrics, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.recorded_range import pct_of_range
@@ -56,20 +57,20 @@ def count_run(
     equal this machine's within the parity vectors' tolerance. An artifact without an FP32 of its image size is only
     counted.
     jobs: how many artifacts are counted at a time, each in one thread and below 1 GB; this machine's cores if None.
-    Raises CountError, or what reading the run raises.
+    Raises RoverError, or what reading the run raises.
     """
     run_dir = Path(run_dir)
     files = [*run_dir.glob("policy_*.pt"), *run_dir.glob(f"policy_*{ONNX_SUFFIX}")]
     artifacts = {p.stem: p for p in sorted(files)}
     if REFERENCE not in artifacts:
-        raise CountError(
+        raise RoverError(
             f"{run_dir}: no {REFERENCE}.pt in it", found=sorted(artifacts), remedy="'rover run' makes a run"
         )
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
-        raise CountError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
+        raise RoverError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
     core = prepare(progress)
     plans = plans_of(manifests, len(samples))
     counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
@@ -81,7 +82,7 @@ def count_run(
         metrics["note"] = note
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
-    given["qemu"] = run("qemu-aarch64", "--version", error=CountError).splitlines()[0]
+    given["qemu"] = run("qemu-aarch64", "--version", error=RoverError).splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
     return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
 
@@ -136,7 +137,7 @@ def _judge(
 ) -> dict[str, dict[str, Any]]:
     """Judge the predictions of each artifact that has a reference; return the rows for arm.json.
 
-    Raises CountError if an FP32 artifact predicts something else in the emulated Pi than on this machine.
+    Raises RoverError if an FP32 artifact predicts something else in the emulated Pi than on this machine.
     """
     rows: dict[str, dict[str, Any]] = {}
     ranges = again.recordings.action_range()
@@ -147,7 +148,7 @@ def _judge(
         tolerance = read_manifest(artifacts[reference])["parity"]["tolerance"]
         names = again.checkpoint.config.action_names
         if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
-            raise CountError(
+            raise RoverError(
                 f"{artifacts[reference]}: differs by {difference:.2g} on the core", remedy="quantize again"
             )
         for stem in (stem for stem, plan in plans.items() if plan.reference == reference):

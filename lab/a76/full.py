@@ -11,7 +11,7 @@ from typing import Any
 from balloon_world.record import record_episodes
 from rover_learn.train import train
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
@@ -61,12 +61,12 @@ def full_run(
     policy_fp32.onnx.zip and policy_static.onnx.zip. For each of `sizes` it leaves calibration_<height>x<width>.pt,
     policy_fp32_<height>x<width>.pt and policy_static_<height>x<width>.pt.
     load.json says whether the policy can drive. Recordings and checkpoint come from the cache if they were made before.
-    Raises WorldError if run_dir holds another kind of run, and whatever the steps raise.
+    Raises TrainingError if run_dir holds another kind of run, and whatever the steps raise.
     """
     run_dir = Path(run_dir).resolve()
     note = NOTE if steps else LEARNED_NOTE
     if (run_dir / "load.json").exists() and read_stage(run_dir / "load.json", "load")["metrics"].get("note") != note:
-        raise WorldError(
+        raise TrainingError(
             f"{run_dir}: holds a run on another checkpoint", remedy="name another folder, or move it away first"
         )
     for name in ("quantize.json", LAST):

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from lab.a76.core import FOR_GUEST, GUEST, CountError, fetch_wheels, prepare
+from lab.a76.core import FOR_GUEST, GUEST, fetch_wheels, prepare
 from lab.a76.count import COUNTED, Counted, Guest, count_artifact, side_by_side
 from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
 from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
@@ -131,7 +132,7 @@ def _compile(folder: Path) -> None:
     # Kernels and backends register themselves when they are loaded; nothing refers to them by name.
     libraries = ("", "_backend_xnnpack", "_kernels_optimized", "_kernels_quantized", "_threadpool")
     command += ["-Wl,--no-as-needed", *(f"-lexecutorch{name}" for name in libraries)]
-    run(*command, error=CountError)
+    run(*command, error=RoverError)
 
 
 # --- the engines' forms of the policy ---------------------------------------------------------------------------------
@@ -151,7 +152,7 @@ class Made:
 def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
     """Quantize the policy with an engine's own tools into `folder`.
 
-    samples: for calibration. Raises CountError if the tools fail, or if they leave a layer in float that is INT8 in our
+    samples: for calibration. Raises RoverError if the tools fail, or if they leave a layer in float that is INT8 in our
     artifact.
     """
     folder.mkdir(exist_ok=True)
@@ -164,7 +165,7 @@ def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Samp
         environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
         command = [sys.executable, engine.maker, checkpoint.path.resolve(), calibration, temporary]
         remedy = f"{engine.name}'s tools were to quantize {checkpoint.path}"
-        printed = run(*command, error=CountError, remedy=remedy, env=environment)
+        printed = run(*command, error=RoverError, remedy=remedy, env=environment)
         made = json.loads(printed.splitlines()[-1])
         check_int8(engine.name, made, int8_layers(checkpoint))
     return Made(artifact, made)
@@ -178,10 +179,10 @@ def int8_layers(checkpoint: Checkpoint) -> int:
 
 
 def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
-    """Raise CountError unless a peer has as many INT8 layers as ours, since tools have silently left some in float."""
+    """Raise RoverError unless a peer has as many INT8 layers as ours, since tools have silently left some in float."""
     if made["int8_layers"] != expected:
         what = f"{name}: {made['int8_layers']} convolutions and linears became INT8, and {expected} in ours"
-        raise CountError(f"{what}; float are {made['float_layers'][:5]}")
+        raise RoverError(f"{what}; float are {made['float_layers'][:5]}")
 
 
 # --- counting ---------------------------------------------------------------------------------------------------------
@@ -201,7 +202,7 @@ def count_peers(
     artifact, `torch_affine` repeat a row whose name is in `artifact`. The others also have `int8_layers` and
     `made_with`, the versions of their tools. A peer's chunks come from the emulated Pi, the reference from this
     machine, whose FP32 count_run has compared with the Pi's. What the engines make is kept in run_dir/peers.
-    frames: how many held-out frames to judge with. jobs: how many machines are emulated at a time. Raises CountError if
+    frames: how many held-out frames to judge with. jobs: how many machines are emulated at a time. Raises RoverError if
     arm.json is missing or was counted from other artifacts, or if a peer cannot be had, made or run.
     """
     run_dir = Path(run_dir)
@@ -250,14 +251,14 @@ def file_mb(path: Path) -> float:
 
 
 def open_counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
-    """Return a run's arm.json and its FP32 artifact. Raises CountError unless the one was counted from the other."""
+    """Return a run's arm.json and its FP32 artifact. Raises RoverError unless the one was counted from the other."""
     path, reference = run_dir / "arm.json", run_dir / f"{REFERENCE}.pt"
     remedy = f"count the run's own artifacts first ('python -m lab arm {run_dir}')"
     if not path.exists():
-        raise CountError(f"{path}: not found", remedy=remedy)
+        raise RoverError(f"{path}: not found", remedy=remedy)
     content = read_stage(path, "arm")
     if not reference.exists() or content["inputs"].get(reference.name) != sha256_of(reference):
-        raise CountError(f"{path}: counted from another {reference.name}", remedy=remedy)
+        raise RoverError(f"{path}: counted from another {reference.name}", remedy=remedy)
     return content, reference
 
 
@@ -266,12 +267,12 @@ def peer_metrics(
 ) -> dict[str, Any]:
     """Return one peer's part of arm.json. manifest: of our FP32 artifact. reference: that artifact's chunks, (n, C, A).
 
-    Raises CountError if the peer's chunks have another shape or are not finite.
+    Raises RoverError if the peer's chunks have another shape or are not finite.
     """
     if counted.chunks.shape != reference.shape:
-        raise CountError(f"a peer gave no actions of {reference.shape}", found=counted.chunks.shape)
+        raise RoverError(f"a peer gave no actions of {reference.shape}", found=counted.chunks.shape)
     if not np.isfinite(counted.chunks).all():
-        raise CountError("a peer gave actions that are not finite")
+        raise RoverError("a peer gave actions that are not finite")
     names = manifest["action_names"]
     low, high = action_limits(names, car_of(manifest))
     errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips

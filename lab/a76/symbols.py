@@ -10,7 +10,7 @@ import numpy as np
 from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
 
-from lab.a76.core import CountError
+from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
 KERNELS = 30  # how many are named in the report; the rest are summed up
@@ -23,7 +23,7 @@ FUNCTIONS = (0, 2, 10)  # symbol types none (assembly), function, indirect funct
 
 
 class Functions:
-    """The functions of an ELF file, by address. Raises CountError if the file is not a 64-bit ELF file."""
+    """The functions of an ELF file, by address. Raises RoverError if the file is not a 64-bit ELF file."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -33,7 +33,7 @@ class Functions:
                 if elf.elfclass != 64:
                     raise ELFError("of 32 bits")
             except ELFError as e:
-                raise CountError(f"{path}: not a 64-bit ELF file", found=e) from None
+                raise RoverError(f"{path}: not a 64-bit ELF file", found=e) from None
             # The address of the first loaded segment. A mapping of the file starts there, which shows where it was put.
             self.base = min((s["p_vaddr"] & ~0xFFF for s in elf.iter_segments("PT_LOAD")), default=0)
             whole = elf.get_section_by_name(".symtab")
@@ -100,7 +100,7 @@ def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dic
             name = f"{name} loops with SDOT"
         _add(executed[name], [entered * count for count in counts])
     mangled = sorted(executed, key=lambda n: -executed[n][0])
-    plain = run("c++filt", "--no-params", error=CountError, input="\n".join(mangled)).splitlines()
+    plain = run("c++filt", "--no-params", error=RoverError, input="\n".join(mangled)).splitlines()
     merged: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     for i, (name, demangled) in enumerate(zip(mangled, plain, strict=True)):
         _add(merged[_short(demangled) if i < at_most else "other"], executed[name])

@@ -44,10 +44,6 @@ START_S = 10.0
 NICE = -10  # a real Arduino has a processor of its own
 
 
-class ArduinoError(RoverError):
-    """The emulated Arduino cannot be built or started, or it has ended."""
-
-
 class Built(NamedTuple):
     """The firmware's ELF file, as it is flashed, and the program that is the emulated Arduino."""
 
@@ -66,18 +62,16 @@ def build(human: str = "receiver") -> Built:
 
     human: as in `make -C firmware HUMAN=gamepad`.
 
-    Raises ArduinoError if Debian packages or the repository's sources are missing, or if the compiler fails.
+    Raises RoverError if Debian packages or the repository's sources are missing, or if the compiler fails.
     """
     if missing := " ".join(missing_packages()):
-        raise ArduinoError(
+        raise RoverError(
             f"the emulated Arduino needs the Debian packages {missing}, which are not here",
             remedy=f"sudo apt-get install --no-install-recommends {missing}",
         )
     sources = [EMULATOR, FIRMWARE / "Makefile", *sorted(p for p in (FIRMWARE / "rover").glob("*") if p.is_file())]
     if not all(source.is_file() for source in sources):
-        raise ArduinoError(
-            f"no firmware in {FIRMWARE}", remedy="the emulated Arduino needs a checkout of the repository"
-        )
+        raise RoverError(f"no firmware in {FIRMWARE}", remedy="the emulated Arduino needs a checkout of the repository")
 
     def make(folder: Path) -> None:
         compile_c("make", "-C", FIRMWARE, f"HUMAN={human}", f"BUILD={folder}/firmware")
@@ -90,18 +84,18 @@ def build(human: str = "receiver") -> Built:
 
 
 def compile_c(*command: object) -> None:
-    """Run a compiler, or make. Raises ArduinoError with the last lines that it printed."""
-    run(*command, error=ArduinoError, remedy=OUR_SOURCE)
+    """Run a compiler, or make. Raises RoverError with the last lines that it printed."""
+    run(*command, error=RoverError, remedy=OUR_SOURCE)
 
 
 @functools.cache
 def symbol(name: str, human: str = "receiver") -> int:
     """Return the address of one of the firmware's functions in flash memory. human: as for build()."""
     firmware = build(human).firmware
-    table = run("avr-nm", firmware, error=ArduinoError)
+    table = run("avr-nm", firmware, error=RoverError)
     line = re.search(rf"^([0-9a-f]+) \w {name}$", table, re.M)
     if not line:
-        raise ArduinoError(f"{firmware}: the firmware has no function {name}")
+        raise RoverError(f"{firmware}: the firmware has no function {name}")
     return int(line[1], 16)
 
 
@@ -147,7 +141,7 @@ class EmulatedArduino:
         see ready(). nice: scheduling priority; NICE comes close to a processor of its own. Below 0 it works only for
         root, and is silently left out for others.
         human: as for build().
-        Raises ArduinoError as build() does, and if the program does not start.
+        Raises RoverError as build() does, and if the program does not start.
         """
         built, self._human = build(human), human
         # The program makes this link, and removes it even if the present process was killed.
@@ -160,7 +154,7 @@ class EmulatedArduino:
         options += ["--periods", str(numbers[0]), str(numbers[4])]
         options += ["--eeprom", (eeprom_of(this_car()) if eeprom is None else eeprom).hex()]
         self._process = Child(
-            "the emulated Arduino", built.program, built.firmware, *options, error=ArduinoError, talks=True
+            "the emulated Arduino", built.program, built.firmware, *options, error=RoverError, talks=True
         )
         self.pid = self._process.pid
         self._process.keep_unread(LOG_BYTES)
@@ -170,7 +164,7 @@ class EmulatedArduino:
             while not os.path.lexists(self.port):  # not Path.exists, which would follow the link
                 self._process.check()
                 if time.monotonic() > deadline:
-                    raise ArduinoError(
+                    raise RoverError(
                         f"the emulated Arduino did not start within {START_S:g} s", remedy="is this machine busy?"
                     )
                 time.sleep(0.005)
@@ -217,13 +211,13 @@ class EmulatedArduino:
         """Return what happened since the last call, ordered by when it ended.
 
         With every_pulse, call it at least every 10 s: what does not fit into the pipe is lost, and a 'lost' event says
-        how much. Raises ArduinoError if the process has ended.
+        how much. Raises RoverError if the process has ended.
         """
         with self._reading:
             try:
                 while data := self._process.read():
                     self._rest += data
-            except ArduinoError:
+            except RoverError:
                 if b"\n" not in self._rest:
                     raise
             *lines, self._rest = self._rest.split(b"\n")

@@ -12,7 +12,7 @@ from rover_lib.onboard.care.doctor import Check, examine, receiver
 def rehearse(artifact: Path | None, say: Callable[[str], object]) -> Iterator[Check]:
     """Yield the checks before a drive, then those of the ritual, with the real firmware and the balloon world's camera.
 
-    say: called with what the human is asked to do, just before the script does it. Raises ArduinoError and WorldError
+    say: called with what the human is asked to do, just before the script does it. Raises RoverError and TrainingError
     if an emulator does not start, and LinkError as the link does.
     """
     with EmulatedArduino(every_pulse=False, transmitter=REST_US) as board, VirtualCar() as world:

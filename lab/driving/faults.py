@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from lab.arduino.emulator import CC, REPOSITORY, compile_c
-from lab.driving.on_pins import PIN_ROWS, FaultError, PinRow, run_on_pins
+from lab.driving.on_pins import PIN_ROWS, PinRow, run_on_pins
 from lab.driving.pins import STOPPED, Gates
 from lab.driving.rows import FaultRow, rows_of, run_row
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import write_stage
 
 FUZZ_LINES = 1_000_000
@@ -90,8 +91,8 @@ def run_faults(
     """Inject all faults, or only those named in `only` and those of `kinds`. 'fuzz' is a name too.
 
     A fault of the default car that is on pins is not repeated in virtual time; other cars have all in virtual time.
-    echo: called with a line when a fault is done. Raises FaultError for unknown names and if the bench does not drive,
-    and ArduinoError if there is no emulated Arduino or no gcc here.
+    echo: called with a line when a fault is done. Raises RoverError for unknown names and if the bench does not drive,
+    and RoverError if there is no emulated Arduino or no gcc here.
     """
     car, only, kinds, begin = car or Car(), set(only), set(kinds), time.monotonic()
     everything = not only and not kinds
@@ -103,9 +104,9 @@ def run_faults(
     rows = [row for row in rows_of(car) if row.name not in {row.name for row in on_pins}]
     all_rows = [*rows, *on_pins]
     if unknown := sorted(only - {row.name for row in all_rows} - {"fuzz"}):
-        raise FaultError("no such fault", found=unknown, remedy=f"choose from {[r.name for r in all_rows]} and 'fuzz'")
+        raise RoverError("no such fault", found=unknown, remedy=f"choose from {[r.name for r in all_rows]} and 'fuzz'")
     if unknown := sorted(kinds - {row.kind for row in all_rows}):
-        raise FaultError("no such kind of fault", found=unknown, remedy=f"{sorted({row.kind for row in all_rows})}")
+        raise RoverError("no such kind of fault", found=unknown, remedy=f"{sorted({row.kind for row in all_rows})}")
     logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
     outcome = FaultsOutcome(Gates.of_params(car))
     if everything or "fuzz" in only:

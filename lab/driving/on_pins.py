@@ -53,10 +53,6 @@ IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal,
 THREAD_ENDS = f"from {__name__} import end_thread_on_signal; end_thread_on_signal(); "
 
 
-class FaultError(RoverError):
-    """A fault cannot be injected or judged here."""
-
-
 def end_thread_on_signal() -> None:
     """Make SIGUSR2 end only the main thread of this process, which is the loop's, by the system call exit."""
     number = {"x86_64": 60, "aarch64": 93}[platform.machine()]
@@ -72,7 +68,7 @@ class Drive(Child):
         devices = "--camera", bench.camera, "--port", bench.cable.port, "--view", bench.folder / "view"
         options = "--film", "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
         command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options, *arguments)
-        super().__init__("rover drive", *command, error=FaultError)
+        super().__init__("rover drive", *command, error=RoverError)
 
     def mark(self) -> None:
         """Note that what it has printed until now is from before the fault."""
@@ -165,7 +161,7 @@ class PinBench:
             if first_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
             if not drive.running or time.monotonic() > deadline:
-                raise FaultError("rover drive did not drive", found=drive.last_words(), remedy="drive it by hand")
+                raise RoverError("rover drive did not drive", found=drive.last_words(), remedy="drive it by hand")
         self.arduino.ready(False)  # from here on the human only does what a fault says
 
     def clear_faults(self) -> None:
@@ -276,7 +272,7 @@ def run_pin_row(bench: PinBench, fault: PinRow, gates: Gates) -> dict[str, Any]:
         verdict.wrong.append(f"rover drive ended with {code}, expected {fault.exit_code}")
     try:
         bench.at_speed()
-    except FaultError as error:
+    except RoverError as error:
         verdict.wrong.append(f"the car was not driven again: {error}")
     if fault.told_later:
         line = bench.drive.line_of(fault.message)
@@ -312,7 +308,7 @@ def _spoilt(fault: PinRow, seen: Observation, gates: Gates) -> bool:
 
 
 def run_on_pins(faults: Sequence[PinRow], gates: Gates) -> Iterator[dict[str, Any]]:
-    """Yield a row for each fault. Raises FaultError if the bench does not drive, ArduinoError without an emulator."""
+    """Yield a row for each fault. Raises RoverError if the bench does not drive, RoverError without an emulator."""
     if faults:
         with PinBench() as bench:
             for fault in faults:

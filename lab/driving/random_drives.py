@@ -83,7 +83,7 @@ class Failure:
 def random_drives(seeds: Sequence[int], jobs: int = 1) -> tuple[Tally, list[Failure]]:
     """Drive the story of each seed. Returns what the drives visited, and those that break an invariant.
 
-    jobs: how many processes drive at a time. Raises ArduinoError if there is no gcc.
+    jobs: how many processes drive at a time. Raises RoverError if there is no gcc.
     """
     library()  # in this process, where its errors are seen
     if jobs == 1:

@@ -393,7 +393,7 @@ def _simpler(story: Story) -> Iterator[Story]:
 
 
 def drive_story(story: Story, car: Car | None = None) -> Seen:
-    """Drive a story, in some hundredths of a second, and return what was seen. Raises ArduinoError without gcc."""
+    """Drive a story, in some hundredths of a second, and return what was seen. Raises RoverError without gcc."""
     stage = Stage(story.clock_ms, car)
     world = stage.world
     world.mind.throttle = PLAN[1] if story.steady else None

@@ -47,7 +47,7 @@ class Event(ctypes.Structure):
 
 @functools.cache
 def library(human: str = "receiver") -> Path:
-    """Get the sketch as a library for this machine, from the cache or compiled now. Raises ArduinoError without gcc.
+    """Get the sketch as a library for this machine, from the cache or compiled now. Raises RoverError without gcc.
 
     human: as in `make -C firmware HUMAN=gamepad`.
     """
@@ -65,7 +65,7 @@ def compile_sketch(firmware: Path, folder: Path, human: str = "receiver") -> Non
 
 
 class Board:
-    """The sketch from one start to the next, one at a time. Raises ArduinoError if there is no gcc.
+    """The sketch from one start to the next, one at a time. Raises RoverError if there is no gcc.
 
     numbers: of the car in its EEPROM. human: as for library().
     """

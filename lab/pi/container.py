@@ -23,7 +23,8 @@ from pathlib import Path
 from urllib.request import getproxies
 
 from lab.pi.debian_image import debian_image
-from lab.pi.emulation import EmulationError, in_cgroup
+from lab.pi.emulation import in_cgroup
+from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_root
 from rover_lib.workshop.run_program import run
 
@@ -68,7 +69,7 @@ class Container:
             # redirect_dir allows to rename a folder of a lower layer, as on any disk.
             layers = f"lowerdir={made.root},upperdir={folder}/upper,workdir={folder}/work,redirect_dir=on"
             remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
-            run("mount", "-t", "overlay", self.machine, "-o", layers, self.root, error=EmulationError, remedy=remedy)
+            run("mount", "-t", "overlay", self.machine, "-o", layers, self.root, error=RoverError, remedy=remedy)
             stack.callback(lambda: subprocess.run(["umount", "--lazy", self.root], capture_output=True))
             self._enter_cgroup = stack.enter_context(in_cgroup(self.machine))
             self._configure()
@@ -81,7 +82,7 @@ class Container:
     def boot(self) -> None:
         """Switch it on, and wait until its sshd answers.
 
-        Raises EmulationError with the last lines of its console if sshd does not answer.
+        Raises RoverError with the last lines of its console if sshd does not answer.
         """
         command = ["systemd-nspawn", "--quiet", "--boot", "--register=no", "--keep-unit", "--link-journal=no"]
         command += [f"--machine={self.machine}", f"--hostname={self.name}", f"--directory={self.root}"]
@@ -120,7 +121,7 @@ class Container:
                     return
             time.sleep(0.2)
         last = (self._own / "console.log").read_text(errors="replace").strip().splitlines()[-8:]
-        raise EmulationError(f"{self.name} has no sshd, its console's last: {' | '.join(last) or 'nothing'}")
+        raise RoverError(f"{self.name} has no sshd, its console's last: {' | '.join(last) or 'nothing'}")
 
     def _configure(self) -> None:
         """Write to its disk what makes it this Pi, before it boots."""
@@ -161,7 +162,7 @@ def _lend_systemd(root: Path) -> None:
     here, there = _run(*ask, "systemd"), _run(*ask, f"--admindir={root}/var/lib/dpkg", "systemd:arm64")
     if here.partition(".")[0] != there.partition(".")[0]:
         what = f"systemd is {here} here and {there} on the emulated Pi"
-        raise EmulationError(what, remedy=f"remove {cache_root()}/pi-system-*")
+        raise RoverError(what, remedy=f"remove {cache_root()}/pi-system-*")
     for path in (SYSTEMD, *libraries):
         target = root / path.relative_to("/")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -177,7 +178,7 @@ def _lend_registries(etc: Path) -> None:
     suites = {codename, f"{codename}-updates", f"{codename}-security"}
     sources = sorted({line for line in listed.splitlines() if set(line.split()[1:2]) & suites})
     if not sources:
-        raise EmulationError(f"this machine's apt sources have no Debian {codename}, whose packages the Pi installs")
+        raise RoverError(f"this machine's apt sources have no Debian {codename}, whose packages the Pi installs")
     (etc / "apt/sources.list").write_text("".join(f"deb {line}\n" for line in sources))
     settings = [x for x in _run("apt-config", "dump").splitlines() if x.startswith(("Acquire::http", "Acquire::https"))]
     proxies = getproxies()
@@ -190,7 +191,7 @@ def _lend_registries(etc: Path) -> None:
 
 
 def _run(*command: object) -> str:
-    return run(*command, error=EmulationError)
+    return run(*command, error=RoverError)
 
 
 def pip_settings(config: str, proxy: str = "") -> str:

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lab.debian import fetch_packages
-from lab.pi.emulation import EmulationError, in_cgroup
+from lab.pi.emulation import in_cgroup
+from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.run_program import run
 
@@ -53,7 +54,7 @@ class DebianImage(NamedTuple):
 def debian_image() -> DebianImage:
     """Return the Pi's file system and the key to it, from the cache or made now, which takes two minutes.
 
-    Call it within emulation(). Raises EmulationError or DebianError that says what could not be had.
+    Call it within emulation(). Raises RoverError that says what could not be had.
     """
     recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
     folder = cache_folder("pi-system", key_of(recipe), _make)
@@ -64,7 +65,7 @@ def _codename() -> str:
     about = platform.freedesktop_os_release()
     if about["ID"] != "debian" or not shutil.which("dpkg"):
         what = "the emulated Pi's packages come by the apt sources of a Debian 12 or 13"
-        raise EmulationError(what, found=about["PRETTY_NAME"])
+        raise RoverError(what, found=about["PRETTY_NAME"])
     return about["VERSION_CODENAME"]
 
 
@@ -73,13 +74,13 @@ def _make(folder: Path) -> None:
     root = folder / "root"
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".apt.") as scratch:
         _unpack(root, fetch_packages(Path(scratch), PACKAGES))
-    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "emulated Pi", "-f", folder / "key", error=EmulationError)
+    run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "emulated Pi", "-f", folder / "key", error=RoverError)
     name = f"rover-make-{os.getpid()}"
     with _stand_ins(root / "usr" / "sbin"), in_cgroup(name) as enter:
         chroot = ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", f"--machine={name}"]
         chroot += ["--timezone=off", "--resolv-conf=off", "--link-journal=no", f"--directory={root}"]
         chroot += ["--setenv=DEBIAN_FRONTEND=noninteractive", "--setenv=LC_ALL=C.UTF-8"]
-        run(*chroot, "/bin/sh", "-c", CONFIGURE, error=EmulationError, preexec_fn=enter)
+        run(*chroot, "/bin/sh", "-c", CONFIGURE, error=RoverError, preexec_fn=enter)
     _personalize(root, (folder / "key.pub").read_text())
 
 
@@ -92,9 +93,9 @@ def _unpack(root: Path, packages: list[Path]) -> None:
         (root / name).symlink_to(f"usr/{name}")
     for package in packages:
         with subprocess.Popen(["dpkg-deb", "--fsys-tarfile", package], stdout=subprocess.PIPE) as tar:
-            run("tar", "-x", "-C", root, "--keep-directory-symlink", error=EmulationError, stdin=tar.stdout)
+            run("tar", "-x", "-C", root, "--keep-directory-symlink", error=RoverError, stdin=tar.stdout)
         if tar.returncode:
-            raise EmulationError(f"{package.name} cannot be unpacked: dpkg-deb ended with {tar.returncode}")
+            raise RoverError(f"{package.name} cannot be unpacked: dpkg-deb ended with {tar.returncode}")
     status = root / "var" / "lib" / "dpkg"
     for name in ("info", "updates"):
         (status / name).mkdir(parents=True, exist_ok=True)
@@ -106,7 +107,7 @@ def _unpack(root: Path, packages: list[Path]) -> None:
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
     for part in ([p for p in packages if p.name.startswith(f"{FIRST}_")], packages):
         command = ["dpkg", f"--root={root}", "--log=/dev/null", *forced, "--unpack", *part]
-        run(*command, error=EmulationError, env=environment)
+        run(*command, error=RoverError, env=environment)
 
 
 @contextlib.contextmanager

@@ -33,7 +33,7 @@ from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import debian_image
-from lab.pi.emulation import EmulationError, emulation, interruptible, require
+from lab.pi.emulation import emulation, interruptible, require
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
@@ -91,7 +91,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
     """
     artifact = demo.absolute() / ARTIFACT
     if not artifact.is_file():
-        raise EmulationError(f"{artifact}: not found", remedy="make demo makes it")
+        raise RoverError(f"{artifact}: not found", remedy="make demo makes it")
     require()
     report = Report(output, {artifact.name: sha256_of(artifact)}, say)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -162,13 +162,13 @@ class _Deployment:
         self.expect("rollback", name)
 
     def play(self, book: str, step: str = "", works: bool = True, **variables: Any) -> playbooks.Play:
-        """Run a playbook. works: whether it has to; raises EmulationError with the end of its output if it fails."""
+        """Run a playbook. works: whether it has to; raises RoverError with the end of its output if it fails."""
         with self.report.step(step or book):
             play = playbooks.run(book, self.pi, self.folder, {**self.variables, **variables})
             self.log.write(f"===== {step or book}\n{play.output}\n")
             if works and not play.ok:
                 self.log.write(f"===== its journal\n{playbooks.read_journal(self.pi)}\n")
-                raise EmulationError(f"{book}.yml failed, its output ends: {play.end}")
+                raise RoverError(f"{book}.yml failed, its output ends: {play.end}")
         return play
 
     def expect(self, what: str, name: str) -> None:

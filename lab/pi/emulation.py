@@ -29,17 +29,13 @@ INTERPRETERS = ("/usr/libexec/qemu-binfmt/aarch64-binfmt-P", "/usr/bin/qemu-aarc
 RIGHTS = "is this a container without rights?"
 
 
-class EmulationError(RoverError):
-    """An emulated Pi cannot be made, started or asked here."""
-
-
 def require() -> None:
     """Make sure that this is root, and install what is missing for a Pi and its Arduino.
 
-    Raises EmulationError or DebianError.
+    Raises RoverError.
     """
     if os.geteuid() != 0:
-        raise EmulationError("an emulated Pi mounts file systems and starts a container", remedy="use sudo")
+        raise RoverError("an emulated Pi mounts file systems and starts a container", remedy="use sudo")
     install_packages([*missing_packages(NEEDS), *arduino.missing_packages()], "an emulated Pi")
 
 
@@ -59,17 +55,17 @@ def emulation() -> Iterator[None]:
     """Let the kernel run aarch64 programs. What was mounted or registered for this is removed afterwards."""
     interpreter = next((i for i in INTERPRETERS if Path(i).exists()), None)
     if not interpreter:
-        raise EmulationError(f"none of {', '.join(INTERPRETERS)}", remedy="sudo apt-get install qemu-user-static")
+        raise RoverError(f"none of {', '.join(INTERPRETERS)}", remedy="sudo apt-get install qemu-user-static")
     with contextlib.ExitStack() as stack:
         if not (BINFMT / "register").exists():
-            run("mount", "-t", "binfmt_misc", "binfmt_misc", BINFMT, error=EmulationError, remedy=RIGHTS)
+            run("mount", "-t", "binfmt_misc", "binfmt_misc", BINFMT, error=RoverError, remedy=RIGHTS)
             stack.callback(lambda: subprocess.run(["umount", BINFMT], capture_output=True))
         ours = BINFMT / BINFMT_NAME
         if not ours.exists():
             try:
                 (BINFMT / "register").write_text(f":{BINFMT_NAME}:M::{MAGIC}:{MASK}:{interpreter}:POCF")
             except OSError as error:
-                raise EmulationError(f"the kernel takes no emulator: {error}", remedy=RIGHTS) from None
+                raise RoverError(f"the kernel takes no emulator: {error}", remedy=RIGHTS) from None
             stack.callback(ours.write_text, "-1")
         yield
 
@@ -93,7 +89,7 @@ def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
             for folder in folders:
                 folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise EmulationError(f"no control group can be made: {error}", remedy=RIGHTS) from None
+            raise RoverError(f"no control group can be made: {error}", remedy=RIGHTS) from None
 
         def enter() -> None:
             for folder in folders:

@@ -17,7 +17,7 @@ from typing import Any
 
 from lab.pi.container import Container
 from lab.pi.debian_image import USER
-from lab.pi.emulation import EmulationError
+from rover_lib.onboard.errors import RoverError
 
 REPOSITORY = Path(__file__).parents[2]
 INVENTORY = REPOSITORY / "inventory.ini"
@@ -53,11 +53,11 @@ def run(book: str, pi: Container, folder: Path, variables: Mapping[str, Any]) ->
     """Run ansible/<book>.yml on a rover. A play that fails raises nothing.
 
     folder: for the inventory and Ansible's own files; plays with the same folder share ssh connections. variables:
-    passed with -e. Raises EmulationError if there is no Ansible, or if the play takes longer than MOST_S.
+    passed with -e. Raises RoverError if there is no Ansible, or if the play takes longer than MOST_S.
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     if not program.exists():
-        raise EmulationError(f"no {program.name} beside {sys.executable}", remedy="pip install -e '.[dev]'")
+        raise RoverError(f"no {program.name} beside {sys.executable}", remedy="pip install -e '.[dev]'")
     (folder / "inventory.ini").write_text(inventory(pi))
     given = {"rover_command": str(program.with_name("rover")), **variables}
     command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml", "-e", json.dumps(given)]
@@ -75,7 +75,7 @@ def run(book: str, pi: Container, folder: Path, variables: Mapping[str, Any]) ->
         try:
             output, _ = process.communicate(timeout=MOST_S)
         except subprocess.TimeoutExpired:
-            raise EmulationError(f"{book}.yml took more than {MOST_S:g} s") from None
+            raise RoverError(f"{book}.yml took more than {MOST_S:g} s") from None
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, 15)

@@ -29,10 +29,6 @@ MOST_S = 600  # for the tests of one mutant; a test that hangs has noticed it
 MUTANTS = Path(__file__).with_suffix(".yml")
 
 
-class MutantError(RoverError):
-    """A mutant that cannot be planted, or tests that fail without one."""
-
-
 @dataclass(frozen=True)
 class Mutant:
     """A line that is broken; mutants.yml says what the fields mean."""
@@ -136,7 +132,7 @@ class Copy:
         self._worker.stdin.flush()
         code = int(self._worker.stdout.readline())
         if code == 9 or "gcc failed" in self.log:
-            raise MutantError("what was planted cannot run", found=self.log)
+            raise RoverError("what was planted cannot run", found=self.log)
         return code
 
     @property
@@ -147,11 +143,11 @@ class Copy:
 def try_mutants(mutants: Sequence[Mutant], jobs: int, drives: bool) -> list[Outcome]:
     """Plant each mutant and see whether its test fails, and with `drives` whether random drives notice it.
 
-    Raises MutantError if a mutant's line is not there, or if a named test does not pass without mutants.
+    Raises RoverError if a mutant's line is not there, or if a named test does not pass without mutants.
     """
     for mutant in mutants:
         if (count := (REPOSITORY / mutant.file).read_text().count(mutant.good)) != 1:
-            raise MutantError(f"{mutant.file}: {mutant.good!r} is there {count} times", remedy=f"mend {mutant.name!r}")
+            raise RoverError(f"{mutant.file}: {mutant.good!r} is there {count} times", remedy=f"mend {mutant.name!r}")
     with ExitStack() as stack:
         copies: Queue[Copy] = Queue()
         for _ in range(jobs):
@@ -159,7 +155,7 @@ def try_mutants(mutants: Sequence[Mutant], jobs: int, drives: bool) -> list[Outc
         copy = copies.get()
         words = " or ".join(sorted({m.words for m in mutants}))
         if copy.run(sorted({m.test for m in mutants}), words):
-            raise MutantError("the named tests fail without mutants", found=copy.log)
+            raise RoverError("the named tests fail without mutants", found=copy.log)
         copies.put(copy)
 
         def attempt(mutant: Mutant) -> Outcome:

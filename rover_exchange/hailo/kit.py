@@ -14,7 +14,7 @@ from numpy.lib.format import open_memmap
 
 from rover_exchange.hailo.networks import Network, networks
 from rover_lib.onboard.artifact.manifest import Artifact, largest_tolerance
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, parameters_by_block, zero_colour
 from rover_lib.workshop.progress import Progress, silent
@@ -34,15 +34,15 @@ def write_kit(
     """Write the kit of a run to the new folder `out`.
 
     loaded: what the run was made of. run_dir: the run's folder, with its artifacts. samples: how many frames the
-    calibration set has. Raises QuantizeError if `out` exists or too few frames were recorded, and
+    calibration set has. Raises ArtifactError if `out` exists or too few frames were recorded, and
     ArtifactError without the run's artifacts. After an error nothing of the kit is left.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
-        raise QuantizeError(f"{out}: exists already", remedy="give a folder that does not")
+        raise ArtifactError(f"{out}: exists already", remedy="give a folder that does not")
     chosen, _ = Recipe.of(params(), samples).choose(loaded.parts.calibration)
     if len(chosen) < samples:
-        raise QuantizeError(
+        raise ArtifactError(
             f"a calibration set of {samples} frames is wanted, {len(chosen)} are usable for it",
             remedy="record more; or say --samples, and expect more of an error",
         )

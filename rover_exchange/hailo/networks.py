@@ -7,7 +7,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import ACT, transform
 from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
 
@@ -95,11 +95,11 @@ class Network:
 def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
     """Make an FP32 policy's networks: `backbone`, `whole`, and what runs after `backbone` on the processor.
 
-    Raises QuantizeError for a policy that sees no state: its networks have no place for one.
+    Raises ArtifactError for a policy that sees no state: its networks have no place for one.
     """
     config = policy.config
     if not config.sees_state:
-        raise QuantizeError("a policy without a state has no kit for Hailo yet", remedy="use the Pi's processor")
+        raise ArtifactError("a policy without a state has no kit for Hailo yet", remedy="use the Pi's processor")
     pictures = {f"frame_{n}": torch.zeros(1, 3, *s) for n, s in zip(config.cameras, config.image_sizes, strict=True)}
     grids = [config.grid(*size) for size in config.image_sizes]
     features = {f"features_{n}": torch.zeros(*g, config.dim) for n, g in zip(config.cameras, grids, strict=True)}

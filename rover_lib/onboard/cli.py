@@ -44,7 +44,7 @@ def main(debug: bool) -> None:
 
 
 def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
-    """Return the file. Raises KindError if another of the user's files would be lost by writing it."""
+    """Return the file. Raises RoverError if another of the user's files would be lost by writing it."""
     if file and file.name != "-":
         check_output(Path(file.name), None, appended=True)
     return file

@@ -67,28 +67,12 @@ class PwmError(RoverError):
     """A value that must not become a servo pulse."""
 
 
-class FrameError(RoverError):
-    """A camera frame whose shape or type is not that of a picture."""
-
-
-class QuantizeError(RoverError):
-    """A quantization that changed nothing, or that made a value which cannot be used."""
-
-
-class DistillError(RoverError):
-    """A student that cannot be made from this teacher or these recordings."""
-
-
-class FinetuneError(RoverError):
-    """A policy that cannot be trained further, or recordings that it cannot learn from."""
-
-
 class ArtifactError(RoverError):
-    """A policy file that is damaged, has another format, or cannot run on this machine."""
+    """A policy file that cannot be made, is damaged or of another format, or cannot run on this machine."""
 
 
 class PolicyError(RoverError):
-    """An input to a policy, or a prediction of it, that must not drive a car."""
+    """An input to a policy, such as a frame, or a prediction of it, that must not drive a car."""
 
 
 class ParamsError(RoverError):
@@ -100,11 +84,7 @@ class CarError(RoverError):
 
 
 class TrainingError(RoverError):
-    """A training that failed, or that cannot continue from its saved state."""
-
-
-class WorldError(RoverError):
-    """A recording, training or trial in the balloon world that is not possible."""
+    """A training, a student or a trial that is not possible, failed, or cannot continue from its saved state."""
 
 
 class CameraError(RoverError):

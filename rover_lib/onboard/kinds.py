@@ -1,7 +1,7 @@
 """Recognise what kind of file or folder a path is, without loading it, so that every command can check its arguments.
 
     kinds_of("runs/mine/policy_static.pt")                  # ("artifact",)
-    check_kind(path, "checkpoint")                          # KindError: ... this is an artifact, not a checkpoint; ...
+    check_kind(path, "checkpoint")                          # RoverError: ... this is an artifact, not a checkpoint; ...
 
 A folder may be of several kinds: `rover distill` makes one that is both a run and a LeRobot checkpoint. A path of an
 unknown kind is not refused here; the command itself then reports what is wrong with it.
@@ -63,10 +63,6 @@ HEAD = 65536  # bytes that are read of a file
 PICKLE_HEAD = 4096  # bytes that are read of a torch file's pickle, which names its keys early
 
 
-class KindError(RoverError):
-    """A file or a folder that is not of the kind that the command needs."""
-
-
 def kinds_of(path: Path | str) -> tuple[str, ...]:
     """Return the kinds of a path, as keys of CALLED; empty if the path does not exist or is of no known kind."""
     path = Path(path)
@@ -80,7 +76,7 @@ def kinds_of(path: Path | str) -> tuple[str, ...]:
 
 
 def check_kind(path: Path | str, wanted: str) -> None:
-    """Raise KindError for a path of a known kind that is not the wanted one. wanted: a key of WANTED."""
+    """Raise RoverError for a path of a known kind that is not the wanted one. wanted: a key of WANTED."""
     found = kinds_of(path)
     takes, remedy = WANTED[wanted]
     if not found or set(found) & set(takes):
@@ -88,27 +84,27 @@ def check_kind(path: Path | str, wanted: str) -> None:
     refuse_part(path)
     if found[0] == "tub":
         remedy = "rover export-dataset TUB OUT makes a LeRobotDataset of it"
-    raise KindError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
+    raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 
 def refuse_part(path: Path | str) -> None:
-    """Raise KindError for what no command takes: a part of a checkpoint or dataset, a document, an archive, a Git LFS
+    """Raise RoverError for what no command takes: a part of a checkpoint or dataset, a document, an archive, a Git LFS
     pointer.
     """
     kind = next(iter(kinds_of(path)), "")
     if kind in REMEDIES:
-        raise KindError(f"{path}: this is {CALLED[kind]}", remedy=REMEDIES[kind])
+        raise RoverError(f"{path}: this is {CALLED[kind]}", remedy=REMEDIES[kind])
 
 
 def refuse_holder(folder: Path | str) -> None:
-    """Raise KindError for a folder that is nothing itself, but holds what is: checkpoints, or a cache of the Hub."""
+    """Raise RoverError for a folder that is nothing itself, but holds what is: checkpoints, or a cache of the Hub."""
     for level in ("*", "*/*", "*/*/*"):
         found = sorted(islice(Path(folder).glob(level), MOST_INSIDE))
         inside = [p for p in found if not set(kinds_of(p)) <= {"part", "document", "pointer", "stage"}]
         if inside:
             names = ", ".join(os.path.relpath(p, folder) for p in inside[:4]) + (" ..." if len(inside) > 4 else "")
             what = f"{folder}: contains {CALLED[kinds_of(inside[0])[0]]} but is not one"
-            raise KindError(what, found=printable(names), remedy=f"give one of them, as in {inside[0]}")
+            raise RoverError(what, found=printable(names), remedy=f"give one of them, as in {inside[0]}")
 
 
 def refuse_pointer(path: Path, error: type[RoverError]) -> None:
@@ -118,18 +114,18 @@ def refuse_pointer(path: Path, error: type[RoverError]) -> None:
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
-    """Raise KindError for a file that a command must not write, see `Output`."""
+    """Raise RoverError for a file that a command must not write, see `Output`."""
     if path.is_dir():
-        raise KindError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
+        raise RoverError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
     there = path.exists()
     if found := set(kinds_of(path)) - {kind, "part", "document"}:  # a film may take the place of a film
-        raise KindError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
+        raise RoverError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
     if there and not path.is_file() and not appended:
-        raise KindError(f"{path}: not a regular file, and would be replaced by one", remedy="give another name")
+        raise RoverError(f"{path}: not a regular file, and would be replaced by one", remedy="give another name")
     folder = next((p for p in path.absolute().parents if p.exists()), Path("/"))
     if not (there and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
         what = "cannot be written to" if folder.is_dir() else "this is a file, not a folder"
-        raise KindError(f"{folder}: {what}", remedy="name a file elsewhere")
+        raise RoverError(f"{folder}: {what}", remedy="name a file elsewhere")
 
 
 class Output(click.Path):
@@ -167,7 +163,7 @@ class Number(click.FloatRange):
 
 
 class PathTo(click.Path):
-    """A command's argument: an existing path of one kind, a key of WANTED. Raises KindError for another kind."""
+    """A command's argument: an existing path of one kind, a key of WANTED. Raises RoverError for another kind."""
 
     def __init__(self, wanted: str):
         super().__init__(path_type=Path)

@@ -30,10 +30,6 @@ PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in range(17, 37)] + ["manylinux2014_aarch64"]
 
 
-class WheelhouseError(RoverError):
-    """Wheels that cannot be made or fetched."""
-
-
 @dataclass(frozen=True)
 class Wheelhouse:
     """wheel: the rover's own. version: its, with the hash of its files. changed: something new is in the folder."""
@@ -48,7 +44,7 @@ def make(
 ) -> Wheelhouse:
     """Fill a folder with the rover's own wheel and those that it needs; what is there already is not fetched again.
 
-    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS. Raises WheelhouseError.
+    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS. Raises RoverError.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +67,7 @@ def _build(folder: Path) -> tuple[Path, str]:
         # The same files make the same bytes: the zip has this date, whatever the user's environment says.
         environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800"}
         command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", built]
-        run(*command, cwd=ONBOARD, env=environment, error=WheelhouseError, remedy="is this a checkout of the project?")
+        run(*command, cwd=ONBOARD, env=environment, error=RoverError, remedy="is this a checkout of the project?")
         for old in folder.glob("rover_policy-*.whl"):
             old.unlink()
         shutil.move(Path(built, wheel.name), wheel)
@@ -90,4 +86,4 @@ def _fetch(folder: Path, python: str, requirements: Path) -> None:
         target = ["--python-version", python, "--implementation", "cp", *platforms]
         what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
         remedy = f"is there internet here? pip fetches the wheels of {requirements.name} for Python {python}"
-        run(*pip, *target, *what, error=WheelhouseError, remedy=remedy)
+        run(*pip, *target, *what, error=RoverError, remedy=remedy)

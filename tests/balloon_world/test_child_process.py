@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from balloon_world.child_process import Child
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 ECHO = """
 import sys, time
@@ -17,7 +17,7 @@ for line in sys.stdin:
 
 
 def start(program, **options):
-    return Child("the program", sys.executable, "-c", program, error=WorldError, **options)
+    return Child("the program", sys.executable, "-c", program, error=TrainingError, **options)
 
 
 def test_a_child_that_talks_ends_with_its_input():
@@ -28,13 +28,13 @@ def test_a_child_that_talks_ends_with_its_input():
     child.check()
     child.close()
     assert child.process.returncode == 0
-    with pytest.raises(WorldError, match="the program was closed; make a new one"):
+    with pytest.raises(TrainingError, match="the program was closed; make a new one"):
         child.send_line("hello")
 
 
 def test_its_last_words_are_in_the_error():
     child = start("import sys; sys.stderr.write('one\\ntwo\\n'); sys.exit(7)", talks=True)
-    with pytest.raises(WorldError, match=r"has ended \(exit status 7\): one \| two; start a new one"):
+    with pytest.raises(TrainingError, match=r"has ended \(exit status 7\): one \| two; start a new one"):
         child.read(20)
     assert child.errors() == ["one", "two"]
     child.close()

@@ -13,7 +13,7 @@ from balloon_world.drives import drive_in, drive_missing, pair_worlds, sign_test
 from balloon_world.latency import beside_path
 from balloon_world.world import World, expert
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import PolicyError, WorldError
+from rover_lib.onboard.errors import PolicyError, TrainingError
 from rover_lib.onboard.params import params
 
 SETTINGS = Settings.of(params()["drive"])
@@ -124,7 +124,7 @@ def test_a_policy_that_fails_is_not_a_car_that_was_stopped():
 
 @pytest.mark.parametrize("seconds", [-0.1, math.nan, 6.0])
 def test_a_latency_that_cannot_be_is_refused(seconds):
-    with pytest.raises(WorldError, match="latency"):
+    with pytest.raises(TrainingError, match="latency"):
         late(seconds)
 
 

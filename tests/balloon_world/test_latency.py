@@ -12,7 +12,7 @@ from test_drives import CURVE, SETTINGS, Foresees, Seen, late
 from balloon_world import drives, latency
 from balloon_world.latency import from_above, gates, table
 from rover_lib.cli import main
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run import run as runs
 
@@ -70,9 +70,9 @@ def test_plans_from_above_lead_where_the_car_went():
 
 def test_what_cannot_be_measured_is_refused(run_dir):
     for wrong in ({"worlds": 1, "latencies_ms": []}, {"worlds": 0, "latencies_ms": [0]}):
-        with pytest.raises(WorldError, match="at least one"):
+        with pytest.raises(TrainingError, match="at least one"):
             latency.measure_latencies(run_dir.path, **wrong)
-    with pytest.raises(WorldError, match=r"policy_static\.pt"):
+    with pytest.raises(TrainingError, match=r"policy_static\.pt"):
         latency.measure_latencies(run_dir.path / "nothing", worlds=1, latencies_ms=[0])
 
 

@@ -13,7 +13,7 @@ from balloon_world.world import World, expert
 from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
@@ -202,13 +202,13 @@ def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, 
         assert seconds["demonstrated"] == pytest.approx(row["human_s"], abs=0.1)
     more = run_experiment(run_dir, out, replace(FEW, worlds=3))  # only what is missing is driven
     assert [row["pushed"]["trials"] for row in more["metrics"]["policies"]] == [3] * 5
-    with pytest.raises(WorldError, match="not of this experiment"):
+    with pytest.raises(TrainingError, match="not of this experiment"):
         run_experiment(run_dir, out, replace(FEW, drives=3))
 
 
 def test_what_is_missing_is_said(tmp_path):
-    with pytest.raises(WorldError, match="best_model"):
+    with pytest.raises(TrainingError, match="best_model"):
         run_experiment(tmp_path, tmp_path / "out")
-    with pytest.raises(WorldError, match="at least one round"):
+    with pytest.raises(TrainingError, match="at least one round"):
         Experiment(rounds=0)
     assert not list(tmp_path.iterdir())

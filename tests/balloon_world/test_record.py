@@ -5,7 +5,7 @@ import pytest
 
 from balloon_world import record
 from balloon_world.record import record_episodes
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +61,6 @@ def test_a_recording_that_was_made_is_taken_from_the_cache(recorded, tmp_path, m
 
 def test_a_folder_with_something_else_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("do not touch")
-    with pytest.raises(WorldError, match="is not this recording"):
+    with pytest.raises(TrainingError, match="is not this recording"):
         record_episodes(tmp_path, count=1)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]

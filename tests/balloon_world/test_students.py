@@ -13,7 +13,7 @@ from balloon_world.students import gates_of, judge_students, recommendation, sen
 from rover_learn import plots
 from rover_lib.cli import main
 from rover_lib.onboard.care.pi5 import Work, predict_ms
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.run import run as runs
@@ -168,10 +168,10 @@ def moved(made, name):
 def test_what_does_not_belong_together_is_refused(made, breaks, says):
     student = breaks(made)
     before = {p: p.read_bytes() for p in made.teacher.iterdir()}
-    with pytest.raises(DistillError, match=says):
+    with pytest.raises(TrainingError, match=says):
         judge_students(made.teacher, [student], worlds=1)
     assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
-    with pytest.raises(DistillError, match="names of their own"):
+    with pytest.raises(TrainingError, match="names of their own"):
         judge_students(made.teacher, [student, student], worlds=1)
 
 

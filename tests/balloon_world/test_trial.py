@@ -3,7 +3,7 @@ import pytest
 
 from balloon_world.trial import run_trials, wilson_interval
 from balloon_world.world import World
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 
 class Constant:
@@ -90,5 +90,5 @@ def test_frames_are_kept_evenly_and_not_too_many(keep):
 )
 def test_what_is_no_trial_is_refused(wrong, said):
     policy = Constant(wrong.pop("steering", 0.0), 0.0)
-    with pytest.raises(WorldError, match=said):
+    with pytest.raises(TrainingError, match=said):
         run_trials(policy, **{"worlds": 1, **wrong})

@@ -22,7 +22,7 @@ from balloon_world.simulated_arduino import PinEvent
 from balloon_world.world import World
 from lab.arduino.emulator import BOARD
 from rover_lib.onboard.car.servo_link import ServoLink
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 BOARDS = [
     pytest.param(STAND_IN, id="stand-in"),
@@ -115,12 +115,12 @@ def test_when_its_process_dies():
         eye = Eye(car.camera)
         eye.frames(1)
         os.kill(car.pid, signal.SIGKILL)
-        with pytest.raises(WorldError, match=r"has ended \(exit status -9"):
+        with pytest.raises(TrainingError, match=r"has ended \(exit status -9"):
             car.report()
-        with pytest.raises(WorldError, match="has ended"):
+        with pytest.raises(TrainingError, match="has ended"):
             car.check()
         until(lambda: eye.ended)  # unplugged
-    with pytest.raises(WorldError, match="was closed"):
+    with pytest.raises(TrainingError, match="was closed"):
         car.report()
 
 
@@ -152,7 +152,7 @@ def test_when_its_process_hangs(monkeypatch):
         assert car.report().held
         monkeypatch.setattr(car_module, "ANSWER_S", 0.2)
         os.kill(car.pid, signal.SIGSTOP)
-        with pytest.raises(WorldError, match="did not answer"):
+        with pytest.raises(TrainingError, match="did not answer"):
             car.report()
         os.kill(car.pid, signal.SIGCONT)
         monkeypatch.undo()
@@ -162,7 +162,7 @@ def test_when_its_process_hangs(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"hold_s": -1}])
 def test_numbers_that_make_no_drive(wrong):
-    with pytest.raises(WorldError, match="a car needs"):
+    with pytest.raises(TrainingError, match="a car needs"):
         VirtualCar(**wrong)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from balloon_world.world import DECOY_ASIDE_RAD, TIMEOUT_S, World, expert
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 
 
 def drive(world):
@@ -85,16 +85,16 @@ def test_a_car_that_stands_or_drives_away_hits_nothing(action, outcomes):
 
 @pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1), (0.0, 1.1)])
 def test_an_action_outside_its_range_is_refused(action):
-    with pytest.raises(WorldError, match="steering"):
+    with pytest.raises(TrainingError, match="steering"):
         World(1).step(*action)
 
 
 def test_what_is_no_world_is_refused():
     world = World(1)
     drive(world)
-    with pytest.raises(WorldError, match="ended"):
+    with pytest.raises(TrainingError, match="ended"):
         world.step(0.0, 0.0)
-    with pytest.raises(WorldError, match="negative"):
+    with pytest.raises(TrainingError, match="negative"):
         World(-1)
 
 

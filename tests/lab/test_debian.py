@@ -5,7 +5,8 @@ import os
 import pytest
 
 from lab import debian
-from lab.debian import DebianError, install_packages, missing_packages
+from lab.debian import install_packages, missing_packages
+from rover_lib.onboard.errors import RoverError
 
 
 def test_commands_and_files_tell_what_is_missing(tmp_path, monkeypatch):
@@ -18,7 +19,7 @@ def test_commands_and_files_tell_what_is_missing(tmp_path, monkeypatch):
 
 def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    with pytest.raises(DebianError, match=r"counting needs the Debian packages qemu-user gcc, .*") as raised:
+    with pytest.raises(RoverError, match=r"counting needs the Debian packages qemu-user gcc, .*") as raised:
         install_packages(["qemu-user", "gcc"], "counting")
     assert raised.value.remedy.startswith("sudo apt-get install ")
     assert raised.value.remedy.endswith(" qemu-user gcc")

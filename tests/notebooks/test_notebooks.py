@@ -117,7 +117,7 @@ def test_parameters_act_where_they_stand_and_a_run_may_be_moved(one_notebook, tm
 )  # fmt: skip
 def test_a_failing_cell_is_one_sentence_and_no_file(one_notebook, tmp_path, source, words):
     written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'), ("work", source))
-    with pytest.raises(runs.NotebookError, match=words):
+    with pytest.raises(runs.RoverError, match=words):
         runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook)
     assert not list((tmp_path / "runs").iterdir())
 
@@ -125,11 +125,11 @@ def test_a_failing_cell_is_one_sentence_and_no_file(one_notebook, tmp_path, sour
 def test_what_a_run_was_not_asked_to_know_is_refused_before_anything_runs(one_notebook, tmp_path):
     written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'))
     began = time.monotonic()
-    with pytest.raises(runs.NotebookError, match="wrlds"):
+    with pytest.raises(runs.RoverError, match="wrlds"):
         runs.run("ck", "episodes", runs_dir=tmp_path, notebooks=one_notebook, wrlds=1)
-    with pytest.raises(runs.NotebookError, match="plain folder name"):
+    with pytest.raises(runs.RoverError, match="plain folder name"):
         runs.run("ck", "episodes", "../up", runs_dir=tmp_path, notebooks=one_notebook)
-    with pytest.raises(runs.NotebookError, match=r"shape; .*'scheme'"):
+    with pytest.raises(runs.RoverError, match=r"shape; .*'scheme'"):
         runs.execute("03_quantize", tmp_path, shape="affine")
     assert time.monotonic() - began < 4
 
@@ -165,7 +165,7 @@ def whole(source, folder, given, bars):
         (folder / name).write_text("new")
 
 
-@pytest.mark.parametrize("error", [runs.NotebookError("no such checkpoint"), KeyboardInterrupt()], ids=repr)
+@pytest.mark.parametrize("error", [runs.RoverError("no such checkpoint"), KeyboardInterrupt()], ids=repr)
 def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old_run, monkeypatch, error):
     def ends_early(source, folder, given, bars):
         whole(source, folder, given, bars)

@@ -7,7 +7,8 @@ import zipfile
 import pytest
 
 from rover_lib.onboard.drive.flight_log import FlightLog
-from rover_lib.onboard.kinds import REMEDIES, WANTED, KindError, check_kind, check_output, kinds_of
+from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import REMEDIES, WANTED, check_kind, check_output, kinds_of
 from rover_lib.onboard.stage import write_stage
 
 PULLED = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
@@ -37,7 +38,7 @@ def test_parts_archives_and_pointers_are_refused_with_what_to_do(tmp_path, name,
     path.write_bytes(data)
     wrong = path if path.suffix != ".json" else path.parent  # a folder that is a part, too
     assert kinds_of(wrong) == (kind,)
-    with pytest.raises(KindError) as refused:
+    with pytest.raises(RoverError) as refused:
         check_kind(wrong, "checkpoint")
     assert refused.value.remedy == REMEDIES[kind]
 
@@ -88,12 +89,12 @@ def test_an_output_takes_the_place_of_its_own_kind_only(tmp_path):
         check_output(tmp_path / name, "artifact")
     check_output(tmp_path / "/dev/null", "flight log", appended=True)  # nothing is there to lose
     for path in (artifact, tmp_path / "link.pt", tmp_path, tmp_path / "notes" / "new.pt"):
-        with pytest.raises(KindError):
+        with pytest.raises(RoverError):
             check_output(path, "checkpoint")
 
 
 def test_another_kind_is_refused_with_how_to_get_the_wanted_one(tmp_path):
     path = archive(tmp_path / "policy_static.pt", **{"code/net_DOT_py": b""})
-    with pytest.raises(KindError) as refused:
+    with pytest.raises(RoverError) as refused:
         check_kind(path, "checkpoint")
     assert "this is an artifact" in refused.value.what and refused.value.remedy == WANTED["checkpoint"][1]

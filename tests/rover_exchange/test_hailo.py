@@ -18,7 +18,7 @@ from policies import memory_samples
 from rover_exchange.hailo import compile as hailo_compile
 from rover_exchange.hailo import kit as kits
 from rover_exchange.hailo.networks import networks
-from rover_lib.onboard.errors import ArtifactError, QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import ACT, imagenet, inputs_of
 
 
@@ -82,11 +82,11 @@ def test_other_names_of_inputs_are_refused(kit, monkeypatch):
 
 def test_too_few_frames_or_a_folder_that_exists_or_a_failure_leave_nothing(tiny, tmp_path, monkeypatch):
     loaded = opened(normalised(tiny))
-    with pytest.raises(QuantizeError, match="1024 frames"):
+    with pytest.raises(ArtifactError, match="1024 frames"):
         kits.write_kit(loaded, tmp_path, tmp_path / "kit")
     with pytest.raises(ArtifactError):
         kits.write_kit(loaded, tmp_path / "no run", tmp_path / "kit", samples=FRAMES)
     assert not list(tmp_path.iterdir())
     (tmp_path / "link").symlink_to("gone")  # onto which no folder can be moved
-    with pytest.raises(QuantizeError, match="exists"):
+    with pytest.raises(ArtifactError, match="exists"):
         kits.write_kit(loaded, tmp_path, tmp_path / "link", samples=FRAMES)

@@ -16,7 +16,7 @@ from rover_learn import distill as distill_module
 from rover_learn import training
 from rover_learn.distill import DistillRecipe, distill, summary
 from rover_learn.student import StudentShape
-from rover_lib.onboard.errors import DistillError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of
@@ -194,14 +194,14 @@ def test_a_teacher_of_another_car_is_refused(episodes, recipe, tmp_path):
         policy.model.action_head.weight.zero_()
         policy.model.action_head.bias.copy_(torch.tensor([-0.9, 0.6]))
     torch.save(trainer_content(policy), tmp_path / "best_model.pth")
-    with pytest.raises(DistillError, match="worse than one action"):
+    with pytest.raises(TrainingError, match="worse than one action"):
         distill(tmp_path / "best_model.pth", episodes, "fast", SHAPE, runs_dir=tmp_path, recipe=recipe, device="cpu")
     assert not (tmp_path / "fast").exists()
 
 
 def test_a_run_that_is_there_is_not_overwritten(teacher, episodes, tmp_path, monkeypatch):
     (tmp_path / "fast").mkdir()
-    with pytest.raises(DistillError, match="is there already"):
+    with pytest.raises(TrainingError, match="is there already"):
         distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path)
     (tmp_path / "fast").rmdir()
 
@@ -211,7 +211,7 @@ def test_a_run_that_is_there_is_not_overwritten(teacher, episodes, tmp_path, mon
 
     monkeypatch.setattr(distill_module, "_teach", teach)
     monkeypatch.setattr(distill_module, "_leave", lambda new, *_: (new / "distill.json").touch())
-    with pytest.raises(DistillError, match="is there already"):
+    with pytest.raises(TrainingError, match="is there already"):
         distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
     assert not list((tmp_path / "fast").iterdir())
 
@@ -225,6 +225,6 @@ def test_a_run_that_is_there_is_not_overwritten(teacher, episodes, tmp_path, mon
     ],
 )
 def test_what_cannot_be_taught_is_refused(teacher, episodes, tmp_path, options, says):
-    with pytest.raises(DistillError, match=says):
+    with pytest.raises(TrainingError, match=says):
         distill(teacher, episodes, **{"name": "fast", "runs_dir": tmp_path, **options})
     assert not list(tmp_path.iterdir())

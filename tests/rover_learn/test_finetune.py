@@ -17,7 +17,7 @@ from rover_learn.finetune import FinetuneRecipe, finetune, human_samples
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.errors import FinetuneError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
@@ -174,7 +174,7 @@ def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old,
 
 def refused(says, checkpoint, episodes, tmp_path, **options):
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(FinetuneError, match=says) as error:
+    with pytest.raises(TrainingError, match=says) as error:
         finetune(checkpoint, episodes, **{"name": "better", "runs_dir": tmp_path / "runs", "device": "cpu", **options})
     assert "\n" not in str(error.value) and sorted(tmp_path.rglob("*")) == before
 

@@ -7,7 +7,7 @@ import torch
 from policies import memory_samples
 
 from rover_learn.student import StudentShape, initial_weights, student_config
-from rover_lib.onboard.errors import CheckpointError, DistillError
+from rover_lib.onboard.errors import CheckpointError, TrainingError
 from rover_lib.workshop.act import ACT, expected_shapes, inputs_of, predictions
 
 
@@ -56,7 +56,7 @@ def test_units_that_do_nothing_are_the_ones_to_go(tiny, inputs):
     ],
 )
 def test_a_student_is_no_larger_than_its_teacher(tiny, shape, says):
-    with pytest.raises(DistillError, match=says):
+    with pytest.raises(TrainingError, match=says):
         student_config(tiny, shape)
 
 
@@ -70,11 +70,11 @@ def test_a_policy_of_an_arm_teaches_no_car(tiny):
     names = tuple(f"joint_{i}" for i in range(6))
     for other, found in ((names, "joint_0, joint_1, "), (("left", "right"), "of state left, right, of action left")):
         arm = replace(tiny, config=replace(tiny.config, state_names=other, action_names=other))
-        with pytest.raises(DistillError, match=found):
+        with pytest.raises(TrainingError, match=found):
             student_config(arm, StudentShape())
 
 
 def test_channels_of_a_bottleneck_stay(tiny):
     deep = replace(tiny, config=replace(tiny.config, backbone="resnet50"))
-    with pytest.raises(DistillError, match="basic blocks only"):
+    with pytest.raises(TrainingError, match="basic blocks only"):
         student_config(deep, StudentShape(backbone_channels=0.5))

@@ -8,10 +8,6 @@ PROVISIONED = "rover-arduino"  # the name that provisioning gives it
 KINDS = ("ttyACM*", "ttyUSB*")
 
 
-class PortError(RoverError):
-    """It is not clear which port is the Arduino's."""
-
-
 def list_ports(dev: Path = Path("/dev")) -> dict[Path, str]:
     """Return each USB serial port, with its name in serial/by-id ("" where it has none)."""
     names = {link.resolve(): link.name for link in sorted((dev / "serial" / "by-id").glob("*"))}
@@ -21,7 +17,7 @@ def list_ports(dev: Path = Path("/dev")) -> dict[Path, str]:
 def find_port(dev: Path = Path("/dev")) -> str:
     """Return the port of the only Arduino: the provisioned name, else the only USB serial port.
 
-    Raises PortError if there is none, or several, which it lists.
+    Raises RoverError if there is none, or several, which it lists.
     """
     if (dev / PROVISIONED).exists():
         return str(dev / PROVISIONED)
@@ -29,7 +25,7 @@ def find_port(dev: Path = Path("/dev")) -> str:
     if len(ports) == 1:
         return str(next(iter(ports)))
     found = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
-    raise PortError(
+    raise RoverError(
         "which serial port is the Arduino's?" if ports else "no Arduino is plugged in",
         found=found or "no /dev/ttyACM* and no /dev/ttyUSB*",
         remedy=f"say it: --port {next(iter(ports))}" if ports else "plug it in; dmesg | tail says what the kernel saw",

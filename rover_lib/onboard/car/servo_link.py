@@ -94,7 +94,7 @@ class ServoLink:
         self, port: str, *, car: Car | None = None, boot_s: float = BOOT_S, clock: Callable[[], float] = time.monotonic
     ):
         """port: "" means the only Arduino's. car: None means this machine's. Raises CarError if its car.yml cannot be
-        read, and PortError if it is not clear which port is meant.
+        read, and RoverError if it is not clear which port is meant.
         """
         self._gamepad: Gamepad | None = None
         self._relayed_s = 0.0

@@ -53,7 +53,7 @@ class Policy:
     def predict_unclipped(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """Predict like predict_chunk(), but without clipping, to show how far a prediction was beyond a limit.
 
-        Raises FrameError for a frame that is no picture, PolicyError for frames of other cameras, for a state that is
+        Raises PolicyError for a frame that is no picture, PolicyError for frames of other cameras, for a state that is
         not finite or has another shape, and for a prediction that is not finite, which must never drive a car.
         """
         frames = self._frames(frame_bgr)

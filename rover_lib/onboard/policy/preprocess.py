@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from rover_lib.onboard.errors import FrameError
+from rover_lib.onboard.errors import PolicyError
 
 # torchvision's ImageNet statistics, RGB, for pixels in [0, 1]: what LeRobot's ACT was trained with.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -18,18 +18,18 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     `normalise`), so that a Pi moves bytes, not floats.
     A frame of that size is only reordered. One with a larger side is averaged over areas (no aliasing), a smaller one
     is interpolated. The aspect ratio is not kept, as in the trainer.
-    Raises FrameError for anything that is not such a picture.
+    Raises PolicyError for anything that is not such a picture.
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
         found = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
-        raise FrameError(
+        raise PolicyError(
             "a frame must be (height, width, 3) BGR", found=found, remedy="is the camera delivering colour?"
         )
     if frame_bgr.dtype != np.uint8:
-        raise FrameError("a frame must be uint8", found=frame_bgr.dtype, remedy="pass the picture as OpenCV reads it")
+        raise PolicyError("a frame must be uint8", found=frame_bgr.dtype, remedy="pass the picture as OpenCV reads it")
     h, w = frame_bgr.shape[:2]
     if h == 0 or w == 0:
-        raise FrameError(f"a frame of {w}x{h} pixels has no picture in it", remedy="check the camera")
+        raise PolicyError(f"a frame of {w}x{h} pixels has no picture in it", remedy="check the camera")
     if (h, w) != (height, width):
         shrinks = height < h or width < w
         frame_bgr = cv2.resize(

@@ -54,10 +54,6 @@ ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulati
 SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 
-class ViewError(RoverError):
-    """The view cannot be opened here."""
-
-
 @dataclass(frozen=True)
 class Address:
     """Where browsers find the view.
@@ -70,7 +66,7 @@ class Address:
     interface: str = ""
 
     def open(self) -> socket.socket:
-        """Return a listening socket. Raises ViewError if the port or the interface cannot be used."""
+        """Return a listening socket. Raises RoverError if the port or the interface cannot be used."""
         wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -84,7 +80,7 @@ class Address:
             if error.errno == errno.ENODEV:
                 remedy = "`ip -brief address` lists the interfaces"
             where = f"port {self.port}" + (f" of {self.interface}" if self.interface else "")
-            raise ViewError(f"no page can be served at {where} ({error.strerror})", remedy=remedy) from None
+            raise RoverError(f"no page can be served at {where} ({error.strerror})", remedy=remedy) from None
         return wire
 
     def is_ours(self, host: str) -> bool:
@@ -110,13 +106,13 @@ def new_token() -> str:
 
 
 def read_token(path: Path) -> str:
-    """Read the token from a file. Raises ViewError if it cannot be read, or if the token could be guessed."""
+    """Read the token from a file. Raises RoverError if it cannot be read, or if the token could be guessed."""
     try:
         token = read_plain(path, 4096).decode(errors="replace").strip()
     except OSError as error:
-        raise ViewError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
+        raise RoverError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
     if not re.fullmatch(r"[A-Za-z0-9_-]{16,128}", token, re.ASCII):
-        raise ViewError(f"{path}: no token of 16 letters or more is in it", remedy="provision the rover")
+        raise RoverError(f"{path}: no token of 16 letters or more is in it", remedy="provision the rover")
     return token
 
 
@@ -126,7 +122,7 @@ class View:
     address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. car: the car whose drives are
     shown; None means this machine's. ask: takes what a simulation's page asks for; None for a car, whose page can only
-    stop it. Raises ViewError for an unknown user, and CarError and ParamsError like this_car() and CarShape.of().
+    stop it. Raises RoverError for an unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
     def __init__(
@@ -144,7 +140,7 @@ class View:
             try:
                 self._users.add(pwd.getpwnam(drive_user).pw_uid)
             except KeyError:
-                raise ViewError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
+                raise RoverError(f"no user {drive_user!r} is known here", remedy="provision the rover") from None
         self._open_to_all = drive_user is not None  # the socket; _accept() checks who connects
         car = car or this_car()
         self._shape, self._pwm = CarShape.of(car), car.pwm
@@ -177,7 +173,7 @@ class View:
                 task.result()
 
     async def open(self, stack: contextlib.AsyncExitStack) -> str:
-        """Start serving, until the stack is closed, and return the page's URL. Raises ViewError."""
+        """Start serving, until the stack is closed, and return the page's URL. Raises RoverError."""
         app = web.Application(middlewares=[self._guard], client_max_size=1024)
         app.router.add_get("/", self._give_page)
         app.router.add_get("/ws", self._talk)
@@ -243,16 +239,16 @@ class View:
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
             if is_listened_at(place):
-                raise ViewError(f"{place}: another view listens there", remedy="end that one first")
+                raise RoverError(f"{place}: another view listens there", remedy="end that one first")
             if place.exists() and not place.is_socket():
-                raise ViewError(f"{place}: not a socket", remedy="name another with --feed")
+                raise RoverError(f"{place}: not a socket", remedy="name another with --feed")
             place.unlink(missing_ok=True)  # left by a view that was killed
             wire.bind(str(place))
             place.chmod(0o666 if self._open_to_all else 0o600)
             wire.listen(4)
         except OSError as error:
             wire.close()
-            raise ViewError(f"{place}: no drive could reach a view there ({error})", remedy="give --feed") from None
+            raise RoverError(f"{place}: no drive could reach a view there ({error})", remedy="give --feed") from None
         except BaseException:
             wire.close()
             raise

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.frames import ODD, odd_share, usual
@@ -64,7 +64,7 @@ class Chooser:
 
     odd: some of the odd frames that calibration met. Together with the odd ones among the samples they weigh in every
     error what odd frames weigh in the recordings: their share of what calibration saw, or of the samples, if that is
-    larger. warnings: a sentence for each action that is not judged. Raises QuantizeError without samples, and where no
+    larger. warnings: a sentence for each action that is not judged. Raises ArtifactError without samples, and where no
     action changes in the recordings.
     """
 
@@ -77,10 +77,10 @@ class Chooser:
         odd: Sequence[Sample] = (),
     ):
         if not samples:
-            raise QuantizeError("choosing needs samples that did not calibrate", remedy="record more episodes")
+            raise ArtifactError("choosing needs samples that did not calibrate", remedy="record more episodes")
         if len(constant_actions(action_range)) == len(action_range):
             remedy = "record episodes in which the car is steered"
-            raise QuantizeError(f"{' and '.join(action_range)} never change in these recordings", remedy=remedy)
+            raise ArtifactError(f"{' and '.join(action_range)} never change in these recordings", remedy=remedy)
         forget_graphs()  # for the first time, as nothing is converted yet
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
@@ -205,10 +205,10 @@ class Chooser:
         is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
         static first; the last is the best within the cost, in the budget or not.
 
-        blocks: leave these in float instead, whatever they cost. Raises QuantizeError for an unknown one.
+        blocks: leave these in float instead, whatever they cost. Raises ArtifactError for an unknown one.
         """
         if unknown := [block for block in blocks or () if block not in sensitivity]:
-            raise QuantizeError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
+            raise ArtifactError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
         graph = restore_observed(self.checkpoint, scheme, self.calibration)
         costs = float_costs_pct(self.checkpoint)
         order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)

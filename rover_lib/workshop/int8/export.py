@@ -21,7 +21,7 @@ from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.wheel_version import release
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -122,12 +122,12 @@ class Exporter:
     """Writes artifacts of one checkpoint. FP32's answers to the samples are computed once for all artifacts.
 
     samples: recorded observations. `parity.vectors` of them, evenly spaced, become the parity vectors; INT8's largest
-    error is taken over all of them. Raises QuantizeError without samples, and for samples of several cars.
+    error is taken over all of them. Raises ArtifactError without samples, and for samples of several cars.
     """
 
     def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample], parity: Parity | None = None):
         if not samples:
-            raise QuantizeError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
+            raise ArtifactError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
         self.checkpoint, self.parity = checkpoint, parity or Parity()
         self.car = car_of(samples)
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
@@ -149,7 +149,7 @@ class Exporter:
     def export(self, policy: ACT | QuantizedPolicy, path: Path | str, calibration: Calibration | None = None) -> str:
         """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX, and return its content hash.
 
-        calibration: a quantized policy's, for the manifest. Raises QuantizeError, and writes nothing, if the engine's
+        calibration: a quantized policy's, for the manifest. Raises ArtifactError, and writes nothing, if the engine's
         form of the policy does not compute what the policy computes, or gives anything that is not finite.
         """
         checkpoint, config = self.checkpoint, self.checkpoint.config
@@ -159,13 +159,13 @@ class Exporter:
         expected = predictions(module, [self.inputs[i] for i in self.stored])
         actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
-            raise QuantizeError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
+            raise ArtifactError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
         # The limit follows from the policy's own error. Taken from the form, it would grow with the form's mistakes.
         limits = self._tolerance(policy, expected, self.stored)
         gaps = (actions[self.stored] - expected).abs().amax((0, 1)).tolist()
         for (name, most), gap in zip(limits.items(), gaps, strict=True):
             if not gap <= most:  # written so that NaN fails
-                raise QuantizeError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
+                raise ArtifactError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
         allowed = {
             name: min(most, artifact.largest_tolerance(_mode(policy), name))

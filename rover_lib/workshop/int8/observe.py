@@ -24,7 +24,7 @@ from torch.ao.quantization.observer import UniformQuantizationObserverBase
 from torch.ao.quantization.quantize_fx import prepare_fx
 from torch.fx import GraphModule, Node
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import open_plain
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -72,7 +72,7 @@ class RangeObserver(UniformQuantizationObserverBase):
         v = x.detach().flatten()
         low, high = torch.aminmax(v)
         if not (torch.isfinite(low) and torch.isfinite(high)):
-            raise QuantizeError("calibration met NaN or Inf in an activation", remedy=BROKEN_INPUT)
+            raise ArtifactError("calibration met NaN or Inf in an activation", remedy=BROKEN_INPUT)
         self.frames.append(torch.stack((low, high)))
         self.min_val.copy_(torch.minimum(self.min_val, low))
         self.max_val.copy_(torch.maximum(self.max_val, high))
@@ -92,11 +92,11 @@ class RangeObserver(UniformQuantizationObserverBase):
     def range(self) -> tuple[float, float]:
         """The range [low, high] to represent, containing 0, by this observer's choice.
 
-        Raises QuantizeError if it saw nothing.
+        Raises ArtifactError if it saw nothing.
         """
         low, high = self.min_val.item(), self.max_val.item()
         if low > high:
-            raise QuantizeError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
+            raise ArtifactError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
         if self.choice == "percentile":
             low, high = self._percentiles(low, high)
         elif self.choice == "histogram":
@@ -154,15 +154,15 @@ class Calibration:
 
     @classmethod
     def load(cls, path: Path | str) -> "Calibration":
-        """Read what save() wrote. Raises QuantizeError if the file is missing or not a calibration."""
+        """Read what save() wrote. Raises ArtifactError if the file is missing or not a calibration."""
         try:
             with open_plain(path, OSError("not a plain file")) as file:
                 return cls(**torch.load(file, weights_only=True))
         except FileNotFoundError:
-            raise QuantizeError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
+            raise ArtifactError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
         except Exception as e:  # torch wraps what it meets in many types
             reason = str(e).splitlines()[0][:120]
-            raise QuantizeError(f"{path}: not a calibration ({reason})", remedy="calibrate again") from None
+            raise ArtifactError(f"{path}: not a calibration ({reason})", remedy="calibrate again") from None
 
 
 def calibrate(
@@ -170,12 +170,12 @@ def calibrate(
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
-    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises QuantizeError without samples, and
+    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises ArtifactError without samples, and
     for activations that are not finite.
     """
     if not samples:
         remedy = "give recordings with matching frames and controls"
-        raise QuantizeError("calibration needs samples", found="none", remedy=remedy)
+        raise ArtifactError("calibration needs samples", found="none", remedy=remedy)
     torch.backends.quantized.engine = ENGINE
     start = time.monotonic()
     config = checkpoint.config
@@ -186,7 +186,7 @@ def calibrate(
     model = ACT(config, checkpoint.weights, for_int8=True)
     channels = channel_maxima(model, inputs("channel maxima"))
     if bad := [n for n, s in channels.items() if not all(torch.isfinite(t).all() for t in s.values())]:
-        raise QuantizeError(f"calibration met NaN or Inf at {bad[:3]}", remedy=BROKEN_INPUT)
+        raise ArtifactError(f"calibration met NaN or Inf at {bad[:3]}", remedy=BROKEN_INPUT)
     if smooth is not None:
         apply_channel_scales(model, channels, smooth)
         few = samples[:: max(1, len(samples) // 16)]
@@ -261,10 +261,10 @@ def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) 
     places = _places(prepared)
     if scheme.observer == "frames":
         if not calibration.frames:
-            raise QuantizeError("the calibration is of a version that kept no frames", remedy="calibrate again")
+            raise ArtifactError("the calibration is of a version that kept no frames", remedy="calibrate again")
         kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
         if unknown := sorted(set(wider) - set(places)):
-            raise QuantizeError(f"scheme: wider names {unknown[:3]}, which this policy does not have")
+            raise ArtifactError(f"scheme: wider names {unknown[:3]}, which this policy does not have")
         for place, observer in places.items():
             observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
     for observer in places.values():
@@ -289,11 +289,11 @@ def _pattern(block: str, relu: bool) -> str:
 def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> QConfigMapping:
     """The blocks to quantize (all but the scheme's float blocks, or `only` those); others map to None.
 
-    Raises QuantizeError for a float block that the policy does not have.
+    Raises ArtifactError for a float block that the policy does not have.
     """
     known = blocks(config)
     if unknown := [b for b in scheme.float_blocks if b not in known]:
-        raise QuantizeError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
+        raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
     wanted = set(known) - set(scheme.float_blocks) if only is None else set(only)
     mapping = QConfigMapping().set_global(None)
     # No table is left in the graph of ACT (see act.EMBEDDINGS); where one is, only its rows are worth quantizing.
@@ -368,21 +368,21 @@ def _behind(prepared: nn.Module, node: Node) -> Node | None:
 def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
     """The observed graph as calibration left it, its observers seeing no more.
 
-    Raises QuantizeError for a calibration of another checkpoint, picture size, scheme or version.
+    Raises ArtifactError for a calibration of another checkpoint, picture size, scheme or version.
     """
     if calibration.image_sizes != checkpoint.config.image_sizes:
         sizes = f"images of {calibration.image_sizes}, not {checkpoint.config.image_sizes} (height, width)"
-        raise QuantizeError(f"the calibration was made with {sizes}", remedy=AGAIN)
+        raise ArtifactError(f"the calibration was made with {sizes}", remedy=AGAIN)
     if calibration.checkpoint != checkpoint.identity:
-        raise QuantizeError("the calibration was made with another checkpoint", remedy=AGAIN)
+        raise ArtifactError("the calibration was made with another checkpoint", remedy=AGAIN)
     if scheme.smooth != calibration.smooth:
-        raise QuantizeError(f"the calibration was made with smooth {calibration.smooth}, not {scheme.smooth}")
+        raise ArtifactError(f"the calibration was made with smooth {calibration.smooth}, not {scheme.smooth}")
     torch.backends.quantized.engine = ENGINE
     prepared = _prepare(scale_model(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()
     names = {k for k in state if "activation_post_process" in k}
     if names != set(calibration.observers):
-        raise QuantizeError("the calibration's observers do not fit this graph", remedy=AGAIN)
+        raise ArtifactError("the calibration's observers do not fit this graph", remedy=AGAIN)
     prepared.load_state_dict(state | calibration.observers)
     for m in prepared.modules():
         if isinstance(m, RangeObserver):

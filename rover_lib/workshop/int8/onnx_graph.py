@@ -31,7 +31,7 @@ from torch.ao.nn.intrinsic import quantized as fused_int8
 from torch.ao.nn.quantized import modules as int8
 from torch.fx import GraphModule, Interpreter, Node, Tracer
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import Columns
 
 OPSET = 17  # the first with LayerNormalization, the last that Hailo's parser documents
@@ -54,7 +54,7 @@ def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequen
 
     inputs: examples keyed by the names of the model's inputs, in the order of the graph's arguments; the model takes
     their shapes and dtypes. outputs: names for what the graph returns, a tensor or a tuple of tensors. Raises
-    QuantizeError for a part that this module cannot write, and names it.
+    ArtifactError for a part that this module cannot write, and names it.
     """
     writer = _Writer(graph, inputs, outputs)
     with torch.inference_mode():
@@ -118,7 +118,7 @@ class _Writer(Interpreter):
         write = WRITERS.get(kind) or WRITERS.get(getattr(kind, "__name__", ""))
         if write is None:
             what = getattr(kind, "__name__", kind)
-            raise QuantizeError(f"{n.name}: {what} has no form in ONNX here", remedy="add it to onnx_graph.py")
+            raise ArtifactError(f"{n.name}: {what} has no form in ONNX here", remedy="add it to onnx_graph.py")
         return write(self, n, result) if module is None else write(self, n, result, module)
 
     # --- what writers use ---
@@ -351,7 +351,7 @@ def _getitem(w: _Writer, n: Node, result: Any) -> Any:
         return names[index]
     parts = _as_list(index)
     if any(p is not None and p != slice(None) for p in parts):
-        raise QuantizeError(f"{n.name}: only new axes are taken, not [{index}]", remedy="add it to onnx_graph.py")
+        raise ArtifactError(f"{n.name}: only new axes are taken, not [{index}]", remedy="add it to onnx_graph.py")
     axes = [i for i, p in enumerate(parts) if p is None]
     return w._add("Unsqueeze", [names, w._ints(f"{n.name}_axes", axes)], n.name)
 

@@ -29,7 +29,7 @@ from torch.ao.quantization.backend_config import get_qnnpack_backend_config
 from torch.ao.quantization.quantize_fx import convert_fx
 from torch.fx import GraphModule, Node
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -55,7 +55,7 @@ class QuantizedPolicy:
 def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> QuantizedPolicy:
     """Quantize a checkpoint by a scheme.
 
-    Raises QuantizeError when nothing, or not everything that the scheme names, became INT8, or when a scale is not a
+    Raises ArtifactError when nothing, or not everything that the scheme names, became INT8, or when a scale is not a
     positive finite number. Warnings, by layer, are in the report.
     """
     start = time.monotonic()
@@ -95,11 +95,11 @@ def int8_layers(module: nn.Module) -> dict[str, Int8Layer]:
 
 
 def check_acted(layers: Mapping[str, nn.Module], expected: Sequence[str]) -> None:
-    """Raise QuantizeError, naming the layers, unless every expected layer was quantized."""
+    """Raise ArtifactError, naming the layers, unless every expected layer was quantized."""
     if not layers:
-        raise QuantizeError("nothing was quantized: the qconfig mapping matched no module")
+        raise ArtifactError("nothing was quantized: the qconfig mapping matched no module")
     if missing := [n for n in expected if n not in layers]:
-        raise QuantizeError(f"{len(missing)} of {len(expected)} layers stayed float: {', '.join(missing[:5])}")
+        raise ArtifactError(f"{len(missing)} of {len(expected)} layers stayed float: {', '.join(missing[:5])}")
 
 
 def forget_graphs() -> None:
@@ -118,7 +118,7 @@ def forget_graphs() -> None:
 
 @torch.inference_mode()
 def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
-    """Raise QuantizeError, naming the layers, unless every static INT8 layer dispatches to XNNPACK's SDOT kernels.
+    """Raise ArtifactError, naming the layers, unless every static INT8 layer dispatches to XNNPACK's SDOT kernels.
 
     What torch 2.8 asks of a layer (`can_use_xnnp` in aten's qconv and qlinear) and XNNPACK of its scales: a qint8
     input, symmetric qint8 weights in [-127, 127], per channel for convolutions only, and an output scale that is
@@ -143,10 +143,10 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
         except RuntimeError as e:
             # torch refuses some of these itself, without saying where; the hook of that layer has just run.
             if not slow:
-                raise QuantizeError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
+                raise ArtifactError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
     if slow:
         listed = "; ".join(f"{name}: {reason}" for name, reason in list(slow.items())[:5])
-        raise QuantizeError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {listed}")
+        raise ArtifactError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {listed}")
 
 
 def _why_slow(m: Int8Layer, x: Tensor) -> str | None:
@@ -198,7 +198,7 @@ def _layer_row(name: str, m: Int8Layer) -> dict[str, Any]:
     for key in ("weight_scale_min", "out_scale"):
         if row[key] is not None and not 0 < row[key] < float("inf"):
             what = f"{name}: its calibration range is no range, {key} is {row[key]}"
-            raise QuantizeError(what, remedy="check the recordings, and calibrate again")
+            raise ArtifactError(what, remedy="check the recordings, and calibrate again")
     return row
 
 
@@ -206,11 +206,11 @@ def backbone_of(quantized: QuantizedPolicy) -> nn.Module:
     """The INT8 part of a static policy that is the same to the last bit on every processor: all up to the tokens.
 
     Called like the policy; returns what `image_project` gives for the first camera, (1, D, h, w) int8. Raises
-    QuantizeError where that is not INT8.
+    ArtifactError where that is not INT8.
     """
     module = copy.deepcopy(quantized.module)
     if not isinstance(module, GraphModule) or "image_project" not in int8_layers(module):
-        raise QuantizeError(f"a {quantized.scheme.mode} policy whose image_project is not INT8 has no INT8 backbone")
+        raise ArtifactError(f"a {quantized.scheme.mode} policy whose image_project is not INT8 has no INT8 backbone")
     tokens = next(n for n in module.graph.nodes if n.target == "image_project")
     (output,) = (n for n in module.graph.nodes if n.op == "output")
     with module.graph.inserting_before(output):
@@ -261,7 +261,7 @@ class Rangeable:
                     self.buffers.append((scale, zero, of[scale.item()]))
 
     def take(self) -> None:
-        """Take the ranges of the observers. Raises QuantizeError as `check_fast` does."""
+        """Take the ranges of the observers. Raises ArtifactError as `check_fast` does."""
         now = {observer: [x.item() for x in observer.calculate_qparams()] for observer in self.observers}
         for layer, weight, bias, observer in self.layers:
             layer.scale, layer.zero_point = now[observer]

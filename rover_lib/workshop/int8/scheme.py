@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 
 ENGINE = "qnnpack"
 MODES = ("dynamic", "static", "mixed")
@@ -51,11 +51,11 @@ class Scheme:
             ("observer", self.observer, OBSERVERS),
         ):
             if value not in known:
-                raise QuantizeError(f"scheme: {name} {value!r} is not known", remedy=f"known are {list(known)}")
+                raise ArtifactError(f"scheme: {name} {value!r} is not known", remedy=f"known are {list(known)}")
         if self.smooth is not None and not 0 <= self.smooth <= 1:
-            raise QuantizeError("scheme: smooth must be in [0, 1]", found=self.smooth)
+            raise ArtifactError("scheme: smooth must be in [0, 1]", found=self.smooth)
         if not 50 < self.percentile <= 100:
-            raise QuantizeError("scheme: percentile must be in (50, 100]", found=self.percentile)
+            raise ArtifactError("scheme: percentile must be in (50, 100]", found=self.percentile)
         if not 0 < self.usual_pct <= 100 or any(not 0 <= share <= 1 for _, share in self.wider):
             found = f"{self.usual_pct} and {[share for _, share in self.wider]}"
-            raise QuantizeError("scheme: usual_pct must be in (0, 100], shares of wider in [0, 1]", found=found)
+            raise ArtifactError("scheme: usual_pct must be in (0, 100], shares of wider in [0, 1]", found=found)

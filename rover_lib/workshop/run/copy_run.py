@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, NotebookError, files_of_a_run
+from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.swap_folder import build_beside
 
@@ -20,18 +20,18 @@ from rover_lib.workshop.swap_folder import build_beside
 def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     """Copy what a run left to the run `copy` (<name>-copy if empty) and return that folder; a copy that is there stays.
 
-    Its notebooks then work in it; checkpoint and recordings stay where they are. Raises NotebookError if there is no
+    Its notebooks then work in it; checkpoint and recordings stay where they are. Raises RoverError if there is no
     such run, or if the copy would be the run itself or is a folder of something else.
     """
-    source, folder = (run_folder(runs_dir, n, NotebookError) for n in (name, copy or f"{name}-copy"))
+    source, folder = (run_folder(runs_dir, n, RoverError) for n in (name, copy or f"{name}-copy"))
     if not (source / f"{NAMES[0]}.ipynb").is_file():
-        raise NotebookError(f"there is no run {source}", remedy="rover inspect shows the runs that there are")
+        raise RoverError(f"there is no run {source}", remedy="rover inspect shows the runs that there are")
     if folder == source:
-        raise NotebookError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
+        raise RoverError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
     if (folder / f"{NAMES[0]}.ipynb").is_file():
         return folder
     if folder.exists():
-        raise NotebookError(f"{folder}: is there, and no copy of a run", remedy="give the copy another name: AS=try1")
+        raise RoverError(f"{folder}: is there, and no copy of a run", remedy="give the copy another name: AS=try1")
     with build_beside(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, content_hash
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
@@ -101,12 +101,12 @@ def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
     """The schemes of a run's artifacts beside FP32, by name: static, which all others are held against, and `modes`.
 
-    modes: None means all. Raises QuantizeError for an unknown one.
+    modes: None means all. Raises ArtifactError for an unknown one.
     """
     dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
     schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
     if unknown := [mode for mode in modes or () if mode not in schemes]:
-        raise QuantizeError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
+        raise ArtifactError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
     return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
 
 
@@ -116,7 +116,7 @@ def make_artifact(
     """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
 
     Where there are odd frames, which one scale may not serve, the ranges are chosen first; else that saves its time.
-    fp32: exported as it is. Returns its content hash, and warnings. Raises QuantizeError, in `calibrate`, `quantize`
+    fp32: exported as it is. Returns its content hash, and warnings. Raises ArtifactError, in `calibrate`, `quantize`
     and `export`.
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
@@ -162,7 +162,7 @@ def export_policies(
 def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
     """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
 
-    Raises QuantizeError if the run's files are not those that the artifact was made from.
+    Raises ArtifactError if the run's files are not those that the artifact was made from.
     """
     run_dir = Path(run_dir)
     stage = read_stage(run_dir / "quantize.json", "quantize")
@@ -170,14 +170,14 @@ def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
     if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
         what = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
-        raise QuantizeError(what, remedy="quantize again")
+        raise ArtifactError(what, remedy="quantize again")
     return quantize(checkpoint, Scheme.of(made["scheme"]), Calibration.load(calibrated))
 
 
 def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
     """policy_fp32 and policy_static of a run once more, for ONNX Runtime: {file's name: content hash}.
 
-    The same weights, calibration and scheme, so that the two engines compute the same policy. Raises QuantizeError as
+    The same weights, calibration and scheme, so that the two engines compute the same policy. Raises ArtifactError as
     `requantized` and `export` do, RoverError if the run's checkpoint or recordings have changed.
     """
     run_dir = Path(run_dir)

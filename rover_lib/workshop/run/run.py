@@ -59,10 +59,6 @@ KERNEL_ENVIRONMENT = {
 LINE = re.compile(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", re.M)  # of a parameters cell
 
 
-class NotebookError(RoverError):
-    """A notebook that did not run to its end, or whose output must not be committed."""
-
-
 class ThisPython(AsyncKernelManager):
     """A kernel of the interpreter that runs this code, whichever kernels the user has registered as "python3"."""
 
@@ -110,19 +106,19 @@ def run(
     complete: a run that fails at its third notebook shall not destroy the policies of the last good one. Only a run's
     own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of other hosts stay.
 
-    Raises NotebookError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C or kill -9,
+    Raises RoverError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C or kill -9,
     the old run is as it was, and what the finished notebooks made waits in .<name>.new: the same command continues.
     Raises ArtifactError at once for root, who may not load artifacts, and RoverError while another process makes a run
     of that name.
     """
     refuse_root()
-    folder = run_folder(runs_dir, name, NotebookError)
+    folder = run_folder(runs_dir, name, RoverError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
     if missing := [s.name for s in sources if not s.is_file()]:
-        raise NotebookError(f"{notebooks}: no {missing[0]} in it", remedy="run from a checkout of the project")
+        raise RoverError(f"{notebooks}: no {missing[0]} in it", remedy="run from a checkout of the project")
     known = set().union(*(parameters_of(s) for s in sources))
     if unknown := sorted(set(overrides) - known):
-        raise NotebookError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
+        raise RoverError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
@@ -153,26 +149,26 @@ def files_of_a_run(folder: Path) -> list[Path]:
 
 
 def find_notebook(asked: str) -> str:
-    """The name of the notebook that begins like `asked`, such as 04. Raises NotebookError if there is none."""
+    """The name of the notebook that begins like `asked`, such as 04. Raises RoverError if there is none."""
     found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
     if len(found) != 1:
-        raise NotebookError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
+        raise RoverError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
     return found[0]
 
 
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises NotebookError for an unknown parameter, before anything runs; then in one sentence with the notebook, the
+    Raises RoverError for an unknown parameter, before anything runs; then in one sentence with the notebook, the
     cell and its error. An earlier executed one then stays.
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
     if not source.is_file() or not folder.is_dir():
         missing = folder if source.is_file() else source
-        raise NotebookError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
+        raise RoverError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
     if unknown := sorted(set(overrides) - parameters_of(source)):
         known = sorted(parameters_of(source) - {"run_dir"})
-        raise NotebookError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
+        raise RoverError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
     _execute(source, folder, overrides, False)
     return folder / source.name
 
@@ -190,9 +186,9 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
         except papermill.PapermillExecutionError as e:
-            raise NotebookError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
+            raise RoverError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
-            raise NotebookError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e
+            raise RoverError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e
 
 
 def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:

@@ -16,11 +16,12 @@ from policies import memory_samples
 from lab.a76 import core as a76
 from lab.a76 import count_run as counting
 from lab.a76 import report as reports
-from lab.a76.core import BLOCK, Core, CountError, emulate, prepare
+from lab.a76.core import BLOCK, Core, emulate, prepare
 from lab.a76.count import STEADY, Counted, count_artifact
 from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.care import pi5
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
@@ -127,7 +128,7 @@ def test_lines_are_counted_by_the_cache_that_lacks_them(plugin_only, tmp_path, a
 def test_what_hangs_is_ended(plugin_only, tmp_path, monkeypatch):
     monkeypatch.setattr(a76, "SILENCE_S", 0.5)
     hangs = program(tmp_path / "hangs", [0x14000000])  # a branch to itself
-    with pytest.raises(CountError, match=r"printed nothing for 0\.5 s"):
+    with pytest.raises(RoverError, match=r"printed nothing for 0\.5 s"):
         emulate(plugin_only, [hangs], tmp_path)
     running = [p / "cmdline" for p in Path("/proc").iterdir() if p.name.isdigit()]
     assert not any(str(hangs).encode() in p.read_bytes() for p in running if os.access(p, os.R_OK))
@@ -146,7 +147,7 @@ def test_functions_are_named_by_address(tmp_path):
     assert names[0x5000000000 + at["first"]] == names[0x5000000000 + at["second"] - 1] == "first"
     assert names[0x5000000000 + at["second"] + 4] == "second"
     assert names[0x5000010010] == names[0x10] == "[unknown]"
-    with pytest.raises(CountError, match="not a 64-bit ELF"):
+    with pytest.raises(RoverError, match="not a 64-bit ELF"):
         Functions(source)
 
 
@@ -268,7 +269,7 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again,
     fake = SimpleNamespace(chunks=np.full((STEADY, 32, 2), 0.5, np.float32))
     monkeypatch.setattr(counting, "_count_all", lambda _, artifacts, *args: dict.fromkeys(artifacts, fake))
     monkeypatch.setattr(counting, "artifact_metrics", lambda counted, manifest: {})
-    with pytest.raises(CountError, match=r"policy_fp32\.pt: differs by .* on the core"):
+    with pytest.raises(RoverError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count_run(tiny_run, frames=4)
 
 
@@ -287,6 +288,6 @@ def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):
     broken = tmp_path / "broken.onnx.zip"  # importing torch would take the core half a minute
     broken.write_bytes((tiny_run / "policy_static.onnx.zip").read_bytes()[:-1000])
     with pytest.raises(
-        CountError, match=r"ended with 1 after load: error: .*broken\.onnx\.zip: not an artifact, or cut short"
+        RoverError, match=r"ended with 1 after load: error: .*broken\.onnx\.zip: not an artifact, or cut short"
     ):
         count_artifact(core, broken, memory_samples(1), counted=3)

@@ -57,5 +57,5 @@ def test_nothing_counted_is_a_sentence(tmp_path):
     (tmp_path / "mine").mkdir()
     assert "make count NAME=mine counts" in printed(runs.execute("06_arm", tmp_path / "mine"))
     assert {p.name for p in (tmp_path / "mine").iterdir()} == {"06_arm.ipynb"}
-    with pytest.raises(runs.NotebookError, match="not found"):
+    with pytest.raises(runs.RoverError, match="not found"):
         runs.execute("06_arm", tmp_path / "nothing")

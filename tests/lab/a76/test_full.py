@@ -3,7 +3,7 @@
 import pytest
 
 from lab.a76.full import NOTE, SIZES, STEPS, full_run
-from rover_lib.onboard.errors import WorldError
+from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -36,6 +36,6 @@ def test_leaves_what_counting_needs(run_dir):
 def test_another_run_of_that_name_is_left_alone(tmp_path):
     metrics = {"checkpoint": {}, "split": {}}
     write_stage(tmp_path / "load.json", "load", params={"checkpoint": "mine.pth"}, metrics=metrics)
-    with pytest.raises(WorldError, match="holds a run on another checkpoint"):
+    with pytest.raises(TrainingError, match="holds a run on another checkpoint"):
         full_run(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["load.json"]

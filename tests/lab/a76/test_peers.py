@@ -12,12 +12,13 @@ import pytest
 from policies import memory_samples
 
 from lab.a76 import peers
-from lab.a76.core import CountError, prepare
+from lab.a76.core import prepare
 from lab.a76.count import Counted, count_artifact
 from lab.a76.count_run import errors_pct
 from lab.a76.peers import ENGINES
 from lab.a76.report import LABEL, artifact_metrics
 from rover_lib.onboard.artifact.manifest import read_manifest
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
@@ -115,7 +116,7 @@ def test_a_peer_is_judged_by_its_distance_from_fp32(tiny_run):
     beyond = peers.peer_metrics(counted(np.full_like(off, [1.5, -0.2])), manifest, np.full_like(off, [1, 0]), RANGES)
     assert beyond["steering_mae_pct"] == beyond["throttle_mae_pct"] == 0, "no pulse can say more"
     for wrong in (off[:, :16], np.where(off > 0.08, np.nan, off)):
-        with pytest.raises(CountError, match="a peer gave"):
+        with pytest.raises(RoverError, match="a peer gave"):
             peers.peer_metrics(counted(wrong), manifest, reference, RANGES)
 
 
@@ -124,17 +125,17 @@ def test_as_many_layers_are_int8_as_in_ours(tiny, tiny_run):
     expected = peers.int8_layers(tiny)
     assert expected == ours.report["int8_modules"] > 20
     peers.check_int8("engine", {"int8_layers": expected, "float_layers": ["head"]}, expected)
-    with pytest.raises(CountError, match=rf"engine: 3 .* became INT8, and {expected} in ours; float are \['a', 'b'\]"):
+    with pytest.raises(RoverError, match=rf"engine: 3 .* became INT8, and {expected} in ours; float are \['a', 'b'\]"):
         peers.check_int8("engine", {"int8_layers": 3, "float_layers": ["a", "b"]}, expected)
 
 
 def test_counts_of_another_policy_are_refused(tmp_path):
-    with pytest.raises(CountError, match=r"arm\.json: not found; count the run's own artifacts first"):
+    with pytest.raises(RoverError, match=r"arm\.json: not found; count the run's own artifacts first"):
         peers.count_peers(tmp_path)
     (tmp_path / "policy_fp32.pt").write_bytes(b"one")
     arm_json(tmp_path)
     (tmp_path / "policy_fp32.pt").write_bytes(b"another")
-    with pytest.raises(CountError, match=r"counted from another policy_fp32\.pt; count the run's own artifacts"):
+    with pytest.raises(RoverError, match=r"counted from another policy_fp32\.pt; count the run's own artifacts"):
         peers.count_peers(tmp_path)
 
 

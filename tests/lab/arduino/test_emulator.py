@@ -13,9 +13,10 @@ from needs import ended, until
 
 from balloon_world.simulated_arduino import StandIn
 from lab.arduino import emulator as arduino
-from lab.arduino.emulator import ArduinoError, EmulatedArduino, board
+from lab.arduino.emulator import EmulatedArduino, board
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.car.servo_link import ServoLink, State
+from rover_lib.onboard.errors import RoverError
 
 with_firmware = [pytest.mark.emulated, needs.simavr]
 BOARDS = [pytest.param(StandIn, id="stand-in"), pytest.param(board, id="firmware", marks=with_firmware)]
@@ -82,14 +83,14 @@ def test_opening_the_port_again_does_not_reset_it(kind):
 
 def test_missing_packages_are_named_with_the_command(monkeypatch):
     monkeypatch.setitem(arduino.NEEDS, "/nowhere", "gcc-avr")
-    with pytest.raises(ArduinoError, match=r"gcc-avr.*apt-get install .*gcc-avr"):
+    with pytest.raises(RoverError, match=r"gcc-avr.*apt-get install .*gcc-avr"):
         arduino.build.__wrapped__()
 
 
 def test_without_a_checkout(monkeypatch, tmp_path):
     monkeypatch.setattr(arduino, "NEEDS", {})
     monkeypatch.setattr(arduino, "FIRMWARE", tmp_path / "firmware")
-    with pytest.raises(ArduinoError, match="needs a checkout"):
+    with pytest.raises(RoverError, match="needs a checkout"):
         arduino.build.__wrapped__()
 
 
@@ -98,7 +99,7 @@ def test_without_a_checkout(monkeypatch, tmp_path):
 def test_when_it_has_ended():
     with EmulatedArduino() as board:
         os.kill(board.pid, signal.SIGKILL)
-        with pytest.raises(ArduinoError, match="has ended"):
+        with pytest.raises(RoverError, match="has ended"):
             until(lambda: board.pulses() and False)
     board.close()
     assert not os.path.lexists(board.port)

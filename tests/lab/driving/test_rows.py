@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from lab.__main__ import main
 from lab.arduino.emulator import REPOSITORY
 from lab.driving import faults
-from lab.driving.on_pins import PIN_ROWS, FaultError
+from lab.driving.on_pins import PIN_ROWS
 from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
 from lab.driving.rows import all_rows, rows_of, run_row
 from lab.driving.stories import KEPT
@@ -19,6 +19,7 @@ from lab.driving.virtual import LOST, STUCK, World
 from lab.driving.virtual_host import VirtualLink
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.servo_link import LinkError, State
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 
 SAFETY = (REPOSITORY / "docs" / "safety.md").read_text()
@@ -161,7 +162,7 @@ def test_nothing_arms_it_unattended(relay):
 def test_a_fault_that_is_none():
     done = CliRunner().invoke(main, ["faults", "--only", "camera melted"])
     assert done.exit_code == 1 and "camera melted" in done.output
-    with pytest.raises(FaultError):
+    with pytest.raises(RoverError):
         faults.run_faults(kinds=["weather"])
 
 

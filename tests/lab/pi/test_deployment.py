@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from lab.pi import container, deployment, emulation, playbooks
-from lab.pi.emulation import EmulationError
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 
 OUTPUT = """
@@ -39,10 +39,10 @@ def test_pip_finds_packages_elsewhere_as_it_does_here():
 
 
 def test_it_begins_only_with_an_artifact_and_as_root(tmp_path, monkeypatch):
-    with pytest.raises(EmulationError, match="make demo"):
+    with pytest.raises(RoverError, match="make demo"):
         deployment.deploy_and_drive(tmp_path / "pi.json", tmp_path)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    with pytest.raises(EmulationError, match="use sudo"):
+    with pytest.raises(RoverError, match="use sudo"):
         emulation.require()
 
 
@@ -51,8 +51,8 @@ def test_what_fails_is_said_and_written(tmp_path):
     report = deployment.Report(tmp_path / "pi.json", {"a.pt": "00"}, said.append)
     report.gate("provision again", "changed=0", 0, True)
     report.gate("rollback", "model a in use", "b", False)
-    with pytest.raises(EmulationError), report.step("deploy"):
-        raise EmulationError("no")
+    with pytest.raises(RoverError), report.step("deploy"):
+        raise RoverError("no")
     metrics = read_stage(tmp_path / "pi.json", "pi")["metrics"]
     assert metrics["wrong"] == report.wrong and len(report.wrong) == 1
     assert [gate["holds"] for gate in metrics["gates"]] == [True, False]

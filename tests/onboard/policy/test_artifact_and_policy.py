@@ -13,7 +13,7 @@ from policies import memory_samples
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.acceptance import inspect_artifact
-from rover_lib.onboard.errors import ArtifactError, FrameError, PolicyError
+from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy import memory
 
 FRAME = memory_samples(1)[0].picture
@@ -76,8 +76,8 @@ def test_a_policy_of_gelu_drives_and_is_accepted(tiny, tmp_path):
 @pytest.mark.parametrize(
     ("frame", "state", "error"),
     [
-        (None, STATE, FrameError),
-        (FRAME[:, :, 0], STATE, FrameError),
+        (None, STATE, PolicyError),
+        (FRAME[:, :, 0], STATE, PolicyError),
         (FRAME, np.zeros(3), PolicyError),
         (FRAME, np.array([np.nan, 0]), PolicyError),
         ({"other": FRAME}, STATE, PolicyError),

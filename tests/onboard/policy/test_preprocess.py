@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from policies import smooth_frame
 
-from rover_lib.onboard.errors import FrameError
+from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
 
 
@@ -48,5 +48,5 @@ def test_any_size_keeps_a_flat_colour(h, w, height, width, value):
 
 @pytest.mark.parametrize("bad", [None, np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
 def test_refuses_what_is_no_picture(bad):
-    with pytest.raises(FrameError):
+    with pytest.raises(PolicyError):
         prepare_frame(bad, 360, 640)

@@ -371,22 +371,22 @@ def test_hosts_that_are_ours(interface, host, ours):
 def test_what_cannot_be_opened(tmp_path):
     async def both():
         async with Bench(tmp_path) as bench:
-            with pytest.raises(v.ViewError, match="another view"):
+            with pytest.raises(v.RoverError, match="another view"):
                 async with Bench(tmp_path):
                     pass
             port = int(bench.base.rpartition(":")[2])
-            with pytest.raises(v.ViewError, match=f"port {port} "):
+            with pytest.raises(v.RoverError, match=f"port {port} "):
                 v.Address(port).open()
 
     asyncio.run(both())
     assert not (tmp_path / "view").exists()
-    with pytest.raises(v.ViewError, match="nosuch0"):
+    with pytest.raises(v.RoverError, match="nosuch0"):
         v.Address(0, "nosuch0").open()
     (tmp_path / "view").write_text("a user's")
-    with pytest.raises(v.ViewError, match="not a socket"):
+    with pytest.raises(v.RoverError, match="not a socket"):
         asyncio.run(both())
     assert (tmp_path / "view").read_text() == "a user's"
-    with pytest.raises(v.ViewError, match="nobody-of-that-name"):
+    with pytest.raises(v.RoverError, match="nobody-of-that-name"):
         v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
 
 
@@ -406,7 +406,7 @@ def test_a_socket_that_a_killed_view_has_left_is_taken(tmp_path):
 @pytest.mark.parametrize("content", ["short", "with a blank in the middle", "ä" * 20])
 def test_a_token_that_could_be_guessed_is_refused(tmp_path, content):
     (tmp_path / "token").write_text(content)
-    with pytest.raises(v.ViewError, match="16 letters"):
+    with pytest.raises(v.RoverError, match="16 letters"):
         v.read_token(tmp_path / "token")
 
 
@@ -414,5 +414,5 @@ def test_tokens(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     assert v.read_token(tmp_path / "token") == TOKEN
     assert len(v.new_token()) >= 20 and v.new_token() != v.new_token()
-    with pytest.raises(v.ViewError, match="the token cannot be read"):
+    with pytest.raises(v.RoverError, match="the token cannot be read"):
         v.read_token(tmp_path / "none")

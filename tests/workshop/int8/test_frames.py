@@ -11,7 +11,7 @@ import torch
 from policies import dazzled_by_white, memory_samples
 from recorded import odd_policy
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import inputs_of
 from rover_lib.workshop.int8 import frames
@@ -108,9 +108,9 @@ def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_pa
     for observer in (m for m in graph.modules() if isinstance(m, RangeObserver)):
         low, high = observer.range()
         assert observer.min_val <= low <= 0 <= high <= max(observer.max_val, 0)
-    with pytest.raises(QuantizeError, match="layer9"):
+    with pytest.raises(ArtifactError, match="layer9"):
         restore_observed(dazzled, Scheme(observer="frames", usual_pct=75, wider=(("layer9", 0.5),)), again)
-    with pytest.raises(QuantizeError, match="kept no frames"):
+    with pytest.raises(ArtifactError, match="kept no frames"):
         restore_observed(dazzled, Scheme(observer="frames"), replace(again, frames={}))
 
 

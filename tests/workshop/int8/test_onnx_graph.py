@@ -8,7 +8,7 @@ import torch
 from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
 from torch import nn
 
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -134,5 +134,5 @@ def test_part_with_two_outputs():
 
 
 def test_what_has_no_form_is_named():
-    with pytest.raises(QuantizeError, match="Tanh has no form in ONNX"):
+    with pytest.raises(ArtifactError, match="Tanh has no form in ONNX"):
         onnx_model(graph_of(nn.Sequential(nn.Tanh())), {"x": torch.zeros(1, 2)}, ("y",))

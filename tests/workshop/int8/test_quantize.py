@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from policies import TINY, lerobot_policy, memory_samples, saved
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE
-from rover_lib.onboard.errors import QuantizeError
+from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ACT, inputs_of, predictions
@@ -143,7 +143,7 @@ class Sandwich(torch.nn.Module):
 @pytest.mark.parametrize(("reason", "layer", "x", "dtype"), slow_layers())
 def test_the_guard_names_a_layer_that_misses_the_fast_kernels(reason, layer, x, dtype):
     scale = 2000.0 if "ratio" in reason else 0.05
-    with pytest.raises(QuantizeError, match=f"1 of 1 layers would miss the fast kernels: inner: .*{reason}"):
+    with pytest.raises(ArtifactError, match=f"1 of 1 layers would miss the fast kernels: inner: .*{reason}"):
         q.check_fast(Sandwich(layer, dtype, scale), (x,))
 
 
@@ -161,7 +161,7 @@ def test_the_backbone_alone_gives_the_policys_tokens(tiny, made):
     assert tokens.dtype == torch.int8 and torch.equal(tokens, seen[0]) and tokens.unique().numel() > 10
     assert not any(n.startswith("encoder") for n, _ in backbone.named_modules())
     for mode in ({"mode": "dynamic"}, {"mode": "mixed", "float_blocks": ("image_project",)}):
-        with pytest.raises(QuantizeError, match="no INT8 backbone"):
+        with pytest.raises(ArtifactError, match="no INT8 backbone"):
             q.backbone_of(made(Scheme(**mode)))
 
 
@@ -188,11 +188,11 @@ def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, made):
 
 def test_a_mode_that_changed_nothing_is_an_error(tiny, calibration, monkeypatch):
     monkeypatch.setattr(observe, "_pattern", lambda block, relu: "no such module")
-    with pytest.raises(QuantizeError):
+    with pytest.raises(ArtifactError):
         quantize(tiny, Scheme("static"), calibration)
-    with pytest.raises(QuantizeError, match="nothing was quantized"):
+    with pytest.raises(ArtifactError, match="nothing was quantized"):
         q.check_acted({}, ["a"])
-    with pytest.raises(QuantizeError, match="1 of 2 layers stayed float: b"):
+    with pytest.raises(ArtifactError, match="1 of 2 layers stayed float: b"):
         q.check_acted({"a": torch.nn.Identity()}, ["a", "b"])
 
 
@@ -216,14 +216,14 @@ def test_refusals(tiny, calibration, tmp_path):
         "percentile": lambda: Scheme(percentile=0.0),
     }
     for words, act_on in refused.items():
-        with pytest.raises(QuantizeError, match=words):
+        with pytest.raises(ArtifactError, match=words):
             act_on()
 
 
 def test_non_finite_activations_are_an_error(tiny):
     weights = {k: v.clone() for k, v in tiny.weights.items()}
     weights["backbone.conv1.weight"] *= 1e38
-    with pytest.raises(QuantizeError, match="NaN or Inf"):
+    with pytest.raises(ArtifactError, match="NaN or Inf"):
         calibrate(replace(tiny, weights=weights), memory_samples(1))
 
 
@@ -400,6 +400,6 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
 
     monkeypatch.setattr("rover_lib.workshop.int8.export.TorchScript", badly_written)
     policy = q.QuantizedPolicy(Scheme(), tiny.config, off, {})
-    with pytest.raises(QuantizeError, match="throttle of the written graph differs"):
+    with pytest.raises(ArtifactError, match="throttle of the written graph differs"):
         export(policy, tiny, tmp_path / "a.pt", memory_samples(2), calibration)
     assert not (tmp_path / "a.pt").exists()

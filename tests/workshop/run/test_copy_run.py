@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run.copy_run import copy_run
-from rover_lib.workshop.run.run import NotebookError
 
 
 @pytest.fixture
@@ -32,5 +32,5 @@ def test_a_copy_works_in_its_own_folder_and_reads_the_same_recordings(run_dir):
 @pytest.mark.parametrize(("name", "copy"), [("dmo", ""), ("demo", "demo"), ("demo", "taken")])
 def test_what_cannot_be_copied_is_refused(run_dir, name, copy):
     (run_dir.parent / "taken").mkdir()
-    with pytest.raises(NotebookError):
+    with pytest.raises(RoverError):
         copy_run(name, copy, run_dir.parent)
