@@ -23,10 +23,16 @@ def make_rover(tmp_path, noise):
     with contextlib.ExitStack() as stack:
         feed = stack.enter_context(CameraFeed(tmp_path / "camera", *noise))
 
+        made = []
+
         def make(port, **options):
+            for earlier in made:  # of an attempt that was spoilt: it holds the log
+                if earlier.is_connected:
+                    earlier.disconnect()
             given = {"film": True, "width": 96, "height": 48, "log": tmp_path / "flight.log"} | options
             camera = given.pop("camera", str(tmp_path / "camera"))
             rover = Rover(RoverConfig(port=port, camera=camera, calibration_dir=tmp_path, **given))
+            made.append(rover)
             stack.callback(lambda: rover.is_connected and rover.disconnect())
             return rover, feed
 

@@ -161,7 +161,7 @@ def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
         assert draccus.parse(config, args=words).robot.type == "rover"
         parsed.append(program)
-    assert len(parsed) == (5 if ENDING else 3), parsed
+    assert len(parsed) == (4 if ENDING else 3), parsed
 
 
 @pytest.fixture(scope="module")

@@ -70,8 +70,8 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor]) -> None:
             )
     sizes = (c.chunk, c.dim, c.heads, c.feedforward, c.encoder_layers, c.decoder_layers)
     positions = tuple(weights["decoder_pos_embed.weight"].shape) if "decoder_pos_embed.weight" in weights else None
-    layers = c.encoder_layers + c.decoder_layers
-    if not all(is_whole(size, 1) for size in sizes) or positions != (c.chunk, c.dim) or layers > len(weights):
+    whole = all(is_whole(size, 1) for size in sizes)  # LeRobot 0.6 lets None pass
+    if not whole or positions != (c.chunk, c.dim) or c.encoder_layers + c.decoder_layers > len(weights):
         raise CheckpointError(
             f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)",
             found=f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}",
