@@ -161,4 +161,5 @@ def test_every_command_that_we_print_is_one():
 
 def test_the_pages_are_short():
     """A page that grows must take something out of another."""
-    assert sum(len(page.read_text().split()) for page in (ROOT / "docs").glob("*.md")) <= 12_300
+    pages = [*(ROOT / "docs").glob("*.md"), ROOT / "ansible" / "README.md"]
+    assert sum(len(page.read_text().split()) for page in pages) <= 11_000
