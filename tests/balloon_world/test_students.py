@@ -159,7 +159,7 @@ def moved(made, name):
         (lambda made: moved(made, "teacher"), "none is 'teacher'"),
         (lambda made: (made.student / "distill.json").unlink() or made.student, "no distill.json in it"),
         (lambda made: (made.student / "policy_static.pt").unlink() or made.student, r"policy_static\.pt: not there"),
-        (lambda made: (made.teacher / "policy_fp32.pt").unlink() or made.student, "--mode fp32 -o"),
+        (lambda made: (made.teacher / "policy_fp32.pt").unlink() or made.student, "as it was trained"),
         (lambda made: (made.teacher / "load.json").unlink() or made.student, "give --episodes"),
         (lambda made: distilled(made.student, teacher="another") or made.student, "a student of another checkpoint"),
         (lambda made: distilled(made.student, own="another") or made.student, "not made of the student"),
