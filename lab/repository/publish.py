@@ -21,8 +21,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
-RESULTS_OF = {"05_benchmark": "benchmark-*", "06_arm": "arm", "07_drive": "drive", "08_distill": "students"}
-RESULTS_OF["09_learn"] = "learn"  # the others' stages are their names
+RESULTS_OF = {"05_benchmark": "benchmark-*", "08_distill": "students"}  # the others' stages are their names
 OF_LABORATORY = ("faults*.json", "random.json", "mutants.json")  # in runs/, where make leaves them
 LARGE = 120_000  # bytes of a picture
 LIMIT = 1_000_000  # bytes, of a committed notebook or JSON

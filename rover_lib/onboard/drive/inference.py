@@ -304,7 +304,7 @@ def _load_confined(artifact: str, threads: int) -> tuple[Any, str]:
     if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
         raise PolicyError(
             f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
-            remedy="this car has one camera, steering and throttle, by these names (quantize: --action-names)",
+            remedy="this car has one camera, steering and throttle, by these names (rover run: --action-names)",
         )
     return policy, unconfined
 

@@ -8,13 +8,11 @@ writing, the serial port or a socket, start a program, or touch another process,
 sandbox does some of this too, but for the service as a whole, whose control loop needs the serial port.
 """
 
-import contextlib
 import ctypes
 import os
 import platform
 import resource
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 from rover_lib.onboard.errors import ArtifactError
@@ -119,17 +117,6 @@ def confine(limit_mb: float) -> str:
     return ""
 
 
-@contextlib.contextmanager
-def less_memory(limit_mb: float) -> Iterator[None]:
-    """Inside this context the process may allocate at most limit_mb more; beyond that, a MemoryError is raised."""
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb), hard=before[1])
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
 def _bytes_with(limit_mb: float) -> int:
     """Return the size in bytes that this process's data will have once it has allocated limit_mb more."""
     status = Path("/proc/self/status").read_text()
@@ -141,7 +128,7 @@ def forbid_opening() -> None:
     _lower(resource.RLIMIT_NOFILE, 0)
 
 
-def _lower(limit: int, value: int, hard: int | None = None) -> None:
+def _lower(limit: int, value: int) -> None:
     most = resource.getrlimit(limit)[1]
     value = value if most == resource.RLIM_INFINITY else min(value, most)
-    resource.setrlimit(limit, (value, value if hard is None else hard))
+    resource.setrlimit(limit, (value, value))

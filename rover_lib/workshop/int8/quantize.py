@@ -202,25 +202,6 @@ def _layer_row(name: str, m: Int8Layer) -> dict[str, Any]:
     return row
 
 
-def backbone_of(quantized: QuantizedPolicy) -> nn.Module:
-    """The INT8 part of a static policy that is the same to the last bit on every processor: all up to the tokens.
-
-    Called like the policy; returns what `image_project` gives for the first camera, (1, D, h, w) int8. Raises
-    ArtifactError where that is not INT8.
-    """
-    module = copy.deepcopy(quantized.module)
-    if not isinstance(module, GraphModule) or "image_project" not in int8_layers(module):
-        raise ArtifactError(f"a {quantized.scheme.mode} policy whose image_project is not INT8 has no INT8 backbone")
-    tokens = next(n for n in module.graph.nodes if n.target == "image_project")
-    (output,) = (n for n in module.graph.nodes if n.op == "output")
-    with module.graph.inserting_before(output):
-        output.args = (module.graph.call_method("int_repr", (tokens,)),)
-    module.graph.eliminate_dead_code()
-    module.delete_all_unused_submodules()
-    module.recompile()
-    return module
-
-
 def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> GraphModule:
     """The observed graph with its blocks in INT8: all but the scheme's float blocks, or `only` those.
 

@@ -148,24 +148,6 @@ def test_the_guard_names_a_layer_that_misses_the_fast_kernels(reason, layer, x, 
 
 
 @pytest.mark.slow
-def test_the_backbone_alone_gives_the_policys_tokens(tiny, made):
-    quantized = made(Scheme("static"))
-    backbone = q.backbone_of(quantized)
-    seen = []
-    project = quantized.module.get_submodule("image_project")
-    hook = project.register_forward_hook(lambda m, args, out: seen.append(out.int_repr()))
-    x = inputs(tiny, 1)[0]
-    quantized.module(*x)
-    hook.remove()
-    tokens = backbone(*x)
-    assert tokens.dtype == torch.int8 and torch.equal(tokens, seen[0]) and tokens.unique().numel() > 10
-    assert not any(n.startswith("encoder") for n, _ in backbone.named_modules())
-    for mode in ({"mode": "dynamic"}, {"mode": "mixed", "float_blocks": ("image_project",)}):
-        with pytest.raises(ArtifactError, match="no INT8 backbone"):
-            q.backbone_of(made(Scheme(**mode)))
-
-
-@pytest.mark.slow
 def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, made):
     """The first layer's INT8 output against quantize -> float convolution -> quantize, to one step."""
     quantized = made(Scheme("static"))
