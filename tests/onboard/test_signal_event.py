@@ -11,7 +11,7 @@ from rover_lib.onboard.signal_event import SignalEvent
 
 
 def interrupted(work, handler):
-    """Do the work again and again, interrupted by the handler at another line each time; return how many there are.
+    """Repeat the work, interrupted by the handler at another line each time; return how many there are.
 
     The handler is called as Python calls one of a signal: between two steps of the thread that works. Fails where that
     thread never comes to its end.

@@ -177,7 +177,7 @@ class HealthWatch:
 
 
 def _spent() -> tuple[int, int]:
-    """Return the processors' time in the kernel's ticks, idle and in total; zeros if the kernel does not tell."""
+    """Return the processors' time in the kernel's ticks, idle and in total; zeros if the kernel reports none."""
     try:
         spent = [int(value) for value in Path("/proc/stat").read_text().partition("\n")[0].split()[1:9]]
         return spent[3] + spent[4], sum(spent)

@@ -73,7 +73,7 @@ class Systemd:
             self.hear(0.05)
 
     def feeds(self, seconds: float) -> int:
-        """How often the watchdog is fed within so long."""
+        """How often the watchdog is fed within a duration."""
         return self.hear(seconds).count("WATCHDOG=1")
 
 
