@@ -101,7 +101,7 @@ class Page:
         try:
             async with aiohttp.ClientSession() as browser:
                 url = f"{self._base}/ws?token={self._token}"
-                self._wire = await browser.ws_connect(url, headers={"Origin": self._base})
+                self._wire = await browser.ws_connect(url)
                 self._open.set()
                 async for message in self._wire:
                     if message.type == aiohttp.WSMsgType.BINARY:
