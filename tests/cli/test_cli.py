@@ -4,13 +4,14 @@ import errno
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard.cli import show
-from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
 
 
 def rover(*args):
@@ -53,6 +54,26 @@ def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     assert content == json.loads((folder / "run.json").read_text())
     for listed in (rover("inspect", folder.parent, "--json"), rover("inspect", "--json")):
         assert json.loads(listed.output)["runs"] == {"mine": content["metrics"]["headline"]}
+
+
+def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monkeypatch):
+    file = tmp_path / "drive.json"
+    write_stage(file, "drive", params={}, metrics={"of": "before"})
+
+    def execute(*args, **given):
+        assert not file.exists()  # so that it is measured again
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rover_lib.workshop.run.run.execute", execute)
+    assert rover("world", "latency", tmp_path).exit_code == 1
+    assert read_stage(file, "drive")["metrics"] == {"of": "before"}
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("rover_learn.train.train", Mock(side_effect=KeyboardInterrupt))
+    result = rover("train", tmp_path, tmp_path / "out.pth")
+    assert result.exit_code == 130 and "resume" in result.output
 
 
 def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatch):

@@ -143,14 +143,14 @@ def pulses_of(actions):
 
 
 @pytest.mark.slow
-def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
+def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
     """Those of this LeRobot: in 0.6 lerobot-record drives no policy, and in 0.4 there is no lerobot-rollout."""
     import draccus
 
     # draccus reads a class's source once more for each of its fields.
     once = SimpleNamespace(getsource=functools.cache(inspect.getsource))
     monkeypatch.setattr("draccus.wrappers.docstring.inspect", once)
-    text, parsed = (ROOT / "docs" / "lerobot.md").read_text().replace("\\\n", " "), []
+    text, parsed = "".join(p.read_text() for p in (ROOT / "docs").glob("*.md")).replace("\\\n", " "), []
     for line in re.findall(r"^    (lerobot-\w+ .*)$", text, re.M):
         program, *words = shlex.split(line.partition(" # ")[0])
         if not (BIN / program).exists() or (ENDING and program == "lerobot-record" and "policy" in line):
@@ -158,9 +158,9 @@ def test_lerobots_own_parser_takes_what_the_page_says(monkeypatch):
         module = importlib.import_module(f"lerobot.scripts.{program.replace('-', '_')}")
         config = typing.get_type_hints(getattr(module, program.partition("-")[2]).__wrapped__)["cfg"]
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
-        assert draccus.parse(config, args=words).robot.type == "rover"
+        assert draccus.parse(config, args=words)
         parsed.append(program)
-    assert len(parsed) == 3, parsed
+    assert len(parsed) == (3 if ENDING else 4), parsed
 
 
 @pytest.fixture(scope="module")
