@@ -1,5 +1,6 @@
 """`rover drive` whole, as a user calls it: a car of its own process, a camera, a serial line, exit codes, files."""
 
+import asyncio
 import json
 import signal
 import subprocess
@@ -88,33 +89,52 @@ def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path, number=signa
     assert json.loads((folder / "drive").read_text())["ended"] == "told to stop"
 
 
+async def watch_and_stop(url: str) -> list[dict]:
+    """Show a drive's page, confirm each message, click on stop after 20 of the drive, and return all of them."""
+    import aiohttp
+
+    base, _, token = url.partition("/?token=")
+    heads: list[dict] = []
+    async with aiohttp.ClientSession() as browser, browser.ws_connect(f"{base}/ws?token={token}") as page:
+        while not heads or heads[-1]["phase"] != "ended":
+            message = await page.receive(timeout=120)
+            if message.type == aiohttp.WSMsgType.BINARY:
+                line, _, jpeg = message.data.partition(b"\n")
+                heads.append(json.loads(line) | {"jpeg_bytes": len(jpeg)})
+                await page.send_str(f"shown {heads[-1]['n']}")
+                if sum(head["phase"] == "driving" for head in heads) == 20:
+                    await page.send_str("stop")
+    return heads
+
+
 @real_time
 def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
     pytest.importorskip("aiohttp", reason="needs the extra view")
-    from view_page import Page, ViewServer
-
     folder = fresh(tmp_path)
+    served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
     options = ["--world", "--ticks", "300", "--view", folder / "view", "--log", folder / "flight.log"]
     command = [*ROVER, demo_run / "policy_static.pt", *options, "--json", folder / "drive"]
-    with ViewServer(folder / "view") as server, Page(server.url) as page:
-        with subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True) as process:
+    view = subprocess.Popen(served, stdout=subprocess.PIPE, text=True)
+    try:
+        url = view.stdout.readline().strip()
+        with subprocess.Popen(list(map(str, command))) as process:
             try:
-                until(lambda: sum(m["phase"] == "driving" for m in page.messages) > 20, 120)
-                page.stop()
-                until(lambda: page.newest["phase"] == "ended")
-                _, stderr = process.communicate(timeout=60)
-                assert process.returncode == 0, stderr
+                heads = asyncio.run(watch_and_stop(url))
+                assert process.wait(60) == 0
             finally:
                 process.kill()
-        assert page.newest["stopped"] and page.newest["pins"][1] == 120
-        ended = json.loads((folder / "drive").read_text())["ended"]
-        assert ended == page.newest["text"] == "stopped from the view (127.0.0.1)"
+    finally:
+        view.terminate()
+        view.communicate()
+    ended = json.loads((folder / "drive").read_text())["ended"]
+    assert ended == heads[-1]["text"] == "stopped from the view (127.0.0.1)"
+    assert heads[-1]["stopped"] and heads[-1]["pins"][1] == 120
     ticks = read_log(folder / "flight.log").ticks
-    for message in (m for m in page.messages if m["phase"] == "driving"):
-        assert message["jpeg_bytes"] > 1000 and message["size"] == [640, 360]
-        row = int(np.argmin(np.abs(ticks["t_s"] - message["tick"]["t_s"])))
+    for head in (head for head in heads if head["phase"] == "driving"):
+        assert head["jpeg_bytes"] > 1000 and head["size"] == [640, 360]
+        row = int(np.argmin(np.abs(ticks["t_s"] - head["tick"]["t_s"])))
         for name in ("steering_us", "throttle_us", "pins_steering_us", "pins_throttle_us", "plan", "frame"):
-            assert message["tick"][name] == ticks[name][row]
+            assert head["tick"][name] == ticks[name][row]
 
 
 @real_time
