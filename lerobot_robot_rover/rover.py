@@ -121,7 +121,7 @@ class Rover(CarPart, Robot):
 
         Both are neutral before the first action. Waits for a picture that LeRobot has not seen. If the car is not
         armed, it first waits for the human's gesture, as connect() does. Raises CameraError for a camera that stopped,
-        froze or shows nothing, LinkError if the link is gone, and DriveFault or TakenOver if that ended the drive.
+        froze or shows nothing, LinkError if the link is gone, and DriveFault if that ended the drive.
         """
         self._check_connected()
         if self._ride:

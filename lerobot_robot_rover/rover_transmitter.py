@@ -80,7 +80,7 @@ class RoverTransmitter(CarPart, Teleoperator):
         telemetry = link.latest()
         sticks = _sticks(telemetry)
         actions = link.calibration.actions_from_pulses(*sticks) if sticks else None
-        if telemetry is None or actions is None or None in (actions.steering, actions.throttle):
+        if telemetry is None or actions is None or actions.steering is None or actions.throttle is None:
             what = f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that"
             raise LinkError(what, remedy=f"{link.remedy('s')} and record this episode again; those before it are kept")
         self._check_passed_on(telemetry, link.calibration.throttle)

@@ -29,7 +29,7 @@ from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.service import Request, Service
-from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, TakenOver, sentence_of
+from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, sentence_of
 from rover_lib.onboard.params import params
 
 RATE_HZ = 30.0
@@ -448,7 +448,7 @@ class Process:
         world.phase("opening")
         try:
             yield
-        except (DriveFault, TakenOver):
+        except DriveFault:
             if not self._service:
                 raise
         except Exception as error:

@@ -81,11 +81,11 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     from rover_lib.workshop.run.run_folder import run_folder
 
     given = _values_of(turned)
-    if (bool(only), bool(checkpoint), bool(episodes)) not in ((True, False, False), (False, True, True)):
-        raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
-    if only:
+    if only and not (checkpoint or episodes):
         folder = run_folder(options["runs_dir"], options["name"], RoverError)
         return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
+    if only or not (checkpoint and episodes):
+        raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
     given = {k: v for k, v in options.items() if v is not None} | given
     _judge(run_notebooks(checkpoint, episodes, progress=terminal_bar(), **given))
 

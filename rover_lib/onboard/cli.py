@@ -106,8 +106,7 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     from rover_lib.onboard.drive.drive import drive_car
     from rover_lib.onboard.drive.loop import Report
     from rover_lib.onboard.drive.opening import DriveOptions
-    from rover_lib.onboard.drive.service import NotArmed
-    from rover_lib.onboard.errors import DriveFault, TakenOver
+    from rover_lib.onboard.errors import DriveFault
 
     o = DriveOptions(**options)
     if o.service and o.dry_run:
@@ -117,11 +116,11 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     report, code = Report(), 0
     try:
         drive_car(o, report, car)
-    except NotArmed as e:
-        click.echo(f"rover: {e}", err=True)
-    except (DriveFault, TakenOver) as e:
-        click.echo(f"rover: {e}", err=True)
-        code = 4 if isinstance(e, TakenOver) else 3
+    except RoverError as e:
+        if not (isinstance(e, DriveFault) or e.kind == "not armed" or report.ticks):
+            raise
+        notify(f"rover: {e}")
+        code = {"not armed": 0, "taken over": 4}.get(e.kind, 3)
     except Exception:  # whatever ended a drive, the summary of what was driven is still written
         if not report.ticks:
             raise
@@ -428,11 +427,11 @@ def status(releases: Any, as_json: bool) -> None:
         import socket
 
         from rover_lib.onboard.car.host import Host, default_log
-        from rover_lib.onboard.drive.service import ServiceError, state_of
+        from rover_lib.onboard.drive.service import state_of
 
         try:
             report["service"] = state_of()
-        except ServiceError as e:
+        except RoverError as e:
             report["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
         log = next((p for p in (Path("/var/lib/rover-drive/flight.log"), default_log()) if p.exists()), None)
         report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
@@ -481,11 +480,12 @@ def open_view(
     whose `ask` gets what is asked for on the page.
     """
     import asyncio
+    import secrets
 
     from rover_lib.onboard.car.host import default_view
-    from rover_lib.onboard.view.server import Address, View, new_token, read_token
+    from rover_lib.onboard.view.server import Address, View, read_token
 
-    token = read_token(token_file) if token_file else new_token()
+    token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
     address, ask = Address(web_port, interface), getattr(shown, "ask", None)
     view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)

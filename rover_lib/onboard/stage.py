@@ -86,7 +86,7 @@ def private_lock(path: Path | str) -> FileLock:
     with contextlib.suppress(FileNotFoundError):
         if Path(path).stat().st_mode & 0o077:
             Path(path).unlink()
-    return FileLock(path, timeout=0, mode=0o600)
+    return FileLock(path, timeout=0, mode=0o600, thread_local=False)
 
 
 def sha256_of(path: Path | str) -> str:

@@ -12,7 +12,7 @@ def versions() -> list[str]:
     """A line each for rover, Python and every engine's package."""
     lines = [
         f"rover {version_of('rover-policy') or f'{UNTAGGED}, not installed'}",
-        f"Python {platform.pythonversion_of()}",
+        f"Python {platform.python_version()}",
     ]
     for engine, package in PACKAGES.items():
         there = (

@@ -24,7 +24,7 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError
 
 GO = {"steering": 0.2, "throttle": 0.15}
 HUNG_S = 1.0
@@ -168,7 +168,7 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
 @pytest.mark.parametrize(
     ("happens", "error"),
     [
-        (lambda board, feed: board._enter("M", "h"), TakenOver),
+        (lambda board, feed: board._enter("M", "h"), DriveFault),
         (lambda board, feed: board._reset(), DriveFault),
         (lambda board, feed: feed.freeze(), DriveFault),
         (lambda board, feed: feed.show(*jpegs()), DriveFault),
@@ -185,7 +185,7 @@ def test_what_a_drive_detects_is_detected(bench, happens, error, patient):
             turn(rover, seconds=3)
         until(lambda: rover._ride is None or rover._ride.over)
         for ask in (rover.get_observation, lambda: rover.send_action(GO)):
-            with pytest.raises((TakenOver, DriveFault, CameraError)):
+            with pytest.raises((DriveFault, CameraError)):
                 ask()
         assert on.board._state != "A"
 

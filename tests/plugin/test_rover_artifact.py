@@ -124,7 +124,7 @@ def test_a_packed_folder_is_a_pretrained_policy(artifact, tmp_path, monkeypatch)
     done = CliRunner().invoke(main, [str(artifact), str(folder), "--n-action-steps", "5"])
     assert done.exit_code == 0, done.output
     again = CliRunner().invoke(main, [str(artifact), str(folder)])
-    assert again.exit_code == 1 and again.output.startswith("Error: ") and "already" in again.output
+    assert again.exit_code == 1 and again.output.startswith("Error: ")
     files = [artifact.name, "config.json", "policy_postprocessor.json", "policy_preprocessor.json"]
     assert sorted(p.name for p in folder.iterdir()) == sorted(files)
     folder.rename(moved)

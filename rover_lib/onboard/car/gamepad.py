@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CarError
 
 EVENT = struct.Struct("llHHi")  # struct input_event: seconds, microseconds, type, code, value
 SYN, KEY, ABS, DROPPED, BTN_L1 = 0x00, 0x01, 0x03, 3, 0x136
@@ -32,10 +32,6 @@ ALIVE_S = 0.1  # with nothing from the gamepad for longer, or with older events,
 OPEN_S = 1.0  # for its first events
 
 _log = logging.getLogger(__name__)
-
-
-class GamepadError(RoverError):
-    """There is no gamepad that can be used, or it is not clear which."""
 
 
 @dataclass(frozen=True)
@@ -163,11 +159,11 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
 
 
 def open_gamepad(list_them: Callable[[], list[Found]] = list_gamepads) -> Gamepad:
-    """Open the only gamepad that can be used. GamepadError says why there is none, or why it cannot be read."""
+    """Open the only gamepad that can be used. CarError says why there is none, or why it cannot be read."""
     found = list_them()
     usable = [(pad, pad.motion) for pad in found if pad.motion]
     if len(usable) != 1:
-        raise GamepadError(
+        raise CarError(
             "which gamepad is the human's?" if usable else "no gamepad that can be used is connected",
             found=", ".join(map(str, found)) or "none in /dev/input",
             remedy="connect only one" if usable else "connect a DualShock 4, DualSense or Switch Pro Controller",
@@ -182,7 +178,7 @@ def open_gamepad(list_them: Callable[[], list[Found]] = list_gamepads) -> Gamepa
     except OSError as error:
         for fd in fds:
             os.close(fd)
-        raise GamepadError(
+        raise CarError(
             f"the gamepad {pad} cannot be read ({error.strerror})",
             remedy="is this user in group input? sudo usermod -aG input $USER, and log in again",
         ) from error
@@ -192,7 +188,7 @@ def open_gamepad(list_them: Callable[[], list[Found]] = list_gamepads) -> Gamepa
         gamepad.sticks()
     if gamepad.silent_s > ALIVE_S:
         gamepad.close()
-        raise GamepadError(f"the gamepad {pad} sends nothing", remedy="switch it on, or plug it in again")
+        raise CarError(f"the gamepad {pad} sends nothing", remedy="switch it on, or plug it in again")
     return gamepad
 
 

@@ -280,7 +280,7 @@ def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], res
 def car(artifact: Path | str | None = None) -> Iterator[Check]:
     """Say which car this is, and warn if the artifact was calibrated for another. If its human has a gamepad, open it.
 
-    Raises CarError for a bad car.yml, and GamepadError.
+    Raises CarError for a bad car.yml or gamepad.
     """
     this, path = this_car(), car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")

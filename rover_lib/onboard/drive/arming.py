@@ -24,10 +24,10 @@ from rover_lib.onboard.drive.loop import Arm
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.drive.service import CHECK_S, NotArmed, Service, check_age
+from rover_lib.onboard.drive.service import CHECK_S, Service, check_age
 from rover_lib.onboard.drive.takeover import TakeoverRecorder
 from rover_lib.onboard.drive.watch import boost_priority
-from rover_lib.onboard.errors import sentence_of
+from rover_lib.onboard.errors import RoverError, sentence_of
 from rover_lib.onboard.recording.episode import About
 from rover_lib.onboard.recording.recorder import Recorder, room_for
 
@@ -70,8 +70,8 @@ def arm_when_ready(
 ) -> Telemetry | None:
     """Arm for a human who has just asked for it: say what is missing, wait for it for WAIT_S at most, and then arm.
 
-    checks: called while waiting; each raises if its device fails. Raises NotArmed when told to stop or if something is
-    missing for too long, what a check raises, and what arm() raises.
+    checks: called while waiting; each raises if its device fails. Raises RoverError when told to stop or if
+    something is missing for too long, what a check raises, and what arm() raises.
     """
     link.request()
     told, asked_s = "", clock()
@@ -83,7 +83,7 @@ def arm_when_ready(
         for check in checks:
             check()
         if stop.wait(CHECK_S):
-            raise NotArmed("told to stop before a human armed the car")
+            raise RoverError("told to stop before a human armed the car", kind="not armed")
     check_age(clock() - asked_s, WAIT_S)
     return arm()
 

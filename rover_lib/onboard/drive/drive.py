@@ -28,9 +28,9 @@ from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.opening import DriveOptions, OtherCar, another_car, check_no_film, open_flight_log
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
-from rover_lib.onboard.drive.service import NotArmed, Service
+from rover_lib.onboard.drive.service import Service
 from rover_lib.onboard.drive.watch import HealthWatch, exit_if_hung, stop_on_signals
-from rover_lib.onboard.errors import DriveFault, TakenOver
+from rover_lib.onboard.errors import DriveFault, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
 
@@ -135,8 +135,8 @@ class _Opened:
             until = Until(options.ticks, options.max_seconds, stop, self._over)
             try:
                 drive(pilot, link, log, rate_hz=options.hz, until=until, hooks=hooks, report=report)
-            except (DriveFault, TakenOver) as error:
-                if link and isinstance(error, TakenOver):
+            except DriveFault as error:
+                if link and error.kind == "taken over":
                     arming.record_human(link, stop, self._human_over)
                 if not service:
                     raise
@@ -150,7 +150,7 @@ class _Opened:
         asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
         self.feed.show(WAITING, said, self.report, self.camera, self.link)
         if asked and not self.service:
-            raise NotArmed(asked)
+            raise RoverError(asked, kind="not armed")
 
     def _human_over(self) -> str | None:
         if self.service:

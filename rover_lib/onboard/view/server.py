@@ -22,7 +22,6 @@ import logging
 import os
 import pwd
 import re
-import secrets
 import signal
 import socket
 import struct
@@ -77,11 +76,6 @@ class Address:
             remedy = "choose another --web-port, or an --interface that `ip -brief address` lists"
             raise RoverError(f"no page can be served at {where} ({error.strerror})", remedy=remedy) from None
         return wire
-
-
-def new_token() -> str:
-    """Return a new token that nobody can guess."""
-    return secrets.token_urlsafe(16)
 
 
 def read_token(path: Path) -> str:

@@ -12,7 +12,7 @@ from lab.driving.on_pins import END_S, PinBench
 from lab.driving.virtual import FRAME_MS, LOST, World
 from lab.driving.virtual_host import RATE_HZ, Process
 from rover_lib.onboard.drive.takeover import LET_GO_S, TakeoverRecorder
-from rover_lib.onboard.errors import TakenOver
+from rover_lib.onboard.errors import DriveFault
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.workshop.recordings.episodes import load_recordings
 
@@ -43,7 +43,7 @@ class Recorded(Process):
         self.record = recorder.command
         try:
             super()._drive(link, report)
-        except TakenOver:
+        except DriveFault:
             written = list(world.written)
             options = {"rate_hz": RATE_HZ, "stop": self.until.stop, "clock": world.clock}
             self.takeover = recorder.human(link, self.armed, **options)

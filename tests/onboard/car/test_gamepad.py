@@ -9,8 +9,9 @@ from virtual_gamepad import VirtualGamepad, open_virtual
 from rover_lib.onboard.car import gamepad as gamepads
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, GamepadError
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink
+from rover_lib.onboard.errors import CarError
 
 
 @pytest.fixture
@@ -118,7 +119,7 @@ def kernel(root, *nodes):
     ],
 )  # fmt: skip
 def test_one_sentence_says_what_is_there(tmp_path, nodes, sentence):
-    with pytest.raises(GamepadError) as error:
+    with pytest.raises(CarError) as error:
         gamepads.open_gamepad(kernel(tmp_path, *nodes))
     assert sentence in str(error.value) and error.value.remedy
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,22 +87,17 @@ def test_metrics(machine, bare_host, tmp_path):
     artifact.write_bytes(bytes(2_500_000))
     static = machine.policy("static", [10, 20], manifest={"mode": "static", "gmac": 15.02}, path=artifact)
     fp32 = machine.policy("fp32", [40], manifest={"mode": "fp32", "gmac": 15.02})
-    lerobot = machine.policy("lerobot", [60])
-    policies = {"static": static, "fp32": fp32, "lerobot": lerobot}
+    policies = {"static": static, "fp32": fp32, "lerobot": machine.policy("lerobot", [60])}
     metrics = machine.benchmark(policies, bare_host, warmup=2, iterations=10, reference="lerobot")
-    assert metrics["main"] == "static"
+    timed = metrics["artifacts"]
     expected = {"latency_p50_ms": 15, "latency_p95_ms": 20, "latency_max_ms": 20, "n": 10, "throughput_fps": 1000 / 15}
     for key, value in {**expected, "control_rate_hz": 50, "size_mb": 2.5, "floor_ms": 48.925}.items():
-        assert metrics[key] == pytest.approx(value, rel=1e-3), key
-        assert metrics["artifacts"]["static"][key] == metrics[key]
-    assert metrics["artifacts"]["fp32"]["floor_ms"] == pytest.approx(195.7, abs=0.1)
-    assert metrics["artifacts"]["lerobot"]["floor_ms"] is None
-    assert metrics["artifacts"]["lerobot"]["size_mb"] is None
-    assert metrics["artifacts"]["static"]["speedup"] == pytest.approx(4)
-    assert metrics["artifacts"]["static"]["speedup_p5"] == pytest.approx(3)
-    assert metrics["cpu_pct"] == pytest.approx(200 / metrics["cores"])
-    assert metrics["wall_s"] == pytest.approx(1.15)
-    assert (metrics["rounds"], metrics["series"]) == (10, None)
+        assert metrics[key] == timed["static"][key] == pytest.approx(value, rel=1e-3), key
+    assert timed["fp32"]["floor_ms"] == pytest.approx(195.7, abs=0.1)
+    assert timed["lerobot"]["floor_ms"] is timed["lerobot"]["size_mb"] is None
+    assert (timed["static"]["speedup"], timed["static"]["speedup_p5"]) == pytest.approx((4, 3))
+    assert metrics["cpu_pct"] == pytest.approx(200 / metrics["cores"]) and metrics["wall_s"] == pytest.approx(1.15)
+    assert (metrics["main"], metrics["rounds"], metrics["series"]) == ("static", 10, None)
     json.dumps(metrics, allow_nan=False)
 
 
@@ -140,29 +134,25 @@ def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host,
     assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
 
 
-def test_threads_are_set_and_restored(bare_host):
-    class Threaded(SimpleNamespace):
-        threads = 7
+@pytest.mark.parametrize("threads", [1, 0])
+def test_threads_are_set_and_restored(bare_host, threads):
+    class Threaded:
+        threads, seen = 7, ()
 
         def set_threads(self, threads):
             self.threads = threads
 
-    seen = []
-    policy = Threaded(predict_chunk=lambda frame, state: seen.append(policy.threads))
-    options = BenchmarkOptions(warmup=0, iterations=1, threads=1)
+        def predict_chunk(self, frame, state):
+            self.seen = (*self.seen, self.threads)
+            if len(self.seen) == 2:
+                raise PolicyError("no")
+
+    policy, options = Threaded(), BenchmarkOptions(warmup=0, iterations=1, threads=threads)
     metrics = benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
-    assert seen == [1]
-    assert metrics["threads"] == 1
-    metrics = benchmark({"a": policy}, FRAMES, STATE, replace(options, threads=0), host=bare_host)
-    assert metrics["threads"] == metrics["cores"]
-
-    def fail(frame, state):
-        raise PolicyError("no")
-
-    failing = Threaded(predict_chunk=fail)
+    assert policy.seen == (metrics["threads"],) == (threads or metrics["cores"],)
     with pytest.raises(PolicyError):
-        benchmark({"a": failing}, FRAMES, STATE, options, host=bare_host)
-    assert policy.threads == failing.threads == 7
+        benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
+    assert policy.threads == 7
 
 
 @pytest.mark.parametrize("bad", [{"policies": {}}, {"frames": []}, {"iterations": 0}, {"duration_s": math.nan}])

@@ -335,7 +335,6 @@ def test_what_cannot_be_opened(tmp_path):
 def test_a_token_is_kept_and_one_that_could_be_guessed_is_refused(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     assert v.read_token(tmp_path / "token") == TOKEN
-    assert len(v.new_token()) >= 20 and v.new_token() != v.new_token()
     for content in ("short", "with a blank in the middle", "ä" * 20):
         (tmp_path / "token").write_text(content)
         with pytest.raises(v.RoverError, match="16 letters"):
