@@ -1,4 +1,8 @@
-"""Break single lines of the safety path, each in a copy, and see that a named test fails: `make mutants`.
+"""Break single lines, each in a copy, and see that a named test fails: `make mutants`.
+
+The lines are in planted/*.yml, a file for each subject. A row has a `name`, a `file`, the `good` text that stands in it
+once, the `bad` text that takes its place, and the `test` file whose tests that match `words` (pytest's -k) must fail;
+with `random: true`, random drives must notice it too. To add lines of another subject, add a file.
 
 A line that can be broken unnoticed is a line that no test holds. Where an invariant of the random drives is about the
 line, they must notice it too, within RANDOM_DRIVES. Each worker has a copy of the repository, and a process that has
@@ -26,12 +30,12 @@ from rover_lib.onboard.errors import RoverError
 
 RANDOM_DRIVES = 2000
 MOST_S = 600  # for the tests of one mutant; a test that hangs has noticed it
-MUTANTS = Path(__file__).with_suffix(".yml")
+PLANTED = Path(__file__).with_name("planted")
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A line that is broken; mutants.yml says what the fields mean."""
+    """A line that is broken: a row of planted/*.yml."""
 
     name: str
     file: str
@@ -43,8 +47,9 @@ class Mutant:
 
 
 def read_mutants() -> list[Mutant]:
-    """Read the table of mutants."""
-    return [Mutant(**row) for row in yaml.safe_load(MUTANTS.read_text())]
+    """Read the tables of mutants, in the order of their files' names."""
+    tables = [yaml.safe_load(path.read_text()) for path in sorted(PLANTED.glob("*.yml"))]
+    return [Mutant(**row) for table in tables for row in table]
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ class Outcome:
 
 WORKER = """
 import json, os, sys
-import cv2, numpy, pytest, hypothesis, serial
+import cv2, numpy, pytest, hypothesis, serial, torch
 for line in sys.stdin:
     ask = json.loads(line)
     if not (child := os.fork()):
