@@ -9,16 +9,13 @@ needs a part of an error reads that field and never parses the text.
 import errno
 import os
 
+ELSEWHERE = "name another place, or let this user write there (ls -ld shows whose it is)"
 SYSTEM_REMEDIES = {  # what a user can do about an error of the system
     errno.ENOSPC: "make room on that disk (df -h shows it)",
-    errno.EDQUOT: "make room, your quota is used up",
-    errno.EACCES: "name another place, or let this user write there (ls -ld shows whose it is)",
-    errno.EPERM: "name another place, or let this user write there (ls -ld shows whose it is)",
+    errno.EACCES: ELSEWHERE,
+    errno.EPERM: ELSEWHERE,
     errno.EROFS: "name a place on another disk, this one is read-only",
     errno.ENOENT: "is its name right?",
-    errno.EISDIR: "name a file, this is a folder",
-    errno.ENOTDIR: "name a folder, this is a file",
-    errno.EMFILE: "end other programs, or raise `ulimit -n`",
 }
 
 
