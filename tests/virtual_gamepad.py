@@ -6,7 +6,7 @@ import threading
 import time
 from pathlib import Path
 
-from lab.driving.priority import boost
+from lab.driving.cable import boost
 from rover_lib.onboard.car.gamepad import ABS, BTN_L1, EVENT, KEY, STEERING, SYN, THROTTLE, Gamepad, Stick
 
 FULL = 32767

@@ -67,16 +67,15 @@ class Run:
         sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
         self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
-        self.stick = {
-            "steering": _each_ms(seen.hands, n, lambda h: h.sticks[0]),
-            "throttle": _each_ms(seen.hands, n, lambda h: h.sticks[1]),
-        }
+        sticks = [[(ms, hand.sticks[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
+        self.stick = {pin: _each_ms(sticks[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.signals = _each_ms(seen.hands, n, lambda h: all(h.pulses()))
         self.regular = _each_ms(seen.hands, n, lambda h: h.one_in == 1 and not h.misread_in)
         self.autonomous = self.state == ord("A")
         armed = np.flatnonzero(np.diff(self.autonomous.astype(int)) == 1) + 1
         left = np.flatnonzero(np.diff(self.autonomous.astype(int)) == -1) + 1
         self.armed, self.left = armed.tolist(), left.tolist()
+        self.drives = list(zip(self.armed, [*self.left, seen.end_ms], strict=False))
 
 
 def _each_ms(changes: list, n: int, value: Callable[[Any], Any]) -> np.ndarray:
@@ -156,7 +155,7 @@ def _not_blind(run: Run) -> str | None:
         content[c.at_ms :] = c.content_ms if c.planned else 10**9
     age = np.arange(len(content)) - content
     blind = run.autonomous & (run.throttle > RESTING_US) & (age > STALE_MS)
-    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+    for armed, left in run.drives:
         if (count := int(blind[armed:left].sum())) > BLIND_MS:
             return f"{count} ms by pictures that were {int(age[armed:left][blind[armed:left]].max())} ms old"
     return None
@@ -164,7 +163,7 @@ def _not_blind(run: Run) -> str | None:
 
 def _human_wins(run: Run) -> str | None:
     """A moved stick, or a lost signal, ends autonomy within 100 ms."""
-    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+    for armed, left in run.drives:
         span, before = slice(armed, left), slice(max(0, armed - 45), armed + 1)
         moved = np.zeros(left - armed, bool)
         for channel, stick in run.stick.items():

@@ -7,6 +7,7 @@ import contextlib
 import functools
 import math
 import os
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -181,50 +182,43 @@ class Eyes:
         self._world = world
         self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
-        self._next: tuple[np.ndarray | bytes, float] | None = None
-        self._failure: Exception | None = None
         self._shown = 0  # pictures of a film
         self._seen_ms = -1_000_000
-        self._turn, self._idle = threading.Semaphore(0), threading.Semaphore(0)
+        self._given, self._idle = queue.Queue[Any](), queue.Queue[None]()
         self._over = False
         self._thread = threading.Thread(target=self.camera._read, args=(self._pictures(),), daemon=True)
         self._thread.start()
-        self._idle.acquire()
+        self._idle.get()
         self._due_ms = float(world.now_ms)
         self.on_frame: Callable[[], None] = lambda: None
         self._tick()
 
     def _pictures(self) -> Iterator[tuple[np.ndarray | bytes, float | None]]:
         try:
-            while True:
-                self._idle.release()
-                self._turn.acquire()
-                if self._failure:
-                    raise self._failure
-                if self._next is None:
-                    return
-                yield self._next
+            self._idle.put(None)
+            while isinstance(given := self._given.get(), tuple):
+                yield given
+                self._idle.put(None)
+            if given:
+                raise given
         finally:
             self._over = True
-            self._idle.release()
+            self._idle.put(None)
 
-    def _give(self, picture: tuple[np.ndarray | bytes, float] | None) -> None:
-        if self._over:
-            return
-        self._next = picture
-        self._turn.release()
-        self._idle.acquire()
+    def _give(self, picture: tuple[np.ndarray | bytes, float] | Exception | None) -> None:
+        if not self._over:
+            self._given.put(picture)
+            self._idle.get()
         if self._over:
             self._thread.join()
 
     def unplug(self, failure: Exception | None = None) -> None:
         """Let the camera's reader come to the end of its pictures, or raise."""
-        self._failure = failure
-        self._give(None)
+        self._give(failure)
 
     def close(self) -> None:
         self.camera._closing.set()
-        self.unplug()
+        self._give(None)
         self.on_frame = lambda: None
 
     def _tick(self) -> None:
@@ -234,11 +228,9 @@ class Eyes:
         self._due_ms += FRAME_MS
         world.at(round(self._due_ms), self._tick)
         lens = world.lens
-        if lens.silent or world.paused_until_ms > world.now_ms:
-            return
         seen_ms = world.now_ms - lens.late_ms
-        if seen_ms <= self._seen_ms:
-            return  # pictures have become late, and the next one is still on its way
+        if lens.silent or world.paused_until_ms > world.now_ms or seen_ms <= self._seen_ms:
+            return  # the last: pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
         scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
@@ -364,9 +356,8 @@ def _settings() -> Settings:
 class Process:
     """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
 
-    service: whether it drives again each time that an operator asks for it with ask(); terminal: whether it waits for
-    the human's gesture. limited, heartbeat: whether a service's drive ends after LIMIT_MS, or without the operator's
-    heartbeats. record: the loop's hook, called with each command. armed: the status with which the car was armed.
+    service, terminal, limited, heartbeat: see Story; ask() is an operator's request. record: the loop's hook, called
+    with each command. armed: the status with which the car was armed.
     """
 
     record: Callable[..., None] | None = None
