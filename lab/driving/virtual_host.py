@@ -70,8 +70,7 @@ class VirtualPad(gamepad.Gamepad):
         (pad, self._to_pad), (motion, self._to_motion) = os.pipe(), os.pipe()
         for end in (pad, motion):
             os.set_blocking(end, False)
-        axes = dict.fromkeys((gamepad.STEERING, gamepad.THROTTLE), gamepad.Stick(-self.FULL, self.FULL))
-        super().__init__("virtual", pad, motion, axes)
+        super().__init__("virtual", pad, motion, read=self._where)
         self._known: tuple[bool, list[int]] | None = None  # what its events have told
 
     def close(self) -> None:
@@ -88,17 +87,20 @@ class VirtualPad(gamepad.Gamepad):
             self._send(self._to_motion, gamepad.ABS, 0, self._world.now_ms)
             known = hand.receiver != LOST, list(hand.sticks)
             if known != self._known:
-                self._tell(*known)
+                self._tell(known[0])
                 self._known = known
         return super().sticks(self._world.clock())
 
-    def _tell(self, held: bool, sticks_us: list[int]) -> None:
+    def _where(self, fd: int, axis: int) -> tuple[int, int, int]:
         car = self._world.car
-        actions = car.pwm.actions_from_pulses(*sticks_us)
-        moved = -car.left * (actions.steering or 0.0), -(actions.throttle or 0.0) / car.cap
-        for axis, x in zip((gamepad.STEERING, gamepad.THROTTLE), moved, strict=True):
-            way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
-            self._send(self._to_pad, gamepad.ABS, axis, round(math.copysign(way, x) * self.FULL))
+        actions = car.pwm.actions_from_pulses(*self._world.hand.sticks)
+        x = -car.left * (actions.steering or 0.0) if axis == gamepad.STEERING else -(actions.throttle or 0.0) / car.cap
+        way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
+        return round(math.copysign(way, x) * self.FULL), -self.FULL, self.FULL
+
+    def _tell(self, held: bool) -> None:
+        for axis in gamepad.AXES:
+            self._send(self._to_pad, gamepad.ABS, axis, self._where(-1, axis)[0])
         if not self._known or self._known[0] != held:
             age_s = 1.0 if self._world.hand.pad == STUCK else 0.0
             self._send(self._to_pad, gamepad.KEY, gamepad.BTN_L1, int(held), age_s)
