@@ -209,7 +209,7 @@ def _by_signals(name: str, *numbers: int) -> None:
     @_told(name)
     def send(stage: Stage, h: Happening) -> None:
         if process := stage.process:
-            with stop_on_signals(process.until.stop, process.log):  # type: ignore[arg-type]
+            with stop_on_signals(process.stopped, process.log):  # type: ignore[arg-type]
                 for number in numbers:
                     signal.raise_signal(number)
 
