@@ -39,6 +39,7 @@ PLANNED_MS = 400  # a plan blends in within 100, and its commands hold for 265
 PER_UNIT_US = {"steering": 555.7, "throttle": 591.2}
 LIMIT = 0.2  # params.yml's throttle_limit
 BLACK_FRAMES = 4
+MISSING_MS = 200  # from the last picture to throttle off
 UNANSWERED_MS = 150 + 50  # and a tick
 # From a stop to the end of the drive. To find a silent link takes 0.5 s, and so does each of two unanswered neutrals.
 ENDED_MS = 1700
@@ -232,11 +233,11 @@ def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:
         yield from (other[at >= 0] - one[at[at >= 0]]).tolist()
 
 
-def _off_after(run: Run, since_ms: int, limit_ms: int, what: str) -> str | None:
-    """Say whether a drive that goes on at since_ms still moves the car limit_ms later."""
+def _off_after(run: Run, since_ms: int, limit_ms: int, what: str, until_ms: int = 10**9) -> str | None:
+    """Say whether a drive that goes on at since_ms still moves the car limit_ms later, before until_ms."""
     for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
         if armed <= since_ms < left:
-            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : left] > RESTING_US)
+            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : min(left, until_ms)] > RESTING_US)
             if len(moving):
                 return f"{what} at {since_ms} ms, and throttle at {since_ms + limit_ms + int(moving[0])}"
     return None
@@ -296,9 +297,13 @@ def _as_planned(run: Run) -> str | None:
 
 
 def _bad_ends(run: Run) -> str | None:
-    """A plan that nobody may drive by, or black pictures, end the drive's motion."""
+    """A plan that nobody may drive by, or black or missing pictures, end the drive's motion."""
     for p in run.seen.plans:
         if p.bad and (what := _off_after(run, p.at_ms, VALID_MS + 20, "a bad plan")):
+            return what
+    for (ms, _), (until, _) in pairwise([*run.seen.frames, (run.seen.end_ms, False)]):
+        limit_ms = MISSING_MS if run.clean[ms] else MISSING_MS + VALID_MS
+        if until - ms > limit_ms and (what := _off_after(run, ms, limit_ms, "the last picture", until)):
             return what
     blacks = 0
     for ms, black in run.seen.frames:
@@ -348,7 +353,7 @@ NAMED = re.compile(
     "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
     "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
     "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
-    "|pictures in a row|no frame|ended after|too old"
+    "|pictures in a row|no new frame|no frame|ended after|too old"
     "|picture changed|no frames|squeezed|no such camera|has ended|not found|damaged|copy the file|firmware flash"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )

@@ -203,7 +203,7 @@ def _set_clock(stage: Stage, h: Happening) -> None:
 
 
 def _send_signals(stage: Stage, h: Happening) -> None:
-    with stop_on_signals(stage.running.until.stop, stage.running.log):
+    with stop_on_signals(stage.running.stopped, stage.running.log):
         for name in h.what.split(" and then "):
             signal.raise_signal(signal.Signals[name])
 

@@ -77,7 +77,7 @@ def test_a_planted_fault_of_the_firmware_is_found(tmp_path, monkeypatch, invaria
     ("invariant", "name", "stubbed", "story"),
     [
         ("not_blind", "frozen", lambda *_: None, "frozen since before the start"),
-        ("told", "DriveFault", ValueError, "pictures of 2.5 s ago, from now on"),
+        ("told", "CameraError", ValueError, "pictures of 2.5 s ago, from now on"),
     ],
 )
 def test_a_planted_fault_of_the_host_is_found(monkeypatch, invariant, name, stubbed, story):
