@@ -1,7 +1,4 @@
-"""Find and install the Debian packages that this machine lacks, and fetch arm64 packages without installing them.
-
-missing_packages({"qemu-aarch64": "qemu-user", "/usr/include/stdio.h": "libc6-dev"})     # ["qemu-user"]
-"""
+"""Find and install the Debian packages that this machine lacks, and fetch arm64 packages without installing them."""
 
 import os
 import shutil
@@ -18,50 +15,34 @@ NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
 def missing_packages(needs: Mapping[str, str]) -> list[str]:
     """Return which of these Debian packages this machine lacks.
 
-    needs: the package that each command, or each file by its absolute path, comes from. Commands in root's folders
-    count too.
+    needs: the package that each command, or each file by its absolute path, comes from.
     """
-
-    missing = set()
-    for name, package in needs.items():
-        if not (Path(name).exists() if name.startswith("/") else which(name)):
-            missing.add(package)
-    return sorted(missing)
-
-
-def which(command: str) -> str | None:
-    """Find a command as shutil.which does, but also in root's folders, which a user's PATH may lack."""
-    return shutil.which(command) or shutil.which(command, path="/usr/sbin:/sbin")
+    folders = [*os.get_exec_path(), "/usr/sbin", "/sbin"]  # a user's PATH may lack root's
+    missing = (package for name, package in needs.items() if not any(Path(f, name).exists() for f in folders))
+    return sorted(set(missing))
 
 
 def install_packages(packages: Sequence[str], what: str) -> None:
-    """Install Debian packages, if there are any to install. what: the thing that needs them, for the error.
-
-    Raises RoverError with the command to type if this is not root, or with apt-get's last lines if it fails.
-    """
+    """Install Debian packages, if there are any. what: the thing that needs them. Raises RoverError."""
     if not packages:
         return
     command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
     if os.geteuid() != 0 or not shutil.which("apt-get"):
-        missing = f"{what} needs the Debian packages {' '.join(packages)}, which are not here"
-        raise RoverError(missing, remedy=f"sudo {' '.join(command)}")
+        raise RoverError(f"{what} needs the Debian packages {' '.join(packages)}", remedy=f"sudo {' '.join(command)}")
     print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
     run("apt-get", "update", "--quiet", error=RoverError)
     run(*command, error=RoverError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
 
 
-def fetch_packages(folder: Path, packages: Sequence[str], installed: Path | None = None) -> list[Path]:
+def fetch_packages(folder: Path, packages: Sequence[str]) -> list[Path]:
     """Fetch arm64 packages and their dependencies as .deb files into a scratch folder; return their paths.
 
     Nothing on this machine is changed: apt uses its sources and keys, but its own lists, cache and status in the
-    folder. packages: names, or apt's patterns. installed: the root of a system whose packages are left out. Raises
-    RoverError if the packages cannot be had.
+    folder. packages: names, or apt's patterns. Raises RoverError if they cannot be had.
     """
     for subfolder in ("lists/partial", "archives/partial"):
         (folder / subfolder).mkdir(parents=True)
     (folder / "status").touch()  # says that nothing is installed, so that apt fetches all dependencies
-    if installed:
-        shutil.copy(installed / "var" / "lib" / "dpkg" / "status", folder / "status")
     options = {
         "APT::Architecture": "arm64",
         "APT::Architectures": "arm64",

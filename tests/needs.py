@@ -9,7 +9,6 @@ import fcntl
 import functools
 import os
 import shutil
-import sys
 import tempfile
 import threading
 import time
@@ -21,6 +20,7 @@ import pytest
 from lab.a76 import core
 from lab.arduino import emulator
 from lab.debian import missing_packages
+from rover_lib.onboard.drive import watch
 
 QEMU_MISSING = missing_packages(core.NEEDS)
 qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages {' '.join(QEMU_MISSING)}")
@@ -33,6 +33,7 @@ simavr = pytest.mark.skipif(bool(SIMAVR_MISSING), reason=f"needs the Debian pack
 
 ATTEMPTS = 5
 BEAT_S = 0.02
+PRIORITY = 1  # of a test in real time, if this user may; programs that it starts have ordinary priority
 LATE_S = 0.06  # with the 20 ms between two commands, about half of the 150 ms after which an Arduino stops
 
 
@@ -78,14 +79,11 @@ def keep_sending(
 
 
 class Heartbeat:
-    """A thread that wakes up every 20 ms and measures how late it does. late_s: the largest delay so far."""
-
-    def __init__(self) -> None:
-        self.late_s = 0.0
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+    """Wakes up every 20 ms in a thread of its own. late_s: the largest delay so far."""
 
     def __enter__(self) -> "Heartbeat":
+        self.late_s, self._done = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._thread.start()
         return self
 
@@ -103,36 +101,13 @@ class Heartbeat:
 
 @contextlib.contextmanager
 def in_turn():
-    """While inside, no other test in real time runs on this machine, whether of this test run or of another.
-
-    A thread at real-time priority can keep a processor from another such thread for up to 100 ms, and an Arduino that
-    waits that long stops its car.
-    """
+    """While inside, no other test in real time runs on this machine: it could keep a processor for 100 ms."""
     with (Path(tempfile.gettempdir()) / f"rover-real-time-{os.getuid()}.lock").open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
         try:
             yield
         finally:
             fcntl.flock(turn, fcntl.LOCK_UN)  # explicitly, because a forked child may still hold the file open
-
-
-@contextlib.contextmanager
-def boost_priority():
-    """While inside, this thread goes before ordinary ones, if this user is allowed to do so.
-
-    Processes and threads that it starts have ordinary priority, unless they ask for more: a program that loads torch
-    would otherwise keep every car on this machine waiting.
-    """
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        sys.setswitchinterval(before)
 
 
 def real_time(test: Callable[..., None]) -> Callable[..., None]:
@@ -144,18 +119,16 @@ def real_time(test: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(test)
     def repeated(*args: object, **fixtures: object) -> None:
         for attempt in range(1, ATTEMPTS + 1):
-            with in_turn(), boost_priority(), Heartbeat() as heartbeat:
+            with in_turn(), watch.real_time(PRIORITY), Heartbeat() as heartbeat:
                 try:
                     return test(*args, **fixtures)
                 except Exception as error:
                     if heartbeat.late_s < LATE_S and not isinstance(error, Late):
                         raise
                     if attempt == ATTEMPTS:
-                        late_ms = heartbeat.late_s * 1e3
                         error.add_note(
-                            f"this machine was too busy in {ATTEMPTS} attempts, {late_ms:.0f} ms late in this"
+                            f"this machine was too busy in {ATTEMPTS} attempts: {heartbeat.late_s:.3f} s late"
                         )
                         raise
-            print(f"attempt {attempt} was spoilt: a thread woke up {heartbeat.late_s * 1e3:.0f} ms late")
 
     return repeated

@@ -3,7 +3,7 @@
 It is not libcamera, and proves nothing about a camera. It takes only options that rpicam-apps' core/options.cpp and
 core/video_options.hpp have, and writes what output/output.cpp does. ROVER_CSI names the JPEGs. ROVER_CSI_FAULT is for
 tests: `silent` gives nothing, `cut N` ends the Nth JPEG half way, `gone` finds no camera, `freeze N` and `die N` do so
-after N. An emulated Pi runs this file alone, so it needs nothing else.
+after N, `lose N` writes no metadata of the Nth. An emulated Pi runs this file alone, so it needs nothing else.
 """
 
 import argparse
@@ -61,6 +61,8 @@ def main() -> None:
                 sys.exit("ERROR: *** failed to write output bytes ***")
             sys.stdout.buffer.write(jpeg[: len(jpeg) // 2] if fault == "cut" and n == int(number) else jpeg)
             sys.stdout.buffer.flush()
+            if fault == "lose" and n == int(number):
+                continue
             entries.write(f"ExposureTime={o.shutter or 9000}\nSensorTimestamp={stamp_ns}\nDigitalGain=1.000000\n\n")
             entries.flush()
 

@@ -112,6 +112,22 @@ static bool has_signal(const struct vehicle *vehicle) {
     return vehicle->received[STEERING].present && vehicle->received[THROTTLE].present;
 }
 
+static bool human_gives_throttle(const struct vehicle *vehicle) {
+    return vehicle->state == MANUAL && vehicle->throttle_free && vehicle->throttle_off_rest;
+}
+
+/* What the pins get of the human's pulse. A gamepad's comes from the host too, and gets no more throttle than that does. */
+static uint16_t passed_us(const struct vehicle *vehicle, enum channel channel) {
+    uint16_t pulse_us = vehicle->received[channel].pulse_us;
+#ifdef HUMAN_GAMEPAD
+    const struct servo *servo = &vehicle->car.servos[channel];
+    if (channel == THROTTLE) pulse_us = towards(servo->neutral_us, pulse_us, vehicle->cap_us);
+    if (pulse_us < servo->min_us) return servo->min_us;
+    if (pulse_us > servo->max_us) return servo->max_us;
+#endif
+    return pulse_us;
+}
+
 /* Notes a steering pulse. Returns whether the stick has moved from where it was on arming, as see_throttle() does. */
 static bool see_steering(struct vehicle *vehicle, uint16_t pulse_us, uint32_t now_ms) {
     struct moment now = {true, now_ms}, *wiggle = vehicle->wiggle;
@@ -139,7 +155,7 @@ static bool see_throttle(struct vehicle *vehicle, uint16_t pulse_us) {
 }
 
 /* Whether the car's transmitter may send this. */
-static bool is_pulse(const struct car *car, enum channel channel, uint16_t pulse_us, uint16_t period_us) {
+static bool is_pulse(const struct car *car, enum channel channel, uint32_t pulse_us, uint16_t period_us) {
     uint16_t nominal = car->servos[channel].period_us;
     bool fast = channel == THROTTLE && throttle_is_fast(car);
     return within(pulse_us, fast ? FAST_PULSE_MIN_US : PULSE_MIN_US, fast ? FAST_PULSE_MAX_US : PULSE_MAX_US) &&
@@ -176,7 +192,7 @@ static bool is_out_of_range(struct vehicle *vehicle, const struct command *comma
 #ifdef HUMAN_GAMEPAD
 /* A gamepad's sticks, as if a receiver had measured them. Each must answer a newer status than the last, and is as old as
  * that status, so that nothing which waits or comes twice counts. Both 0: the human has let go, which counts at once.
- * These pulses come from the host too, so they get no more throttle than the host does. */
+ * They are judged as they are; passed_us() limits what the pins get. */
 static void take_sticks(struct vehicle *vehicle, const struct command *command, uint32_t now_ms) {
     uint32_t at_ms = command->heard_ms, age_ms = now_ms - at_ms;
     if (vehicle->boot != command->boot || age_ms > SIGNAL_TIMEOUT_MS || age_ms >= now_ms - vehicle->sticks_ms) {
@@ -184,14 +200,16 @@ static void take_sticks(struct vehicle *vehicle, const struct command *command, 
         return;
     }
     bool held = command->steering_us || command->throttle_us;
-    if (held && is_out_of_range(vehicle, command)) return;
+    const struct servo *steering = &vehicle->car.servos[STEERING], *throttle = &vehicle->car.servos[THROTTLE];
+    if (held && (!within(command->steering_us, steering->min_us, steering->max_us) ||
+                 !is_pulse(&vehicle->car, THROTTLE, command->throttle_us, throttle->period_us))) {
+        count(&vehicle->out_of_range);
+        return;
+    }
     vehicle->sticks_ms = at_ms;
     if (held) {
-        const struct servo *servos = vehicle->car.servos;
-        uint16_t steering_us = (uint16_t)command->steering_us, throttle_us = (uint16_t)command->throttle_us;
-        throttle_us = towards(servos[THROTTLE].neutral_us, throttle_us, vehicle->cap_us);
-        vehicle_received(vehicle, STEERING, steering_us, servos[STEERING].period_us, at_ms);
-        vehicle_received(vehicle, THROTTLE, throttle_us, servos[THROTTLE].period_us, at_ms);
+        vehicle_received(vehicle, STEERING, (uint16_t)command->steering_us, steering->period_us, at_ms);
+        vehicle_received(vehicle, THROTTLE, (uint16_t)command->throttle_us, throttle->period_us, at_ms);
     } else {
         for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) forget_signal(vehicle, &vehicle->received[channel]);
     }
@@ -262,7 +280,7 @@ static char take_car(struct vehicle *vehicle, const uint16_t *numbers) {
     if (vehicle->state == AUTONOMOUS) return IGNORED;
     uint32_t id = car_id(&car);
     bool same = id == vehicle->car_id;
-    if (!same && vehicle->state == MANUAL && vehicle->throttle_free && vehicle->throttle_off_rest) return THROTTLE_AT_REST;
+    if (!same && human_gives_throttle(vehicle)) return THROTTLE_AT_REST;
     vehicle->car_told = true;
     if (same) return DONE;
     vehicle->car = car;
@@ -347,8 +365,8 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
         vehicle->steering_us = towards(vehicle->steering_us, wanted_us[STEERING], ms * STEERING_SLEW_US_PER_MS);
         vehicle->throttle_us = towards(vehicle->throttle_us, wanted_us[THROTTLE], ms * THROTTLE_SLEW_US_PER_MS);
     } else if (vehicle->state == MANUAL && has_signal(vehicle)) {
-        vehicle->steering_us = vehicle->received[STEERING].pulse_us;
-        vehicle->throttle_us = vehicle->throttle_free ? vehicle->received[THROTTLE].pulse_us : neutral_us(vehicle, THROTTLE);
+        vehicle->steering_us = passed_us(vehicle, STEERING);
+        vehicle->throttle_us = vehicle->throttle_free ? passed_us(vehicle, THROTTLE) : neutral_us(vehicle, THROTTLE);
     } else {
         vehicle->steering_us = neutral_us(vehicle, STEERING);
         vehicle->throttle_us = neutral_us(vehicle, THROTTLE);
@@ -361,8 +379,7 @@ static void put_char(struct line *line, char c) {
 }
 
 bool vehicle_may_keep(const struct vehicle *vehicle) {
-    return vehicle->car_told && vehicle->state != AUTONOMOUS &&
-           distance(vehicle->throttle_us, neutral_us(vehicle, THROTTLE)) <= THROTTLE_DEAD_BAND_US;
+    return vehicle->car_told && vehicle->state != AUTONOMOUS && !human_gives_throttle(vehicle);
 }
 
 uint8_t vehicle_hello(const struct vehicle *vehicle, char reset_cause, struct line *line) {
@@ -391,7 +408,7 @@ uint8_t vehicle_status(const struct vehicle *vehicle, uint32_t now_ms, struct li
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
         const struct received *received = &vehicle->received[channel];
         if (received->present) {
-            line_number(line, received->pulse_us);
+            line_number(line, passed_us(vehicle, (enum channel)channel));
             line_number(line, received->period_us);
         } else {
             line_text(line, "-");

@@ -4,32 +4,27 @@
     emulation = emulate_script(core, Path("predict.py"), [], folder)
     emulation.total(section=0)
 
-Emulation says nothing about time, but it counts exactly, on any workstation, and gives the same count every time. It
-runs an arm64 Debian's Python with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
-small plugin of ours (guest/count.c). Nothing on the host is changed: packages are fetched by a private apt, unpacked
-without being installed, and cached.
+An arm64 Debian's Python runs with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
+plugin of ours (guest/count.c). Packages are fetched by a private apt, unpacked without being installed, and cached.
 
 A peak of memory is the most that the emulator's process held resident, as the kernel records it, minus the emulator's
-own share: its translated code and the plugin's counters. These lie outside the address range that is reserved for the
-guest at a fixed place. They grow slowly, are read five times a second, and are reported separately. MB are 10**6 bytes.
+own share: its translated code and the plugin's counters, which lie outside the addresses that are reserved for the
+guest. They grow slowly and are read five times a second. MB are 10**6 bytes.
 """
 
-import os
 import re
-import selectors
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from threading import Event
-from typing import IO, Any
+from threading import Event, Lock, Thread
+from typing import Any
 
 import numpy as np
 
@@ -69,8 +64,6 @@ CPU revision\t: 1
 A76 = "cortex-a76"  # QEMU's name for the core of a Raspberry Pi 5
 GUEST_BASE, GUEST_SIZE = 0x100000000000, 0x4000000000  # the guest's addresses, as the host sees them
 SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
-SILENCE_S = 1200  # of processor time: loading the full policy in FP32 prints nothing for five minutes
-WAITING = 6  # by the clock the silence may be that many times longer, as the machine may have more to do
 
 # As in count.c.
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")])
@@ -88,10 +81,9 @@ class Core:
 
 
 def prepare(progress: Progress = silent) -> Core:
-    """Return everything that counting needs, from the cache or made now, which takes about half a minute.
+    """Return what counting needs, from the cache or made now, in half a minute. Raises RoverError if it cannot be had.
 
-    Missing Debian packages are installed if this runs as root. Raises RoverError if anything cannot be
-    had.
+    Missing Debian packages are installed if this runs as root.
     """
     steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, _userland)
     _, plugin, root = [step() for step in progress(steps, desc=f"emulated {A76}", total=len(steps))]
@@ -131,16 +123,14 @@ def _make_userland(root: Path) -> None:
 
 
 def fetch_wheels(folder: Path, *what: object) -> None:
-    """Fetch Python packages into a folder with uv, without installing them. what: packages, and further options of uv.
+    """Fetch Python packages into a folder with uv, without installing them. Raises RoverError if they cannot be had.
 
-    Dependencies are not fetched, so `what` must name them all. Raises RoverError if they cannot be had.
+    what: all packages, as dependencies are not fetched, and further options of uv.
     """
-    beside = Path(sys.executable).parent / "uv"
-    uv = str(beside) if beside.is_file() else shutil.which("uv")
-    if not uv:
-        raise RoverError("no uv to fetch Python packages with", remedy="pip install uv ('make count' has it)")
+    beside = Path(sys.executable).with_name("uv")
+    uv = beside if beside.is_file() else shutil.which("uv") or "uv"
     options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
-    remedy = f"is the index within reach that has {' '.join(map(str, what))}?"
+    remedy = f"pip install uv, and have the index within reach that has {' '.join(map(str, what))}"
     run(uv, "pip", "install", *options, *what, error=RoverError, remedy=remedy)
 
 
@@ -184,7 +174,6 @@ class Emulation:
     sections: dict[int, np.ndarray]  # arrays of BLOCK
     more: dict[int, np.ndarray]  # by section, if it was watched, as guest/count.c leaves it
     peak_mb: dict[str, float]  # by the line that the program had printed last; "" stands for before the first
-    emulator_mb: float  # the emulator's own memory at the end
 
     def total(self, section: int, what: str = "instructions") -> int:
         """Return how many instructions, or "simd" or "sdot" ones, were executed in a section."""
@@ -200,10 +189,7 @@ class Emulation:
         return int(self.more[section][0])
 
     def far_lines(self, section: int) -> int:
-        """Return how many lines of 64 bytes the memory that all cores share had to deliver or take.
-
-        That is what loads found in no cache, and twice, as it goes back, what stores found in no cache of their core.
-        """
+        """Return how many lines of 64 bytes the shared memory had to deliver, or twice if stores missed each cache."""
         return int(self.more[section][4] + 2 * self.more[section][3])
 
 
@@ -234,34 +220,33 @@ def emulate(
     *,
     environment: dict[str, str] | None = None,
     on_line: Callable[[str], None] = lambda line: None,
-    stop: Event | None = None,
     watch: str = "",
 ) -> Emulation:
     """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 
-    folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. stop: ends the
-    program when set. watch: "memory=SECTION", see guest/count.c.
-    Raises RoverError with the end of its stderr if it fails, or if it prints nothing for SILENCE_S of processor time.
-    Whatever ends this function also ends the emulator.
+    folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. watch:
+    "memory=SECTION", see guest/count.c. Raises RoverError with the end of its stderr if it fails. Whatever ends this
+    function also ends the emulator.
     """
     plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
-    qemu = [*_qemu(core.root), "-plugin", plugin, *command]
+    qemu = [str(word) for word in (*_qemu(core.root), "-plugin", plugin, *command)]
     with (folder / "stderr").open("wb") as stderr:
-        try:
-            process = subprocess.Popen(
-                [str(c) for c in qemu],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                env=environment or {},
-                cwd=folder,
-            )
-        except OSError as e:
-            raise RoverError(f"the emulator does not start: {e}") from None
-    watched = _Watched(process.pid)
+        process = subprocess.Popen(
+            qemu,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=environment or {},
+            cwd=folder,
+            text=True,
+            errors="replace",
+        )
     assert process.stdout  # a pipe
     try:
-        _read_to_the_end(process.stdout, watched, on_line, stop or Event())
+        with _Watched(process.pid) as watched:
+            for line in process.stdout:
+                watched.begin(line.rstrip("\n"))
+                on_line(watched.step)
         code = process.wait()
     finally:
         process.kill()
@@ -272,53 +257,43 @@ def emulate(
         raise RoverError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
     sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
     more = {int(f.stem): np.fromfile(f, "<u8") for f in folder.glob("*.more")}
-    return Emulation(sections, more, dict(watched.peak_mb), watched.emulator_mb)
+    return Emulation(sections, more, dict(watched.peak_mb))
 
 
 @dataclass
 class _Watched:
-    """What is known about a running emulator. Each line that the program prints begins a step with its own peak."""
+    """The memory of a running emulator, sampled while inside. Each printed line begins a step with its own peak."""
 
     pid: int
     step: str = ""
     peak_mb: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    emulator_mb: float = 0.0
 
-    def sample(self) -> None:
+    def __enter__(self) -> "_Watched":
+        self._lock, self._over = Lock(), Event()
+        self._thread = Thread(target=self._run, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._over.wait(SAMPLE_S):
+            with self._lock:
+                self._sample()
+
+    def _sample(self) -> None:
         peak_mb, outside_mb = _memory_mb(self.pid)
         self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
-        self.emulator_mb = outside_mb or self.emulator_mb
 
     def begin(self, step: str) -> None:
-        if step != self.step:
-            _forget_peak(self.pid)
-        self.step = step
-
-
-def _read_to_the_end(stdout: IO[bytes], watched: _Watched, on_line: Callable[[str], None], stop: Event) -> None:
-    """Read what the program prints, and sample its memory, until it closes its stdout."""
-    unread, last_s, last_cpu_s = b"", time.monotonic(), 0.0
-    with selectors.DefaultSelector() as readable:
-        readable.register(stdout, selectors.EVENT_READ)
-        while True:
-            ready = readable.select(SAMPLE_S)
-            if stop.is_set():
-                raise RoverError("stopped, because another count failed")
-            watched.sample()
-            if not ready:
-                silent_s = max(_cpu_s(watched.pid) - last_cpu_s, (time.monotonic() - last_s) / WAITING)
-                if silent_s > SILENCE_S:
-                    after = watched.step or "its start"
-                    raise RoverError(f"the emulated program printed nothing for {SILENCE_S} s after {after}")
-                continue
-            last_s, last_cpu_s = time.monotonic(), _cpu_s(watched.pid)
-            content = os.read(stdout.fileno(), 65536)
-            if not content:
-                return
-            *lines, unread = (unread + content).split(b"\n")
-            for line in lines:
-                watched.begin(line.decode(errors="replace"))
-                on_line(watched.step)
+        with self._lock:
+            self._sample()
+            if step != self.step:
+                with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
+                    Path(f"/proc/{self.pid}/clear_refs").write_text("5")
+            self.step = step
 
 
 # Read from /proc, as psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
@@ -341,18 +316,3 @@ def _memory_mb(pid: int) -> tuple[float, float]:
         elif not line[0].isupper():  # a mapping's addresses; the lines about it start with capitals
             in_guest = GUEST_BASE <= int(line.partition("-")[0], 16) < GUEST_BASE + GUEST_SIZE
     return (int(peak[1]) * 1024 / 1e6, outside_kb * 1024 / 1e6) if peak else (0.0, 0.0)
-
-
-def _cpu_s(pid: int) -> float:
-    """Return the processor time that a process has used, in seconds; 0 if it has ended."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _forget_peak(pid: int) -> None:
-    # If the process has ended or the kernel cannot do it, earlier peaks count too, but none is missed.
-    with suppress(OSError):
-        Path(f"/proc/{pid}/clear_refs").write_text("5")

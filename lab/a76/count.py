@@ -1,13 +1,14 @@
 """Count the instructions that an artifact executes in the emulated Pi, in one thread, with rover_lib.onboard alone."""
 
 import json
+import os
 import tempfile
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock
-from typing import Any, TypeVar
+from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -33,23 +34,18 @@ class Guest:
 
 
 OURS = Guest()
-Name = TypeVar("Name", bound=Hashable)
 
 
-def onnxruntime_there() -> Path:
-    """Return a folder with the packages of a Pi without torch, for the emulated Pi, from the cache or fetched now."""
+def guest_of(artifact: Path) -> Guest:
+    """Return what runs one of our artifacts. One for ONNX Runtime gets the packages of a Pi without torch."""
+    if read_manifest(artifact)["engine"] != engines.ONNXRUNTIME:
+        return OURS
     wheels = REQUIREMENTS["onnxruntime"]
 
     def make(folder: Path) -> None:
         fetch_wheels(folder, "--require-hashes", *FOR_GUEST, "--requirement", wheels)
 
-    return cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make)
-
-
-def guest_of(artifact: Path) -> Guest:
-    """Return what runs one of our artifacts: always the same script, with packages for the manifest's engine."""
-    is_onnx = read_manifest(artifact)["engine"] == engines.ONNXRUNTIME
-    return Guest(packages=onnxruntime_there()) if is_onnx else OURS
+    return Guest(packages=cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +62,9 @@ class Counted:
     cycles: float  # of the steady inference, see Emulation, as are
     near_lines: int
     far_lines: int
-    kernels: dict[str, tuple[int, int, int]]  # (instructions, SIMD, SDOT) of the steady inference by function
+    kernels: dict[str, tuple[int, int]]  # (instructions, SDOT) of the steady inference by function
     peak_mb: float
     peak_loading_mb: float
-    emulator_mb: float
     chunks: np.ndarray
     versions: dict[str, Any]
 
@@ -80,10 +75,7 @@ class Counted:
 
 
 def write_observations(path: Path, samples: Sequence[Any]) -> Path:
-    """Write what a policy shall see for the guest: `state` (n, S) float32 and `frame_0000`, ... (h, w, 3) uint8 BGR.
-
-    If there are several cameras, each has its own frames: `frame_0000.<camera>`, ...
-    """
+    """Write what a policy shall see, as guest/inferences.predict_all reads it."""
     frames: dict[str, Any] = {}
     for i, sample in enumerate(samples):
         seen = sample.frame_bgr()
@@ -100,29 +92,18 @@ def count_artifact(
     *,
     guest: Guest = OURS,
     counted: int = COUNTED,
-    on_step: Callable[[], None] = lambda: None,
-    stop: Event | None = None,
+    on_line: Callable[[str], None] = lambda line: None,
 ) -> Counted:
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
     samples: have frame_bgr() and state. If there are fewer than `counted`, which must be at least STEADY, they are
-    repeated from the first. on_step: called after each inference. stop: ends the count when set. Raises RoverError with
-    the last lines that the guest printed, if it fails.
+    repeated from the first. on_line: called with each line that the guest prints. Raises RoverError if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
         observations = write_observations(folder / "observations.npz", samples)
-        before = ""
-
-        def on_line(line: str) -> None:
-            nonlocal before
-            if before == "predict":  # a step has ended when the next one begins
-                on_step()
-            before = line
-
         given = [Path(artifact).resolve(), observations, folder, counted, *guest.arguments]
-        options: dict[str, Any] = {"packages": guest.packages, "on_line": on_line, "stop": stop}
-        options["watch"] = f"memory={STEADY}"
+        options: dict[str, Any] = {"packages": guest.packages, "on_line": on_line, "watch": f"memory={STEADY}"}
         done = emulate_script(core, guest.script, given, folder, **options)
         return Counted(
             load=done.total(0),
@@ -135,34 +116,30 @@ def count_artifact(
             kernels=by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text())),
             peak_mb=done.peak_mb["predict"],
             peak_loading_mb=done.peak_mb["load"],
-            emulator_mb=done.emulator_mb,
             chunks=np.load(folder / "chunks.npy"),
             versions=json.loads((folder / "versions.json").read_text()),
         )
 
 
 def side_by_side(
-    counts: Mapping[Name, Callable[..., Counted]], inferences: int, what: str, jobs: int, progress: Progress
-) -> dict[Name, Counted]:
-    """Count in several emulated machines, `jobs` at a time: a count does not depend on what else is running.
+    counts: Mapping[str, Callable[..., Counted]], inferences: int, what: str, progress: Progress
+) -> dict[str, Counted]:
+    """Count in several emulated machines, one for each of this machine's cores at a time.
 
-    counts: functions by name, each called with on_step and stop (see `count_artifact`). If one fails, the others end.
-    inferences: how many all of them have together, for the progress bar. what: the bar's label.
+    counts: functions by name, each called with on_line (see `count_artifact`). inferences: how many all of them have
+    together, for the progress bar. what: the bar's label.
     """
     bar = iter(progress(range(inferences), desc=what, total=inferences))
-    one_at_a_time, stop = Lock(), Event()
+    one_at_a_time = Lock()
 
-    def on_step() -> None:
-        with one_at_a_time:
-            next(bar, None)
+    def on_line(line: str) -> None:
+        if line == "predict":
+            with one_at_a_time:
+                next(bar, None)
 
-    with ThreadPoolExecutor(min(jobs, len(counts))) as pool:
-        started = {name: pool.submit(count, on_step=on_step, stop=stop) for name, count in counts.items()}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        started = {name: pool.submit(count, on_line=on_line) for name, count in counts.items()}
         try:
-            for future in as_completed(started.values()):
-                future.result()
+            return {name: future.result() for name, future in started.items()}
         finally:
-            stop.set()  # if one failed, or the user interrupts, the others end
-            pool.shutdown(cancel_futures=True)
-    next(bar, None)
-    return {name: future.result() for name, future in started.items()}
+            pool.shutdown(cancel_futures=True)  # if one failed, those that run end, and no more begin

@@ -3,13 +3,10 @@
 count_run("runs/demo")      # writes runs/demo/arm.json
 """
 
-import os
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +17,7 @@ from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop.judge.recorded_range import pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -32,40 +29,26 @@ FRAMES = 50
 SLOW_GMAC = 1.0  # a larger FP32 takes a minute and a half for an emulated inference, so a few frames must be enough
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How an artifact is counted.
+class Plan(NamedTuple):
+    """The frames that an artifact predicts in the emulated Pi, and how many inferences are counted one by one."""
 
-    reference: the FP32 artifact of its image size; None if there is none, so that it is only counted and not judged.
-    frames: the indices of the frames that it predicts in the emulated Pi. counted: how many inferences are counted one
-    by one.
-    """
-
-    reference: str | None
     frames: tuple[int, ...]
     counted: int = COUNTED
 
 
-def count_run(
-    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
-) -> dict[str, Any]:
+def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
     """Count every artifact of a run; write and return its arm.json.
 
-    Artifacts are judged on `frames` of the run's held-out frames. What an artifact predicts in the emulated Pi is
-    compared with what the FP32 artifact of its image size predicts on this machine; so is what it predicts on this
-    machine. FP32 takes up to minutes for a frame in the emulated Pi. So it predicts only a few frames there, which must
-    equal this machine's within the parity vectors' tolerance. An artifact without an FP32 of its image size is only
-    counted.
-    jobs: how many artifacts are counted at a time, each in one thread and below 1 GB; this machine's cores if None.
-    Raises RoverError, or what reading the run raises.
+    Artifacts are judged on `frames` of the run's held-out frames. What an artifact predicts in the emulated Pi, and on
+    this machine, is compared with what the FP32 artifact predicts on this machine. In the emulated Pi, FP32 takes up to
+    minutes for a frame, so it predicts only a few there, which must equal this machine's within the parity vectors'
+    tolerance. Raises RoverError.
     """
     run_dir = Path(run_dir)
     files = [*run_dir.glob("policy_*.pt"), *run_dir.glob(f"policy_*{ONNX_SUFFIX}")]
     artifacts = {p.stem: p for p in sorted(files)}
     if REFERENCE not in artifacts:
-        raise RoverError(
-            f"{run_dir}: no {REFERENCE}.pt in it", found=sorted(artifacts), remedy="'rover run' makes a run"
-        )
+        raise RoverError(f"{run_dir}: no {REFERENCE}.pt in it", found=[*artifacts], remedy="'rover run' makes a run")
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
@@ -73,13 +56,10 @@ def count_run(
         raise RoverError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
     core = prepare(progress)
     plans = plans_of(manifests, len(samples))
-    counts = _count_all(core, artifacts, plans, samples, jobs or os.cpu_count() or 1, progress)
-    rows = {stem: artifact_metrics(counts[stem], manifests[stem]) for stem in artifacts}
-    for stem, judged in _judge(artifacts, plans, counts, samples, again, progress).items():
-        rows[stem] |= judged
+    counts = _count_all(core, artifacts, plans, samples, progress)
+    judged = _judge(artifacts, plans, counts, samples, again, progress)
+    rows = {stem: artifact_metrics(counts[stem], manifests[stem]) | judged[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
-    if (run_dir / "load.json").exists() and (note := read_stage(run_dir / "load.json", "load")["metrics"].get("note")):
-        metrics["note"] = note
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
     given["qemu"] = run("qemu-aarch64", "--version", error=RoverError).splitlines()[0]
@@ -87,44 +67,30 @@ def count_run(
     return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
 
 
-def reference_of(stem: str, artifacts: Iterable[str]) -> str | None:
-    """Return the FP32 artifact to judge an artifact by, policy_fp32_180x320 for policy_static_180x320, if it exists."""
-    size = re.search(r"_\d+x\d+(?=\.|$)", stem)
-    own = REFERENCE + (size.group() if size else "")
-    return own if own in artifacts else None
-
-
 def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[str, Plan]:
-    """Plan how each artifact is counted. What takes longest comes first, so that no core waits for it in the end."""
+    """Plan how each artifact is counted. FP32 takes longest, so it comes first."""
     plans, every = {}, range(frames)
-    for stem, manifest in manifests.items():
-        reference = reference_of(stem, manifests)
-        if reference is None or (manifest["mode"] == "fp32" and manifest["gmac"] >= SLOW_GMAC):
-            plans[stem] = Plan(reference, tuple(every[:STEADY]), STEADY)
-        elif manifest["mode"] in ("fp32", "dynamic"):
-            # Both are slow, and fewer frames are enough: FP32 is only compared with this machine's, and nobody would
-            # drive a Pi with a dynamic artifact.
-            plans[stem] = Plan(reference, pick_evenly(every, COUNTED))
+    for stem in sorted(manifests, key=lambda stem: stem != REFERENCE):
+        mode, gmac = manifests[stem]["mode"], manifests[stem]["gmac"]
+        if mode == "fp32" and gmac >= SLOW_GMAC:
+            plans[stem] = Plan(tuple(every[:STEADY]), STEADY)
+        elif mode in ("fp32", "dynamic"):
+            # Both are slow: FP32 is only compared with this machine's, and nobody would drive a Pi with dynamic.
+            plans[stem] = Plan(pick_evenly(every, COUNTED))
         else:
-            plans[stem] = Plan(reference, tuple(every))
-    references = {plan.reference for plan in plans.values()}
-    return dict(sorted(plans.items(), key=lambda item: (item[0] not in references, -manifests[item[0]]["gmac"])))
+            plans[stem] = Plan(tuple(every))
+    return plans
 
 
 def _count_all(
-    core: Core,
-    artifacts: Mapping[str, Path],
-    plans: Mapping[str, Plan],
-    samples: Sequence[Any],
-    jobs: int,
-    progress: Progress,
+    core: Core, artifacts: Mapping[str, Path], plans: Mapping[str, Plan], samples: Sequence[Any], progress: Progress
 ) -> dict[str, Counted]:
-    counts: dict[str, Callable[..., Counted]] = {}
+    counts = {}
     for stem, plan in plans.items():
         chosen, guest = [samples[i] for i in plan.frames], guest_of(artifacts[stem])
         counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guest, counted=plan.counted)
     inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
-    return side_by_side(counts, inferences, "emulated inferences", jobs, progress)
+    return side_by_side(counts, inferences, "emulated inferences", progress)
 
 
 def _judge(
@@ -135,30 +101,25 @@ def _judge(
     again: Opened,
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
-    """Judge the predictions of each artifact that has a reference; return the rows for arm.json.
+    """Judge the predictions of each artifact; return the rows for arm.json.
 
-    Raises RoverError if an FP32 artifact predicts something else in the emulated Pi than on this machine.
+    Raises RoverError if FP32 predicts something else in the emulated Pi than on this machine.
     """
     rows: dict[str, dict[str, Any]] = {}
-    ranges = again.recordings.action_range()
-    for reference in sorted({plan.reference for plan in plans.values() if plan.reference}):
-        here = chunks_here(artifacts[reference], samples, progress)
-        differences = np.abs(counts[reference].chunks - here[list(plans[reference].frames)]).max((0, 1))
-        difference = float(differences.max())
-        tolerance = read_manifest(artifacts[reference])["parity"]["tolerance"]
-        names = again.checkpoint.config.action_names
-        if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
-            raise RoverError(
-                f"{artifacts[reference]}: differs by {difference:.2g} on the core", remedy="quantize again"
-            )
-        for stem in (stem for stem, plan in plans.items() if plan.reference == reference):
-            frames = plans[stem].frames
-            expected, chosen = here[list(frames)], [samples[i] for i in frames]
-            at_home = expected if stem == reference else chunks_here(artifacts[stem], chosen, progress)
-            rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
-            rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
-            rows[stem] |= {"reference": reference, "frames_on_the_core": len(frames)}
-            rows[stem]["reference_max_difference"] = difference
+    ranges, names = again.recordings.action_range(), again.checkpoint.config.action_names
+    here = chunks_here(artifacts[REFERENCE], samples, progress)
+    differences = np.abs(counts[REFERENCE].chunks - here[list(plans[REFERENCE].frames)]).max((0, 1))
+    difference = float(differences.max())
+    tolerance = read_manifest(artifacts[REFERENCE])["parity"]["tolerance"]
+    if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
+        raise RoverError(f"{artifacts[REFERENCE]}: differs by {difference:.2g} on the core", remedy="quantize again")
+    for stem, plan in plans.items():
+        expected, chosen = here[list(plan.frames)], [samples[i] for i in plan.frames]
+        at_home = expected if stem == REFERENCE else chunks_here(artifacts[stem], chosen, progress)
+        rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
+        rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
+        rows[stem] |= {"reference": REFERENCE, "frames_on_the_core": len(plan.frames)}
+        rows[stem]["reference_max_difference"] = difference
     return rows
 
 

@@ -3,15 +3,15 @@
     count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which count_run.count_run has written
 
 Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
-held-out frames. It has its own packages, which are pinned here. They come before ours on Python's path, on this machine
-and in the emulated Pi, and are never installed, so our environment does not change.
+held-out frames. Its packages are pinned here and come before ours on Python's path, on this machine and in the emulated
+Pi; they are never installed.
 """
 
 import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_st
 from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8 import quantize as q
+from rover_lib.workshop.int8.scheme import STAYS_FLOAT
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -44,7 +44,6 @@ FOLDER = GUEST / "peers"
 SHIM = FOLDER / "executorch.cpp"
 COMPILER = "aarch64-linux-gnu-g++"
 NEEDS = {COMPILER: "g++-aarch64-linux-gnu"}  # the Debian package of a command
-AFFINE = "policy_static_affine"
 FRAMES = 20  # how many judge a peer; its error only has to show that it computes the same policy
 
 
@@ -52,7 +51,7 @@ FRAMES = 20  # how many judge a peer; its error only has to show that it compute
 class Engine:
     """Another engine: the packages that it needs before ours, here and in the emulated Pi, and its files' suffix.
 
-    Dependencies such as numpy are not listed, as our own packages have them.
+    FOLDER/make_<name>.py runs its tools. Dependencies such as numpy are not listed, as our own packages have them.
     """
 
     name: str
@@ -60,41 +59,29 @@ class Engine:
     packages: tuple[str, ...]
     guest_packages: tuple[str, ...]
 
-    @property
-    def maker(self) -> Path:
-        """The path of our script that runs the engine's tools."""
-        return FOLDER / f"make_{self.name}.py"
 
-
-ENGINES = (
-    Engine(
-        "onnxruntime",
-        ".onnx",
-        ("onnxruntime==1.31.1", "onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19"),
-        ("onnxruntime==1.31.1",),
-    ),
-    Engine(
-        "executorch",
-        ".pte",
-        (
-            "executorch==1.5.1",
-            "torchao==0.18.0",
-            # This torch only exports. It is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that
-            # an x86-64 wheel insists on; it needs one more of them.
-            "torch==2.10.0",
-            "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
-            "flatbuffers==25.12.19",
-            "ruamel.yaml==0.19.1",
-            "tabulate==0.10.0",
-            "expecttest==0.3.0",
-            "parameterized==0.9.0",
-        ),
-        ("executorch==1.5.1",),  # only its C++ runtime is used: see executorch.cpp
-    ),
+ONNXRUNTIME = Engine(
+    "onnxruntime",
+    ".onnx",
+    ("onnxruntime==1.31.1", "onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19"),
+    ("onnxruntime==1.31.1",),
 )
-
-
-# --- their packages ---------------------------------------------------------------------------------------------------
+EXECUTORCH = Engine(
+    "executorch",
+    ".pte",
+    (
+        "executorch==1.5.1",
+        "torchao==0.18.0",
+        # This torch only exports. It is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that
+        # an x86-64 wheel insists on; it needs one more of them.
+        "torch==2.10.0",
+        "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
+        *("flatbuffers==25.12.19", "ruamel.yaml==0.19.1", "tabulate==0.10.0"),
+        *("expecttest==0.3.0", "parameterized==0.9.0"),
+    ),
+    ("executorch==1.5.1",),  # only its C++ runtime is used: see executorch.cpp
+)
+ENGINES = (ONNXRUNTIME, EXECUTORCH)
 
 
 def packages_here(engine: Engine) -> Path:
@@ -110,14 +97,14 @@ def packages_here(engine: Engine) -> Path:
 def packages_there(engine: Engine) -> Path:
     """Return the same for the emulated Pi; for ExecuTorch, it includes our compiled caller of its C++ runtime."""
     made = {"packages": engine.guest_packages, "for": FOR_GUEST}
-    compiled = engine.name == "executorch"
+    compiled = [SHIM] if engine is EXECUTORCH else []
 
     def make(folder: Path) -> None:
         fetch_wheels(folder, *FOR_GUEST, *engine.guest_packages)
         if compiled:
             _compile(folder)
 
-    return cache_folder(f"arm-peer-{engine.name}", key_of(made, *([SHIM] if compiled else [])), make)
+    return cache_folder(f"arm-peer-{engine.name}", key_of(made, *compiled), make)
 
 
 def _compile(folder: Path) -> None:
@@ -135,25 +122,13 @@ def _compile(folder: Path) -> None:
     run(*command, error=RoverError)
 
 
-# --- the engines' forms of the policy ---------------------------------------------------------------------------------
+def quantize_with(
+    engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path
+) -> tuple[Path, dict[str, Any]]:
+    """Quantize the policy with an engine's own tools into `folder`. samples: for calibration.
 
-
-@dataclass(frozen=True)
-class Made:
-    """An engine's form of the policy, and what the script that made it reported.
-
-    report: `int8_layers` (how many), `float_layers` (their names) and `versions`.
-    """
-
-    path: Path
-    report: dict[str, Any]
-
-
-def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path) -> Made:
-    """Quantize the policy with an engine's own tools into `folder`.
-
-    samples: for calibration. Raises RoverError if the tools fail, or if they leave a layer in float that is INT8 in our
-    artifact.
+    Returns the file, and what the tools reported: `int8_layers` (how many) and `versions`. Raises RoverError if they
+    fail, or leave a layer in float that is INT8 in our artifact.
     """
     folder.mkdir(exist_ok=True)
     artifact = folder / f"{engine.name}{engine.suffix}"
@@ -163,47 +138,28 @@ def quantize_with(engine: Engine, checkpoint: Checkpoint, samples: Sequence[Samp
         prepared = np.stack([prepare_frame(s.frame_bgr(), height, width) for s in samples])
         np.savez(calibration, state=np.stack([s.state for s in samples]).astype(np.float32), frames=prepared)
         environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
-        command = [sys.executable, engine.maker, checkpoint.path.resolve(), calibration, temporary]
-        remedy = f"{engine.name}'s tools were to quantize {checkpoint.path}"
-        printed = run(*command, error=RoverError, remedy=remedy, env=environment)
-        made = json.loads(printed.splitlines()[-1])
-        check_int8(engine.name, made, int8_layers(checkpoint))
-    return Made(artifact, made)
+        maker = FOLDER / f"make_{engine.name}.py"
+        command = [sys.executable, maker, checkpoint.path.resolve(), calibration, temporary]
+        report = json.loads(run(*command, error=RoverError, env=environment).splitlines()[-1])
+        if (ours := int8_layers(checkpoint)) != report["int8_layers"]:  # tools have silently left some in float
+            raise RoverError(f"{engine.name}: {ours} layers of ours are INT8", found=report["int8_layers"])
+    return artifact, report
 
 
 def int8_layers(checkpoint: Checkpoint) -> int:
     """Return how many convolutions and linear layers of the policy are INT8 in our artifact."""
     modules = act.ACT(checkpoint.config, checkpoint.weights).named_modules()
     layers = (name for name, m in modules if isinstance(m, (nn.Conv2d, nn.Linear)))
-    return sum(act.block_of(name) not in q.STAYS_FLOAT for name in layers)
+    return sum(act.block_of(name) not in STAYS_FLOAT for name in layers)
 
 
-def check_int8(name: str, made: dict[str, Any], expected: int) -> None:
-    """Raise RoverError unless a peer has as many INT8 layers as ours, since tools have silently left some in float."""
-    if made["int8_layers"] != expected:
-        what = f"{name}: {made['int8_layers']} convolutions and linears became INT8, and {expected} in ours"
-        raise RoverError(f"{what}; float are {made['float_layers'][:5]}")
-
-
-# --- counting ---------------------------------------------------------------------------------------------------------
-
-
-def guest_of(engine: Engine, size: tuple[int, int]) -> Guest:
-    """Return what runs an engine's artifact in the emulated Pi. size: (height, width) of the image that it takes."""
-    return Guest(FOLDER / "guest.py", (engine.name, *size), packages_there(engine))
-
-
-def count_peers(
-    run_dir: Path | str, *, frames: int = FRAMES, jobs: int | None = None, progress: Progress = silent
-) -> dict[str, Any]:
+def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
     """Count the peers of a run's static artifact, add them to its arm.json and return the content of that.
 
-    metrics.peers has rows like those of metrics.artifacts, with `file_mb`. `torch_fp32` and, if the run has that
-    artifact, `torch_affine` repeat a row whose name is in `artifact`. The others also have `int8_layers` and
-    `made_with`, the versions of their tools. A peer's chunks come from the emulated Pi, the reference from this
-    machine, whose FP32 count_run has compared with the Pi's. What the engines make is kept in run_dir/peers.
-    frames: how many held-out frames to judge with. jobs: how many machines are emulated at a time. Raises RoverError if
-    arm.json is missing or was counted from other artifacts, or if a peer cannot be had, made or run.
+    metrics.peers has rows like those of metrics.artifacts, with `file_mb`, `int8_layers` and `made_with`, the versions
+    of their tools. A peer's chunks come from the emulated Pi, the reference from this machine, whose FP32 count_run has
+    compared with the Pi's. What the engines make is kept in run_dir/peers. frames: how many held-out frames judge.
+    Raises RoverError if arm.json is missing or was counted from other artifacts, or if a peer cannot be had or run.
     """
     run_dir = Path(run_dir)
     content, reference = open_counted_run(run_dir)
@@ -214,51 +170,33 @@ def count_peers(
     guests = {}
     for engine in progress(ENGINES, desc="peers' packages", total=len(ENGINES)):
         packages_here(engine)
-        guests[engine.name] = guest_of(engine, again.checkpoint.config.image_sizes[0])
+        size = again.checkpoint.config.image_sizes[0]
+        guests[engine.name] = Guest(FOLDER / "guest.py", (engine.name, *size), packages_there(engine))
     given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
-    made: dict[str, Made] = {}
+    made = {}
     for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
         made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
-    counts: dict[str, Callable[..., Counted]] = {
-        name: partial(count_artifact, core, peer.path, samples, guest=guests[name]) for name, peer in made.items()
-    }
-    inferences = max(len(samples), COUNTED) * len(made)
-    counted = side_by_side(counts, inferences, "peers, emulated", jobs or os.cpu_count() or 1, progress)
+    counts = {n: partial(count_artifact, core, path, samples, guest=guests[n]) for n, (path, _) in made.items()}
+    counted = side_by_side(counts, max(len(samples), COUNTED) * len(made), "peers, emulated", progress)
 
     here, manifest = chunks_here(reference, samples, progress), read_manifest(reference)
     ranges = again.recordings.action_range()
-    peers = {}
-    for name, stem in (("torch_fp32", REFERENCE), ("torch_affine", AFFINE)):
-        if found := content["metrics"]["artifacts"].get(stem):
-            peers[name] = {"artifact": stem, "file_mb": file_mb(run_dir / f"{stem}.pt")} | found
-    for name, peer in made.items():
-        peers[name] = peer_metrics(counted[name], manifest, here, ranges) | {
-            "file_mb": file_mb(peer.path),
-            "int8_layers": peer.report["int8_layers"],
-            "made_with": peer.report["versions"],
-        }
-    inputs = {f"peers/{peer.path.name}": sha256_of(peer.path) for peer in made.values()}
+    peers, inputs = {}, dict(content["inputs"])
+    for name, (path, report) in made.items():
+        about = {"file_mb": path.stat().st_size / 1e6, "int8_layers": report["int8_layers"]}
+        peers[name] = peer_metrics(counted[name], manifest, here, ranges) | about | {"made_with": report["versions"]}
+        inputs[f"peers/{path.name}"] = sha256_of(path)
     metrics = content["metrics"] | {"peers": peers}
-    return write_stage(
-        run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=content["inputs"] | inputs
-    )
-
-
-def file_mb(path: Path) -> float:
-    """Return the size of a file in 10**6 bytes."""
-    return path.stat().st_size / 1e6
+    return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
 
 
 def open_counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
     """Return a run's arm.json and its FP32 artifact. Raises RoverError unless the one was counted from the other."""
-    path, reference = run_dir / "arm.json", run_dir / f"{REFERENCE}.pt"
-    remedy = f"count the run's own artifacts first ('python -m lab arm {run_dir}')"
-    if not path.exists():
-        raise RoverError(f"{path}: not found", remedy=remedy)
-    content = read_stage(path, "arm")
+    reference = run_dir / f"{REFERENCE}.pt"
+    content = read_stage(run_dir / "arm.json", "arm")
     if not reference.exists() or content["inputs"].get(reference.name) != sha256_of(reference):
-        raise RoverError(f"{path}: counted from another {reference.name}", remedy=remedy)
+        raise RoverError(f"{run_dir}/arm.json: counted from another {reference.name}", remedy="make count")
     return content, reference
 
 
@@ -269,10 +207,8 @@ def peer_metrics(
 
     Raises RoverError if the peer's chunks have another shape or are not finite.
     """
-    if counted.chunks.shape != reference.shape:
-        raise RoverError(f"a peer gave no actions of {reference.shape}", found=counted.chunks.shape)
-    if not np.isfinite(counted.chunks).all():
-        raise RoverError("a peer gave actions that are not finite")
+    if counted.chunks.shape != reference.shape or not np.isfinite(counted.chunks).all():
+        raise RoverError(f"a peer gave no finite actions of {reference.shape}", found=counted.chunks.shape)
     names = manifest["action_names"]
     low, high = action_limits(names, car_of(manifest))
     errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips

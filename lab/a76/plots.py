@@ -1,6 +1,5 @@
 """Notebook 06: instructions counted on an emulated Cortex-A76."""
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +15,6 @@ from rover_lib.workshop.plots.style import (
     OTHERS,
     RED,
     SKY,
-    SLATE,
     action_colour,
     bar_values,
     judged_keys,
@@ -46,15 +44,16 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     first = next(iter(metrics["artifacts"].values()))
     keys = judged_keys(right, {k: v for k, v in first.items() if "workstation" not in k})
     height = 0.8 / max(len(keys), 1)
-    judged = [
-        m if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{n}" else None
-        for n, m in rows.items()
-    ]
-    frames = sorted({m["frames_on_the_core"] for m in judged if m})
+    judged = {
+        at: m
+        for at, (name, m) in enumerate(rows.items())
+        if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{name}"
+    }
+    frames = sorted({m["frames_on_the_core"] for m in judged.values()})
     over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
     for i, key in enumerate(keys):
-        known = [(at, m[key]) for at, m in enumerate(judged) if m is not None]
-        at, values = [at + (i - (len(keys) - 1) / 2) * height for at, _ in known], [value for _, value in known]
+        at = [at + (i - (len(keys) - 1) / 2) * height for at in judged]
+        values = [m[key] for m in judged.values()]
         right.barh(at, values, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
         bar_values(right, at, values, "{:.2f}")
     right.set_xlabel("mean error against FP32\n(% of the recorded range)")
@@ -85,25 +84,4 @@ def draw_counts_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
         axes[1, 0].set_title("those of the fewest instructions, closer", fontsize=11)
     axes[-1, 0].set_xlabel("instructions of one inference (10^9)")
     legend_below(fig, axes[0, 0], 4)
-    return fig
-
-
-def draw_counts_by_size(metrics: Mapping[str, Any]) -> Figure:
-    """Draw what a smaller image saves: static INT8 and its floor by image size. metrics: those of arm.json."""
-    rows = [m for stem, m in metrics["artifacts"].items() if re.fullmatch(r"policy_static(_\d+x\d+)?", stem)]
-    rows.sort(key=lambda m: m["gmac"])
-    fig, axes = new_figure(1, height_in=3.7)
-    ax, x = axes[0, 0], np.array([m["image_height"] * m["image_width"] for m in rows]) / 1e3
-    lines = (("instructions_g", BLUE, "o-", "all instructions"), ("simd_g", SLATE, "s-", "SIMD instructions"))
-    for key, colour, style, label in (*lines, ("floor_g", RED, "--", "floor: dot products alone")):
-        ax.plot(x, [m[key] for m in rows], style, color=colour, lw=1.8, label=label)
-    for at, m in zip(x, rows, strict=True):
-        ax.annotate(f"{m['instructions_g']:.3g}", (at, m["instructions_g"]), (0, 7), textcoords="offset points",
-                    ha="center", fontsize=9)  # fmt: skip
-    ax.set_xticks(x, [f"{m['image_width']}x{m['image_height']}" for m in rows])
-    ax.set(ylim=(0, 1.12 * max(m["instructions_g"] for m in rows)), ylabel="instructions of one inference (10^9)")
-    ax.set_xlabel("image, width x height in pixels; the axis is in proportion to their number")
-    ax.set_title("static INT8, counted on an emulated Cortex-A76", fontsize=11)
-    ax.set_xlim(0, None)
-    legend(ax, loc="lower right")
     return fig

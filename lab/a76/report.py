@@ -52,7 +52,10 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
     """Return one artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
-    work = work_of(counted)
+    kernels_g = {name: row[0] / 1e9 for name, row in counted.kernels.items()}
+    counts = {"instructions": counted.steady, "simd": counted.simd, "cycles": counted.cycles}
+    counts |= {"near_lines": counted.near_lines, "far_lines": counted.far_lines}
+    work = {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels_g)}
     return work | {
         "sdot_g": counted.sdot / 1e9,
         "floor_g": floor_g,
@@ -64,24 +67,14 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
         "gmac": manifest["gmac"],
         "image_height": manifest["cameras"][0]["height"],
         "image_width": manifest["cameras"][0]["width"],
-        "instructions_by_kernel": {name: row[0] / 1e9 for name, row in counted.kernels.items()},
-        "simd_by_kernel": {name: row[1] / 1e9 for name, row in counted.kernels.items()},
-        "sdot_by_kernel": {name: row[2] / 1e9 for name, row in counted.kernels.items()},
+        "instructions_by_kernel": kernels_g,
+        "sdot_by_kernel": {name: row[1] / 1e9 for name, row in counted.kernels.items()},
         "peak_memory_mb": counted.peak_mb,
         "peak_memory_loading_mb": counted.peak_loading_mb,
-        "emulator_memory_mb": counted.emulator_mb,
         "threads": counted.versions["threads"],
         "versions": counted.versions,
         "computed_pi5_ms": predict_ms(Work.of(work))._asdict() | {"threads": DRIVING},
     }
-
-
-def work_of(counted: Counted) -> dict[str, float]:
-    """Return what an artifact's steady inference executes, as `pi5.Work.of` reads it."""
-    kernels = {name: row[0] for name, row in counted.kernels.items()}
-    counts = {"instructions": counted.steady, "simd": counted.simd, "cycles": counted.cycles}
-    counts |= {"near_lines": counted.near_lines, "far_lines": counted.far_lines}
-    return {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels)}
 
 
 def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
@@ -91,11 +84,10 @@ def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
 
 
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
-    """Hold static artifacts to their gates; return `compare.gate` rows.
+    """Hold static artifacts to their gates; return `compare.gate` rows. limits: arm.gates of lab/params.yml.
 
-    metrics: of arm.json. limits: arm.gates of lab/params.yml. A gate is left out if this run has no artifact for it:
-    those of instructions are for the user's policy, which is known by its multiply-accumulates. Errors are divided by
-    this machine's, ONNX Runtime's by torch's too, and the worst action is judged.
+    A gate is left out if this run has no artifact for it: those of instructions are for the user's policy, known by its
+    multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too; the worst action counts.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():
@@ -103,7 +95,7 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
         if own and abs(artifact["gmac"] / own.pop("gmac") - 1) >= SAME_POLICY:
             own = {}
         rows += [gate(f"{stem} {key}", artifact[key], "<=", limit) for key, limit in own.items()]
-        if not re.fullmatch(rf"{STATIC}(_\d+x\d+)?(\.onnx)?", stem) or artifact.get("reference") is None:
+        if stem not in (STATIC, STATIC_ONNX):
             continue
         here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
@@ -128,11 +120,7 @@ def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float |
 
 
 def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
-    """Group the instructions of an artifact or a peer by what they do, in 10**9; together they are instructions_g.
-
-    The order is fixed. counts: of arm.json, with instructions_by_kernel and, to separate a product's SDOT from the
-    instructions that feed it, sdot_by_kernel.
-    """
+    """Group the instructions of an artifact or a peer by what they do, in 10**9, in a fixed order."""
     groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
     sdot = counts.get("sdot_by_kernel", {})
     for kernel, instructions_g in counts["instructions_by_kernel"].items():
@@ -144,20 +132,17 @@ def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
 
 
 def table(content: dict[str, Any]) -> str:
-    """Show arm.json as text: the counts, fewest instructions first; then the computed times, the note and the gates."""
+    """Show arm.json as text: the counts, fewest instructions first; then the computed times and the gates."""
     metrics = content["metrics"]
     counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
     ordered = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
     for name, found in ordered:
-        cells = [_written(found.get(key), how) for key, how in COLUMNS.values()]
+        cells = [_written(found[key], how) for key, how in COLUMNS.values()]
         errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
-        times = found["computed_pi5_ms"]
-        span = f"{times['low']:.3g} to {times['high']:.3g}"
-        rows.append([name, *cells, _written(worst(errors), ".3f"), str(found.get("frames_on_the_core", "-")), span])
+        span = "{low:.3g} to {high:.3g}".format_map(found["computed_pi5_ms"])
+        rows.append([name, *cells, _written(worst(errors), ".3f"), str(found["frames_on_the_core"]), span])
     lines = [f"{LABEL}, 10^9 instructions of an inference; times are computed from them (docs/clock.md)", *align(rows)]
-    if note := metrics.get("note"):
-        lines += ["", f"note: {note}"]
     for row in metrics["gates"]:
         verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
         lines.append(f"{verdict}: {row['gate']}, {_written(row['found'], '.4g')} {row['relation']} {row['limit']:g}")

@@ -2,12 +2,11 @@
 
 import re
 from bisect import bisect_right
-from collections import defaultdict
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from elftools.common.exceptions import ELFError
 from elftools.elf.elffile import ELFFile
 
 from rover_lib.onboard.errors import RoverError
@@ -23,17 +22,12 @@ FUNCTIONS = (0, 2, 10)  # symbol types none (assembly), function, indirect funct
 
 
 class Functions:
-    """The functions of an ELF file, by address. Raises RoverError if the file is not a 64-bit ELF file."""
+    """The functions of a 64-bit ELF file, by address."""
 
     def __init__(self, path: Path):
         self.path = path
         with path.open("rb") as file:
-            try:
-                elf = ELFFile(file)
-                if elf.elfclass != 64:
-                    raise ELFError("of 32 bits")
-            except ELFError as e:
-                raise RoverError(f"{path}: not a 64-bit ELF file", found=e) from None
+            elf = ELFFile(file)
             # The address of the first loaded segment. A mapping of the file starts there, which shows where it was put.
             self.base = min((s["p_vaddr"] & ~0xFFF for s in elf.iter_segments("PT_LOAD")), default=0)
             whole = elf.get_section_by_name(".symtab")
@@ -87,29 +81,28 @@ class GuestFunctions:
         return file.function_at(address - self._lowest[path] + file.base)
 
 
-def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, tuple[int, int, int]]:
-    """Sum up the executed (instructions, SIMD, SDOT) by function: demangled names, the most instructions first.
+def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, tuple[int, int]]:
+    """Sum up the executed (instructions, SDOT) by function: demangled names, the most instructions first.
 
     All functions after the first `at_most` are summed up as "other". blocks: an array of core.BLOCK. functions: names
     by address. For a library that was stripped of names, blocks with an SDOT are listed apart from the rest.
     """
-    executed: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
-    for address, entered, *counts, _ in blocks.tolist():
+    instructions: Counter[str] = Counter()
+    sdots: Counter[str] = Counter()
+    for address, entered, count, _, sdot, _ in blocks.tolist():
         name = functions[address]
-        if name.startswith("[") and counts[2]:
+        if name.startswith("[") and sdot:
             name = f"{name} loops with SDOT"
-        _add(executed[name], [entered * count for count in counts])
-    mangled = sorted(executed, key=lambda n: -executed[n][0])
+        instructions[name] += entered * count
+        sdots[name] += entered * sdot
+    mangled = [name for name, _ in instructions.most_common()]
     plain = run("c++filt", "--no-params", error=RoverError, input="\n".join(mangled)).splitlines()
-    merged: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    merged: dict[str, tuple[int, int]] = {}
     for i, (name, demangled) in enumerate(zip(mangled, plain, strict=True)):
-        _add(merged[_short(demangled) if i < at_most else "other"], executed[name])
-    return {name: (row[0], row[1], row[2]) for name, row in merged.items()}
-
-
-def _add(row: list[int], counts: list[int]) -> None:
-    for i, count in enumerate(counts):
-        row[i] += count
+        short = _short(demangled) if i < at_most else "other"
+        before = merged.get(short, (0, 0))
+        merged[short] = before[0] + instructions[name], before[1] + sdots[name]
+    return merged
 
 
 def _short(name: str) -> str:

@@ -11,9 +11,15 @@ import time
 import tty
 
 from lab.driving.pins import Command
-from lab.driving.priority import boost
 
 _DRIVE = re.compile(rb">D \d+ \d+ \d+ (\d+) (\d+)\*[0-9A-F]{8}")
+PRIORITY = 3  # of real-time scheduling, above that of rover drive: hardware does not wait for this machine
+
+
+def boost(thread: int) -> None:
+    """Give a thread or a process, by its id, that priority, if this user may."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
 
 
 class Cable:

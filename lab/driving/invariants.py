@@ -39,6 +39,7 @@ PLANNED_MS = 400  # a plan blends in within 100, and its commands hold for 265
 PER_UNIT_US = {"steering": 555.7, "throttle": 591.2}
 LIMIT = 0.2  # params.yml's throttle_limit
 BLACK_FRAMES = 4
+MISSING_MS = 200  # from the last picture to throttle off
 UNANSWERED_MS = 150 + 50  # and a tick
 # From a stop to the end of the drive. To find a silent link takes 0.5 s, and so does each of two unanswered neutrals.
 ENDED_MS = 1700
@@ -67,16 +68,15 @@ class Run:
         sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
         self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
-        self.stick = {
-            "steering": _each_ms(seen.hands, n, lambda h: h.sticks[0]),
-            "throttle": _each_ms(seen.hands, n, lambda h: h.sticks[1]),
-        }
+        sticks = [[(ms, hand.sticks[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
+        self.stick = {pin: _each_ms(sticks[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.signals = _each_ms(seen.hands, n, lambda h: all(h.pulses()))
         self.regular = _each_ms(seen.hands, n, lambda h: h.one_in == 1 and not h.misread_in)
         self.autonomous = self.state == ord("A")
         armed = np.flatnonzero(np.diff(self.autonomous.astype(int)) == 1) + 1
         left = np.flatnonzero(np.diff(self.autonomous.astype(int)) == -1) + 1
         self.armed, self.left = armed.tolist(), left.tolist()
+        self.drives = list(zip(self.armed, [*self.left, seen.end_ms], strict=False))
 
 
 def _each_ms(changes: list, n: int, value: Callable[[Any], Any]) -> np.ndarray:
@@ -156,7 +156,7 @@ def _not_blind(run: Run) -> str | None:
         content[c.at_ms :] = c.content_ms if c.planned else 10**9
     age = np.arange(len(content)) - content
     blind = run.autonomous & (run.throttle > RESTING_US) & (age > STALE_MS)
-    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+    for armed, left in run.drives:
         if (count := int(blind[armed:left].sum())) > BLIND_MS:
             return f"{count} ms by pictures that were {int(age[armed:left][blind[armed:left]].max())} ms old"
     return None
@@ -164,7 +164,7 @@ def _not_blind(run: Run) -> str | None:
 
 def _human_wins(run: Run) -> str | None:
     """A moved stick, or a lost signal, ends autonomy within 100 ms."""
-    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+    for armed, left in run.drives:
         span, before = slice(armed, left), slice(max(0, armed - 45), armed + 1)
         moved = np.zeros(left - armed, bool)
         for channel, stick in run.stick.items():
@@ -233,11 +233,11 @@ def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:
         yield from (other[at >= 0] - one[at[at >= 0]]).tolist()
 
 
-def _off_after(run: Run, since_ms: int, limit_ms: int, what: str) -> str | None:
-    """Say whether a drive that goes on at since_ms still moves the car limit_ms later."""
+def _off_after(run: Run, since_ms: int, limit_ms: int, what: str, until_ms: int = 10**9) -> str | None:
+    """Say whether a drive that goes on at since_ms still moves the car limit_ms later, before until_ms."""
     for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
         if armed <= since_ms < left:
-            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : left] > RESTING_US)
+            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : min(left, until_ms)] > RESTING_US)
             if len(moving):
                 return f"{what} at {since_ms} ms, and throttle at {since_ms + limit_ms + int(moving[0])}"
     return None
@@ -297,9 +297,13 @@ def _as_planned(run: Run) -> str | None:
 
 
 def _bad_ends(run: Run) -> str | None:
-    """A plan that nobody may drive by, or black pictures, end the drive's motion."""
+    """A plan that nobody may drive by, or black or missing pictures, end the drive's motion."""
     for p in run.seen.plans:
         if p.bad and (what := _off_after(run, p.at_ms, VALID_MS + 20, "a bad plan")):
+            return what
+    for (ms, _), (until, _) in pairwise([*run.seen.frames, (run.seen.end_ms, False)]):
+        limit_ms = MISSING_MS if run.clean[ms] else MISSING_MS + VALID_MS
+        if until - ms > limit_ms and (what := _off_after(run, ms, limit_ms, "the last picture", until)):
             return what
     blacks = 0
     for ms, black in run.seen.frames:
@@ -349,7 +353,7 @@ NAMED = re.compile(
     "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
     "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
     "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
-    "|pictures in a row|no frame|ended after|too old"
+    "|pictures in a row|no new frame|no frame|ended after|too old"
     "|picture changed|no frames|squeezed|no such camera|has ended|not found|damaged|copy the file|firmware flash"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )

@@ -4,6 +4,7 @@ It is the real sketch, compiled for this machine (lab/driving/board.c). A second
 """
 
 import ctypes
+from typing import Any
 
 from lab.driving.virtual import STEERING, THROTTLE, Board
 from rover_lib.onboard.car.car import Car
@@ -19,11 +20,10 @@ class NativeArduino:
     """A board that a transmitter's pulses and the host's lines go into, and pulses come out of; one at a time.
 
     You may set these: sticks: the transmitter's pulses (us), where 0 stands for no signal. misread: one in so many of
-    its throttle pulses is read as another pulse (us), 0 for none: (one in, us). periods_us: of its pulses.
-    gamepad: the firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
-    sequence: of the last command. car: the car of the transmitter and of the host. The board is told of it too, unless
-    it is the default. heard_ms: the board's time that the host claims to have heard last; None stands for now_ms.
-    asked_ms: the same, of when somebody asked to arm it.
+    its throttle pulses is read as another pulse (us): (one in, us). heard_ms, asked_ms: the board's time that the host
+    claims to have heard last, and at which somebody asked to arm it; None stands for now_ms. sequence: of the last
+    command. car: of the transmitter and of the host; the board is told of it, unless it is the default. gamepad: the
+    firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
     """
 
     def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None, gamepad: bool = False):
@@ -56,24 +56,20 @@ class NativeArduino:
         """Whether the board may write its car into the EEPROM now."""
         return bool(self._board.c.board_may_keep() & 1)
 
-    def _line(self, hello: bool) -> bytes:
+    def _line(self, hello: bool) -> Any:
         text = ctypes.create_string_buffer(256)
         length = self._board.c.board_line(hello, text)
-        return text.raw[:length]
+        return parse(text.raw[: length - 1], 0.0)
 
     @property
     def status(self) -> Telemetry:
         """The board's status line, as the host reads it."""
-        telemetry = parse(self._line(False)[:-1], 0.0)
-        assert isinstance(telemetry, Telemetry)
-        return telemetry
+        return self._line(False)
 
     @property
     def hello(self) -> Hello:
         """The board's hello, as it is after a power-on."""
-        hello = parse(self._line(True)[:-1], 0.0)
-        assert isinstance(hello, Hello)
-        return hello
+        return self._line(True)
 
     def run(self, ms: int) -> list[tuple[int, int]]:
         """Let time pass; return the pins' pulses (steering, throttle; us) after each millisecond."""
@@ -115,11 +111,13 @@ class NativeArduino:
         """
         if sequence is None:
             self.sequence = sequence = (self.sequence + 1) % (1 << 32)
-        heard_ms = self.now_ms if self.heard_ms is None else self.heard_ms
-        dated: tuple[int, ...] = (heard_ms % (1 << 32),) if kind in "AD" else ()
+        numbers: list[int] = []
+        if kind in "AD":
+            numbers.append(self.now_ms if self.heard_ms is None else self.heard_ms)
         if kind == "A":
-            dated += ((self.now_ms if self.asked_ms is None else self.asked_ms) % (1 << 32), self.car.id)
-        return self.send(frame(" ".join(map(str, (f">{kind}", BOOT, sequence, *dated, *pulses_us)))))
+            numbers += [self.now_ms if self.asked_ms is None else self.asked_ms, self.car.id]
+        words = [f">{kind}", BOOT, sequence, *(number % (1 << 32) for number in numbers), *pulses_us]
+        return self.send(frame(" ".join(map(str, words))))
 
     def drive(self, steering_us: int, throttle_us: int, ms: int, every_ms: int = 33) -> list[tuple[int, int]]:
         """Send a drive command every `every_ms` for `ms` milliseconds; return the pins' pulses as run() does."""

@@ -7,11 +7,9 @@ between them, and the transmitter's pulses come from simavr. All other faults ar
 
 import contextlib
 import ctypes
-import os
 import platform
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -26,7 +24,7 @@ from balloon_world.car import CameraFeed
 from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.cable import Cable
+from lab.driving.cable import PRIORITY, Cable, boost
 from lab.driving.pins import (
     BEFORE_S,
     CONTINUES,
@@ -40,7 +38,7 @@ from lab.driving.pins import (
     row_of,
 )
 from lab.driving.policy import RATE_HZ, make_artifact, pictures
-from lab.driving.priority import boost, boost_priority
+from rover_lib.onboard.drive.watch import real_time
 from rover_lib.onboard.errors import RoverError
 
 AT_SPEED_S = 0.6  # from the first throttle to the fault
@@ -62,9 +60,9 @@ def end_thread_on_signal() -> None:
 class Drive(Child):
     """`rover drive` with the bench's artifact, camera and cable. prepared: code that runs in its process before."""
 
-    def __init__(self, bench: "PinBench", prepared: str, *arguments: object, in_terminal: bool = True):
+    def __init__(self, bench: "PinBench", prepared: str, *arguments: object):
         self.prepared, self._marked = prepared, 0
-        code = f"{IN_TERMINAL * in_terminal}{prepared}from rover_lib.onboard.cli import main; main()"
+        code = f"{IN_TERMINAL}{prepared}from rover_lib.onboard.cli import main; main()"
         devices = "--camera", bench.camera, "--port", bench.cable.port, "--view", bench.folder / "view"
         options = "--film", "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
         command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options, *arguments)
@@ -89,31 +87,25 @@ class Drive(Child):
 class PinBench:
     """An Arduino, a camera, a cable, and the drive that uses them; a context manager. undo: what ends the fault."""
 
-    def __init__(self) -> None:
-        self._stack, self.undo = contextlib.ExitStack(), contextlib.ExitStack()
-        self.folder = Path(tempfile.mkdtemp(prefix="rover-faults-"))
-        self._stack.callback(shutil.rmtree, self.folder, ignore_errors=True)
-        self.artifact, self.camera = self.folder / "policy.pt", self.folder / "camera"
-        make_artifact(self.artifact)
-        self.events: list[PinEvent] = []
-        self._drive: Drive | None = None
-        try:
-            self.arduino = self._stack.enter_context(EmulatedArduino(transmitter=REST_US, nice=NICE))
-            boost(self.arduino.pid)
-            self._stack.enter_context(CameraFeed(self.camera, *pictures()))
-            self.cable = Cable(self.arduino.port)
-            self._stack.enter_context(boost_priority())
-        except BaseException:
-            self._stack.close()
-            raise
-        self._stack.callback(lambda: self.cable.unplug())
-
     def __enter__(self) -> "PinBench":
+        self.undo, self.events = contextlib.ExitStack(), list[PinEvent]()
+        self._drive: Drive | None = None
+        with contextlib.ExitStack() as stack:
+            self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-faults-")))
+            self.artifact, self.camera = self.folder / "policy.pt", self.folder / "camera"
+            make_artifact(self.artifact)
+            self.arduino = stack.enter_context(EmulatedArduino(transmitter=REST_US, nice=NICE))
+            boost(self.arduino.pid)
+            stack.enter_context(CameraFeed(self.camera, *pictures()))
+            self.cable = Cable(self.arduino.port)
+            stack.callback(lambda: self.cable.unplug())
+            stack.enter_context(real_time(PRIORITY))
+            stack.callback(self._end_drive)
+            stack.callback(self.undo.close)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.undo.close()
-        self._end_drive()
         self._stack.close()
 
     @property
@@ -169,9 +161,6 @@ class PinBench:
         self.undo.close()
         self.arduino.transmitter(*REST_US)
 
-    def signal(self, number: int) -> None:
-        self.drive.process.send_signal(number)
-
     def _end_drive(self) -> None:
         if self._drive:
             self._drive.close()
@@ -185,9 +174,9 @@ class PinBench:
 class PinRow:
     """One fault, and what is expected of the car.
 
-    inject: makes the fault happen. message: a regular expression for the line that tells of it. told_later: whether
-    only the next drive prints that line. method: how the fault is injected, in words. exit_code: of the drive, None if
-    it goes on. prepared: of the drive. starves: whether the fault takes this machine's time away from the drive.
+    inject: makes the fault happen; method: how, in words. message: a regular expression for the line that tells of it.
+    told_later: whether only the next drive prints that line. exit_code: of the drive, None if it goes on. starves:
+    whether the fault takes this machine's time away from the drive.
     """
 
     name: str
@@ -205,9 +194,9 @@ class PinRow:
 
 
 def _stop_process(bench: PinBench) -> None:
-    bench.signal(signal.SIGSTOP)
+    bench.drive.process.send_signal(signal.SIGSTOP)
     bench.wait(1.0)
-    bench.signal(signal.SIGCONT)
+    bench.drive.process.send_signal(signal.SIGCONT)
 
 
 def _starve(bench: PinBench) -> None:
@@ -215,8 +204,6 @@ def _starve(bench: PinBench) -> None:
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
         bench.undo.callback(busy.wait)
         bench.undo.callback(busy.kill)  # added last, so it is called before wait
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, busy.pid, 0)
 
 
 def _fill_disk(bench: PinBench) -> None:
@@ -241,11 +228,11 @@ PIN_ROWS = (
     PinRow("host process stopped", "host", STOPPED, "no valid command for 150 ms|said nothing for",
            "SIGSTOP, after 1 s SIGCONT", _stop_process),
     PinRow("loop thread killed", "host", STOPPED, "the loop has not ticked", "the loop's thread leaves by exit(2)",
-           lambda bench: bench.signal(signal.SIGUSR2), prepared=THREAD_ENDS),
+           lambda bench: bench.drive.process.send_signal(signal.SIGUSR2), prepared=THREAD_ENDS),
     PinRow("SIGTERM", "operator", STOPPED, "SIGTERM: stopping", "a signal from outside",
-           lambda bench: bench.signal(signal.SIGTERM), exit_code=0),
+           lambda bench: bench.drive.process.send_signal(signal.SIGTERM), exit_code=0),
     PinRow("SIGKILL", "operator", STOPPED, "the drive before this one", "a signal from outside",
-           lambda bench: bench.signal(signal.SIGKILL), exit_code=-9, told_later=True),
+           lambda bench: bench.drive.process.send_signal(signal.SIGKILL), exit_code=-9, told_later=True),
     PinRow("CPU starved", "host", CONTINUES, "this machine is busy", "4 busy processes of ordinary priority",
            _starve, exit_code=None, watch_s=3.0, starves=True),
     PinRow("disk full while logging", "host", CONTINUES, "the flight log cannot be written",
@@ -308,7 +295,7 @@ def _spoilt(fault: PinRow, seen: Observation, gates: Gates) -> bool:
 
 
 def run_on_pins(faults: Sequence[PinRow], gates: Gates) -> Iterator[dict[str, Any]]:
-    """Yield a row for each fault. Raises RoverError if the bench does not drive, RoverError without an emulator."""
+    """Yield a row for each fault. Raises RoverError if the bench does not drive, or without an emulator."""
     if faults:
         with PinBench() as bench:
             for fault in faults:

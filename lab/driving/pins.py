@@ -23,6 +23,7 @@ STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pu
 BEFORE_S = 0.2  # how long the car must have been driving before a fault
 LAST_S = 0.2  # how long at the end there must be pulses
 LATE_COMMAND_S = 0.1  # three ticks of a drive
+DEFAULT = Car()
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,9 @@ class Gates:
     throttle_max_us: float = STOPPED_THROTTLE_US
 
     @classmethod
-    def of_params(cls, car: Car | None = None) -> "Gates":
-        """Read the gates from lab/params.yml. car: the default one if None."""
-        neutral_us = (car or Car()).numbers[6]
-        return cls(**lab_params()["faults"], throttle_max_us=neutral_us + ARDUINO_STEP_US)
+    def of_params(cls, car: Car = DEFAULT) -> "Gates":
+        """Read the gates from lab/params.yml."""
+        return cls(**lab_params()["faults"], throttle_max_us=car.numbers[6] + ARDUINO_STEP_US)
 
 
 class Command(NamedTuple):
@@ -62,15 +62,15 @@ class Observation:
     at_s: float
     end_s: float
 
-    def pulses(self, pin: str, from_s: float | None = None, to_s: float | None = None) -> list[PinEvent]:
-        """Return a pin's pulses that ended in a span of time [default: from the fault to the end]."""
+    def pulses(self, pin: str, from_s: float | None = None) -> list[PinEvent]:
+        """Return a pin's pulses that ended after from_s [default: the fault], until the end."""
         from_s = self.at_s if from_s is None else from_s
-        to_s = self.end_s if to_s is None else to_s
-        return [e for e in self.events if e.pin == pin and e.kind in ("pulse", "cut") and from_s < e.end_s <= to_s]
+        kinds = "pulse", "cut"
+        return [e for e in self.events if e.pin == pin and e.kind in kinds and from_s < e.end_s <= self.end_s]
 
     def was_driving(self, throttle_max_us: float) -> bool:
         """Whether each throttle pulse right before the fault moved the car."""
-        before = self.pulses("throttle", self.at_s - BEFORE_S, self.at_s)
+        before = [e for e in self.pulses("throttle", self.at_s - BEFORE_S) if e.end_s <= self.at_s]
         return bool(before) and min(e.pulse_us for e in before) > throttle_max_us
 
     def stalled_ms(self) -> float:
@@ -96,17 +96,15 @@ def judge(
     expected: str,
     seen: Observation,
     gates: Gates,
+    car: Car = DEFAULT,
     *,
     human_us: tuple[float, float] = REST_US,
     until_limit: bool = False,
-    car: Car | None = None,
 ) -> Verdict:
     """Compare what the pins did from the fault on with what was expected.
 
-    human_us: the human's pulses. until_limit: whether a car that `continues` is stopped by a limit in the end. car: the
-    default one if None.
+    human_us: the human's pulses. until_limit: whether a car that `continues` is stopped by a limit in the end.
     """
-    car = car or Car()
     throttle, steering = seen.pulses("throttle"), seen.pulses("steering")
     least_us = car.numbers[6] - ARDUINO_STEP_US if car.reverses else 0
     moving = [e.end_s for e in throttle if not least_us <= e.pulse_us <= gates.throttle_max_us]
@@ -142,7 +140,7 @@ def periods_of(car: Car) -> dict[str, int]:
 
 
 def row_of(
-    fault: Any, verdict: Verdict, code: int | None, line: str | None, recovered: bool | None, method: str, **more: Any
+    fault: Any, verdict: Verdict, code: int | None, line: str | None, recovered: bool, method: str, **more: Any
 ) -> dict[str, Any]:
     """Return a row of metrics.faults. line: tells of the fault. method: how it was done."""
     row = {"fault": fault.name, "kind": fault.kind, "expected": fault.expected, **verdict.figures}
@@ -151,9 +149,10 @@ def row_of(
     return row | {"found": fault.expected if not verdict.wrong else "not as expected"}
 
 
-def _not_stopped(
-    seen: Observation, gates: Gates, figures: dict[str, Any], resting_us: tuple[float, float]
-) -> Iterator[str]:
+Figures = dict[str, Any]  # of a row
+
+
+def _not_stopped(seen: Observation, gates: Gates, figures: Figures, resting_us: tuple[float, float]) -> Iterator[str]:
     if figures["stopped_after_ms"] > gates.stopped_ms:
         yield f"throttle off {figures['stopped_after_ms']:g} ms after the fault, {gates.stopped_ms:g} are allowed"
     if (figures["max_throttle_us_after"] or 0) > gates.throttle_max_us:
@@ -165,9 +164,7 @@ def _not_stopped(
         yield f"steering at {off[-1]:g} us, neutral is {resting_us[0]:g}"
 
 
-def _not_human(
-    seen: Observation, gates: Gates, figures: dict[str, Any], human_us: tuple[float, float]
-) -> Iterator[str]:
+def _not_human(seen: Observation, gates: Gates, figures: Figures, human_us: tuple[float, float]) -> Iterator[str]:
     took_ms = 0.0
     for pin, wanted_us in zip(("steering", "throttle"), human_us, strict=True):
         pulses = seen.pulses(pin)
@@ -183,9 +180,7 @@ def _not_human(
         yield f"the human's pulses after {took_ms:.1f} ms, {gates.takeover_ms:g} are allowed"
 
 
-def _not_continued(
-    seen: Observation, gates: Gates, figures: dict[str, Any], until_limit: bool, car: Car
-) -> Iterator[str]:
+def _not_continued(seen: Observation, gates: Gates, figures: Figures, until_limit: bool, car: Car) -> Iterator[str]:
     if until_limit:
         yield from _not_limited(seen, gates, figures)
     stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
@@ -209,7 +204,7 @@ def _not_continued(
         yield "the throttle went off"
 
 
-def _not_limited(seen: Observation, gates: Gates, figures: dict[str, Any]) -> Iterator[str]:
+def _not_limited(seen: Observation, gates: Gates, figures: Figures) -> Iterator[str]:
     """The throttle must fade from a plan's age of fade_s (params.yml) on, and be off at stop_s.
 
     When the fault comes, the plan already has some age, so both may happen earlier after the fault.

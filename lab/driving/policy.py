@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
-from rover_lib.onboard.artifact.manifest import SCHEMA, save_artifact, save_onnx
+from rover_lib.onboard.artifact.engines import TORCH
+from rover_lib.onboard.artifact.manifest import SCHEMA, save_artifact
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0
@@ -14,38 +14,27 @@ PLAN = 0.2, 0.15  # steering, throttle
 PLAIN = 0  # the pictures' usual seed
 
 
-def make_artifact(
-    path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96), engine: str | None = None
-) -> None:
-    """Write an artifact with the constant plan PLAN.
-
-    camera: the camera's name. size: height and width of the policy's pictures. engine: torch if None; with ONNX
-    Runtime's the artifact is made for that, any other is only named in the manifest.
-    """
+def make_artifact(path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96)) -> None:
+    """Write an artifact with the constant plan PLAN. camera: its name. size: height and width of its pictures."""
     import torch
 
     class Constant(torch.nn.Module):
         plan: torch.Tensor
-        nothing: torch.Tensor
 
         def __init__(self):
             super().__init__()
             self.register_buffer("plan", torch.tensor([PLAN] * CHUNK)[None])
-            self.register_buffer("nothing", torch.zeros(1))
 
         def forward(self, state, frame):
-            return self.plan + self.nothing * state[:, None]
+            return self.plan + 0 * state[:, None]
 
-    height, width = size
-    module = Constant().eval()
-    inputs = {"state": torch.zeros(1, 2), f"frame_{camera}": torch.zeros((height, width, 3), dtype=torch.uint8)}
-    names = ["steering", "throttle"]
+    names, frame = ["steering", "throttle"], f"frame_{camera}"
     manifest = {
         "schema": SCHEMA,
         "mode": "fp32",
         "scheme": "float",
-        "engine": engine or TORCH,
-        "cameras": [{"name": camera, "height": height, "width": width}],
+        "engine": TORCH,
+        "cameras": [{"name": camera, "height": size[0], "width": size[1]}],
         "state_names": names,
         "action_names": names,
         "chunk": CHUNK,
@@ -58,18 +47,9 @@ def make_artifact(
         "parity": {"tolerance": dict.fromkeys(names, 1e-6), "reason": "constant"},
         "versions": {"torch": torch.__version__, "rover_lib": ""},
     }
-    frames = np.zeros((1, height, width, 3), np.uint8)
-    parity: dict[str, np.ndarray] = {
-        "state": np.zeros((1, 2), np.float32),
-        f"frame_{camera}": frames,
-        "chunk": np.full((1, CHUNK, 2), PLAN, np.float32),
-    }
-    if engine == ONNXRUNTIME:
-        from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
-
-        save_onnx(path, onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(), manifest, parity)
-    else:
-        save_artifact(path, torch.jit.freeze(torch.jit.trace(module, tuple(inputs.values()))), manifest, parity)
+    seen = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
+    graph = torch.jit.trace(Constant().eval(), (torch.zeros(1, 2), torch.zeros((*size, 3), dtype=torch.uint8)))
+    save_artifact(path, torch.jit.freeze(graph), manifest, seen | {"chunk": np.full((1, CHUNK, 2), PLAN, np.float32)})
 
 
 def pictures(seed: int = PLAIN, size: tuple[int, int] = SIZE, count: int = 40) -> list[bytes]:

@@ -5,107 +5,63 @@ few stories of its own: they visited 34 of the firmware's states in 150 drives, 
 """
 
 import logging
-import re
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from lab.driving.invariants import RESTING_US, Run, broken
 from lab.driving.stories import Story, drive_story, random_story, shortest
 from lab.driving.virtual import Event, Seen, library
 from rover_lib.onboard.car import servo_link
-from rover_lib.onboard.stage import write_stage
 
 
-@dataclass
-class Tally:
-    """What a number of drives visited. driven: in how many of them the host moved the car.
+def random_drives(seeds: Sequence[int], jobs: int = 1) -> dict[str, Any]:
+    """Drive the story of each seed; return the metrics of stage `random`.
 
-    firmware: the firmware's states, each with its reason, what is missing, the result of the last command and which
-    signals are there. loop: the phases of the loop, each with the firmware's state and its reason. ends: the sentences
-    with which drives ended, without their numbers.
+    driven: in how many drives the host moved the car. firmware_states: how many they visited, each with its reason,
+    what is missing, the result of the last command and which signals are there. broken: a text for each drive that
+    breaks an invariant, with its seed and a short story that breaks the same one. jobs: how many processes drive at a
+    time. Raises RoverError if there is no gcc.
     """
+    library()  # in this process, where its errors are seen
+    parts = [seeds[job::jobs] for job in range(jobs)]
+    if jobs == 1:
+        done = [_drive_seeds(seeds)]
+    else:
+        with ProcessPoolExecutor(jobs) as pool:
+            done = list(pool.map(_drive_seeds, parts))
+    return {
+        "drives": len(seeds),
+        "driven": sum(driven for driven, _, _ in done),
+        "firmware_states": len(set().union(*(states for _, states, _ in done))),
+        "broken": [f"seed {seed}: {text}" for seed, text in sorted(f for _, _, broke in done for f in broke)],
+    }
 
-    drives: int = 0
-    driven: int = 0
-    firmware: set[tuple] = field(default_factory=set)
-    loop: set[tuple] = field(default_factory=set)
-    ends: set[str] = field(default_factory=set)
 
-    def add(self, seen: Seen) -> None:
-        run = Run(seen)
-        self.drives += 1
-        self.driven += bool((run.autonomous & (run.throttle > RESTING_US)).any())
-        self.ends |= {re.sub(r"[\d.]+", "N", text) for _, _, text in seen.drives if text}
-        self.firmware |= {_firmware_state(event) for _, event in seen.pins}
-        changes = [(ms, 0, name) for ms, name in seen.phases]
-        changes += [(ms, 1, "".join(map(str, _firmware_state(event)[:2]))) for ms, event in seen.pins]
-        now = ["off", ""]
-        for _, which, value in sorted(changes, key=lambda change: change[:2]):
-            now[which] = value
-            self.loop.add(tuple(now))
+def _drive_seeds(seeds: Sequence[int]) -> tuple[int, set[tuple], list[tuple[int, str]]]:
+    logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
+    driven, states, broke = 0, set(), []
+    for seed in seeds:
+        story = random_story(seed)
+        seen = drive_story(story)
+        driven += _moved(seen)
+        states |= {_firmware_state(event) for _, event in seen.pins}
+        if sentence := next(broken(seen), None):
+            short = shortest(story, partial(_breaks, sentence.partition(":")[0]))
+            broke.append((seed, f"{sentence}\n    {short}"))
+    return driven, states, broke
 
-    def merge(self, other: "Tally") -> None:
-        self.drives += other.drives
-        self.driven += other.driven
-        for name in ("firmware", "loop", "ends"):
-            getattr(self, name).update(getattr(other, name))
 
-    @property
-    def summary(self) -> dict[str, int]:
-        """The counts for JSON: drives, driven, and different states and ends."""
-        states = {"firmware_states": len(self.firmware), "loop_states": len(self.loop), "ends": len(self.ends)}
-        return {"drives": self.drives, "driven": self.driven, **states}
+def _moved(seen: Seen) -> bool:
+    run = Run(seen)
+    return bool((run.autonomous & (run.throttle > RESTING_US)).any())
 
 
 def _firmware_state(event: Event | None) -> tuple:
     if event is None:
         return ("floating",)
-    letters = (c.decode() for c in (event.state, event.reason, event.missing, event.result))
-    return (*letters, *event.signals)
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A seed whose story breaks an invariant, the sentence about it, and a short story that breaks the same one."""
-
-    seed: int
-    sentence: str
-    story: Story
-
-    def __str__(self) -> str:
-        return f"seed {self.seed}: {self.sentence}\n    {self.story}"
-
-
-def random_drives(seeds: Sequence[int], jobs: int = 1) -> tuple[Tally, list[Failure]]:
-    """Drive the story of each seed. Returns what the drives visited, and those that break an invariant.
-
-    jobs: how many processes drive at a time. Raises RoverError if there is no gcc.
-    """
-    library()  # in this process, where its errors are seen
-    if jobs == 1:
-        return _drive_seeds(seeds)
-    tally, failures = Tally(), []
-    with ProcessPoolExecutor(jobs) as pool:
-        for part, more in pool.map(_drive_seeds, [seeds[job::jobs] for job in range(jobs)]):
-            tally.merge(part)
-            failures += more
-    return tally, sorted(failures, key=lambda failure: failure.seed)
-
-
-def _drive_seeds(seeds: Sequence[int]) -> tuple[Tally, list[Failure]]:
-    logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
-    tally, failures = Tally(), []
-    for seed in seeds:
-        story = random_story(seed)
-        seen = drive_story(story)
-        tally.add(seen)
-        if sentence := next(broken(seen), None):
-            failures.append(Failure(seed, sentence, shortest(story, partial(_breaks, sentence.partition(":")[0]))))
-    return tally, failures
+    return event.state, event.reason, event.missing, event.result, *event.signals
 
 
 def find_broken(seeds: Sequence[int]) -> str:
@@ -117,9 +73,3 @@ def find_broken(seeds: Sequence[int]) -> str:
 
 def _breaks(invariant: str, story: Story) -> bool:
     return any(sentence.startswith(invariant) for sentence in broken(drive_story(story)))
-
-
-def write_random_drives(path: Path | str, first: int, tally: Tally, failures: Sequence[Failure]) -> dict[str, Any]:
-    """Write the stage `random`, and return it."""
-    metrics = tally.summary | {"broken": [str(failure) for failure in failures]}
-    return write_stage(path, "random", params={"first_seed": first}, metrics=metrics)

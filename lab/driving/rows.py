@@ -25,8 +25,8 @@ import numpy as np
 
 from balloon_world.simulated_arduino import PinEvent
 from lab.driving.invariants import Run, broken
-from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED, Command, Gates, Observation, judge, row_of
-from lab.driving.stories import TOLD, Happening, Stage, Story, drive_story, during, read_stories, told
+from lab.driving.pins import CONTINUES, DEFAULT, HUMAN, REFUSED, STOPPED, Command, Gates, Observation, judge, row_of
+from lab.driving.stories import TOLD, Happen, Happening, Stage, Story, drive_story, during, read_stories, told
 from lab.driving.virtual import GONE, SILENT, STUCK, Killed, Seen
 from lab.driving.virtual_host import scenery
 from rover_lib.onboard.artifact.manifest import Artifact, seen_size
@@ -101,9 +101,9 @@ def rows_of(car: Car) -> list[FaultRow]:
     return [row for row in all_rows().values() if row.human in ("", car.human)]
 
 
-def _told(what: str) -> Callable[[Callable], Callable]:
-    def add(happen: Callable[[Stage, Happening], object]) -> Callable:
-        TOLD[what] = happen  # type: ignore[assignment]
+def _told(what: str) -> Callable[[Happen], Happen]:
+    def add(happen: Happen) -> Happen:
+        TOLD[what] = happen
         return happen
 
     return add
@@ -112,9 +112,8 @@ def _told(what: str) -> Callable[[Callable], Callable]:
 # ---- what only these rows have
 
 
-def _film(what: str, make: Callable[[], Sequence[np.ndarray | bytes]]) -> None:
-    made = functools.cache(make)
-    TOLD[what] = lambda stage, h: stage.during(h, stage.world.lens, film=made())
+def _film(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.lens, film=FILMS[h.what]())
 
 
 def _jpegs() -> list[bytes]:
@@ -151,19 +150,17 @@ FILMS: dict[str, Callable[[], Sequence[np.ndarray | bytes]]] = {
     "camera changes its picture's size": lambda: [picture[::2, ::2] for picture in scenery()],
     "camera of another shape": lambda: [np.vstack([picture, picture[:24]]) for picture in scenery()],
 }
-for _what, _make in FILMS.items():
-    _film(_what, _make)
+TOLD |= dict.fromkeys(FILMS, _film)
 
 
-_told("rpicam-vid ends")(
-    lambda stage, h: stage.process and stage.process.eyes.unplug(CameraError("rpicam-vid has ended"))
-)
+@_told("rpicam-vid ends")
+def _end_rpicam(stage: Stage, h: Happening) -> None:
+    stage.running.eyes.unplug(CameraError("rpicam-vid has ended"))
 
 
 @_told("the policy's process is killed")
 def _kill_policy(stage: Stage, h: Happening) -> None:
-    if stage.process:
-        stage.process.planner._fail(PolicyError("the policy's process has ended (SIGKILL)"))
+    stage.running.planner._fail(PolicyError("the policy's process has ended (SIGKILL)"))
 
 
 def _flipping(stage: Stage, share: float) -> Callable[[bytes], list[bytes]]:
@@ -176,10 +173,10 @@ def _cutting(stage: Stage) -> Callable[[bytes], list[bytes]]:
     return lambda line: [line if next(number) % 3 else line[: len(line) // 2]]
 
 
-def _by_lines(what: str, changing: Callable[[Stage], Callable[[bytes], list[bytes]]], *wires: str) -> None:
+def _by_lines(what: str, changing: Callable[[Stage], Callable[[bytes], list[bytes]]]) -> None:
     def change(stage: Stage, h: Happening) -> None:
-        for wire in wires or ("down", "up"):
-            stage.during(h, getattr(stage.world, wire), change=changing(stage))
+        for wire in (stage.world.down, stage.world.up):
+            stage.during(h, wire, change=changing(stage))
 
     TOLD[what] = change
 
@@ -193,7 +190,7 @@ _by_lines("a bit of 30 % of the bytes", functools.partial(_flipping, share=0.3))
 _by_lines("a bit of 1 % of the bytes", functools.partial(_flipping, share=0.01))
 _by_lines("each third line", _cutting)
 _by_lines("each line twice", lambda stage: lambda line: [line, line])
-_by_lines("another firmware on the Arduino", lambda stage: _other_firmware, "up")
+_by_lines("another firmware on the Arduino", lambda stage: _other_firmware)
 _told("the Arduino's power is cut")(lambda stage, h: stage.world.reset("p"))
 for _fault in (GONE, SILENT, STUCK):
     TOLD[f"the gamepad: {_fault}"] = during("hand", pad=_fault)
@@ -204,18 +201,13 @@ def _set_clock(stage: Stage, h: Happening) -> None:
     stage.world.wall_step_s += h.amount
 
 
-def _by_signals(name: str, *numbers: int) -> None:
-    @_told(name)
-    def send(stage: Stage, h: Happening) -> None:
-        if process := stage.process:
-            with stop_on_signals(process.until.stop, process.log):  # type: ignore[arg-type]
-                for number in numbers:
-                    signal.raise_signal(number)
+def _send_signals(stage: Stage, h: Happening) -> None:
+    with stop_on_signals(stage.running.stopped, stage.running.log):
+        for name in h.what.split(" and then "):
+            signal.raise_signal(signal.Signals[name])
 
 
-for _number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
-    _by_signals(_number.name, _number)
-_by_signals("SIGTERM and then SIGINT", signal.SIGTERM, signal.SIGINT)
+TOLD |= dict.fromkeys(("SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT", "SIGTERM and then SIGINT"), _send_signals)
 
 
 class _View:
@@ -283,9 +275,8 @@ TOLD["artifact gone"] = during("", opening=lambda: _read_manifest(Path("/nowhere
 # ---- judging
 
 
-def run_row(fault: FaultRow, car: Car | None = None) -> dict[str, Any]:
-    """Drive a fault's story with a car, the default one if None; return the row of metrics.faults."""
-    car = car or Car()
+def run_row(fault: FaultRow, car: Car = DEFAULT) -> dict[str, Any]:
+    """Drive a fault's story with a car; return the row of metrics.faults."""
     gates = Gates.of_params(car)
     gamepad = car.human == "gamepad"
     later_ms = GAMEPAD_MS * gamepad
@@ -295,7 +286,7 @@ def run_row(fault: FaultRow, car: Car | None = None) -> dict[str, Any]:
     at_ms, over_ms = (0, AGAIN_MS) if refused else (fault.at_ms + later_ms, END_MS + later_ms)
     watch_ms = 120 if gamepad and fault.expected == HUMAN else fault.watch_ms  # the drive ends, and with it his way
     watched = _observe(seen, car, at_ms, over_ms if refused else at_ms + watch_ms)
-    verdict = judge(fault.expected, watched, gates, human_us=human_us, until_limit=fault.until_limit, car=car)
+    verdict = judge(fault.expected, watched, gates, car, human_us=human_us, until_limit=fault.until_limit)
     code = next((_exit_code(error) for ms, error in seen.errors if ms < over_ms), None)
     wanted = EXIT_CODES[fault.expected] if fault.exit_code == "usual" else fault.exit_code
     if code != wanted:
@@ -309,7 +300,7 @@ def run_row(fault: FaultRow, car: Car | None = None) -> dict[str, Any]:
     recovered = bool((run.autonomous & (run.throttle != car.numbers[6]))[AGAIN_MS:].any())
     if not recovered:
         verdict.wrong.append("the car was not driven again")
-    if car == Car():  # the invariants' numbers are this car's
+    if car == DEFAULT:  # the invariants' numbers are this car's
         verdict.wrong += broken(seen)
     method = ", ".join(dict.fromkeys(h.what for h in fault.happenings)) or "nothing happens"
     return row_of(fault, verdict, code, line, recovered, f"in virtual time: {method}")

@@ -8,7 +8,7 @@ random drive may have it. stories.yml has the faults of docs/safety.md (rows.py)
 
 import contextlib
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -70,6 +70,12 @@ class Stage:
         self.view: Any = None
         self.stack = contextlib.ExitStack()  # of what is closed at the end
         self._usual: dict[tuple[object, str], Any] = {}
+
+    @property
+    def running(self) -> Process:
+        """The process, which must be there."""
+        assert self.process
+        return self.process
 
     def during(self, happening: Happening, thing: object, **values: Any) -> None:
         """Set attributes of a thing while the happening lasts, then set them back to their usual values."""
@@ -159,20 +165,16 @@ _may("the policy is slow", (90, 2000), A_WHILE)(during("mind", latency_ms=AMOUNT
 _may("the policy wants full throttle", for_ms=A_WHILE)(during("mind", throttle=1.0))
 _may("the host goes mad", (120, 711), A_WHILE)(during("", mad_us=AMOUNT))
 
+
+def _lag(stage: Stage, h: Happening, wire: str) -> None:
+    for ms in range(0, h.for_ms, 10):
+        later = Happening(h.at_ms + ms, h.what, 1 + ms * h.amount // 100, h.for_ms - ms)
+        stage.world.at(stage.world.now_ms + ms, partial(during(wire, latency_ms=AMOUNT), stage, later))
+
+
 WIRES = {"to the Arduino": "down", "from the Arduino": "up"}
-
-
-def _by_lag(what: str, wire: str) -> None:
-    def slower(stage: Stage, h: Happening) -> None:
-        for ms in range(0, h.for_ms, 10):
-            later = Happening(h.at_ms + ms, what, 1 + ms * h.amount // 100, h.for_ms - ms)
-            stage.world.at(stage.world.now_ms + ms, partial(during(wire, latency_ms=AMOUNT), stage, later))
-
-    _may(f"{what}: further and further behind", (1, 99), (200, 4000))(slower)
-
-
 for _what, _wire in WIRES.items():
-    _by_lag(_what, _wire)
+    _may(f"{_what}: further and further behind", (1, 99), (200, 4000))(partial(_lag, wire=_wire))
 for _fault, _most in (("latency_ms", 2500), ("lost_pct", 100), ("garbled_pct", 100)):
     for _what, _wire in WIRES.items():
         _may(f"{_what}: {_fault}", (1, _most), A_WHILE)(during(_wire, **{_fault: AMOUNT}))
@@ -333,13 +335,12 @@ def told(happens: Sequence[Sequence[Any]]) -> tuple[Happening, ...]:
     return tuple(Happening(*each) for each in happens)
 
 
-def _kept() -> Iterator[tuple[str, tuple[Story, str]]]:
-    for row in read_stories("kept"):
-        name, end, happenings = row.pop("name"), row.pop("end"), told(row.pop("happens"))
-        yield name, (Story(happenings, **row), end)
+def _kept(happens: Sequence[Sequence[Any]], end: str, **options: Any) -> tuple[Story, str]:
+    return Story(told(happens), **options), end
 
 
-KEPT = dict(_kept())  # stories that once broke an invariant, and how a drive ends in them: a regular expression
+# Stories that once broke an invariant, and how a drive ends in them: a regular expression.
+KEPT = {row.pop("name"): _kept(**row) for row in read_stories("kept")}
 
 
 def random_story(seed: int) -> Story:
@@ -363,33 +364,13 @@ def random_story(seed: int) -> Story:
 
 
 def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
-    """Simplify a story step by step, for as long as it still breaks the same invariant; return the simplest one."""
-    while True:
-        simpler = next((other for other in _simpler(story) if breaks(other)), None)
-        if simpler is None:
-            return story
-        story = simpler
-
-
-def _simpler(story: Story) -> Iterator[Story]:
-    if story.clock_ms:
-        yield replace(story, clock_ms=0)
-    for name in ("service", "terminal", "limited", "heartbeat", "late", "longer_ms"):
-        if getattr(story, name):
-            yield replace(story, **{name: type(getattr(story, name))()})
-    if not story.wiggled:
-        yield replace(story, wiggled=True)
-    for i, h in enumerate(story.happenings):
-        before, after = story.happenings[:i], story.happenings[i + 1 :]
-        yield replace(story, happenings=before + after)
-        _, (least, _), (briefest, _) = HAPPENINGS[h.what]
-        for other in (
-            replace(h, for_ms=max(briefest, h.for_ms // 2)),
-            replace(h, amount=(h.amount + least) // 2 if least >= 0 else h.amount),
-            replace(h, at_ms=h.at_ms // 100 * 100),
-        ):
-            if other != h:
-                yield replace(story, happenings=(*before, other, *after))
+    """Leave out what the story does not need to break the same invariant; return the simplest one found."""
+    plain = (replace(story, **{name: value}) for name, value in vars(Story()).items() if name != "happenings")
+    fewer = (replace(story, happenings=tuple(h for h in story.happenings if h is not out)) for out in story.happenings)
+    for simpler in (*plain, *fewer):
+        if simpler != story and breaks(simpler):
+            return shortest(simpler, breaks)
+    return story
 
 
 def drive_story(story: Story, car: Car | None = None) -> Seen:

@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -176,8 +176,8 @@ class Killed(BaseException):
 class Asked(NamedTuple):
     """A drive command as the host wrote it.
 
-    content_ms: when the scene in the picture behind the plan was really to be seen. planned: whether a plan asked for
-    the command, and not a host that went mad.
+    content_ms: when the scene behind the plan was really to be seen. planned: whether a plan asked for it, and not a
+    host that went mad.
     """
 
     at_ms: int
@@ -199,56 +199,35 @@ class Planned(NamedTuple):
 
 @dataclass
 class Seen:
-    """What really happened, for the invariants. All times are in milliseconds.
+    """What really happened, for the invariants. All times are in milliseconds; what lasts is noted when it begins."""
 
-    pins: what the pins do from a time on, with the board's reasons; None while they float. hands: what human and
-    receiver do from a time on. commands: the drive commands as the host wrote them. asked: when an operator asked to
-    arm the car. wiggled: when a gesture was complete. starts: when the sketch started. hung: from when to when its loop
-    hung. phases: what the host is doing from a time on. drives: begin, end and closing sentence of each, None if it was
-    killed. errors: what ended each process, None as asked. log: the events of the flight log. paused_ms: for how long
-    the host's process was stopped in all; pauses: from when to when. asked_most_ms: how old a request may become.
-    plans: as they arrived. frames: when each came, and whether it was black. heard: the Arduino's statuses as the host
-    read them: when, and the command's number. stops: when a drive was to end, by a signal, the view, its limit or a
-    missing heartbeat; and since when it must have driven. sick: from a time on, whether lines or orders are spoilt.
-    """
-
-    pins: list[tuple[int, Event | None]] = field(default_factory=list)
-    hands: list[tuple[int, Hand]] = field(default_factory=list)
+    pins: list[tuple[int, Event | None]] = field(default_factory=list)  # with the board's reasons; None: they float
+    hands: list[tuple[int, Hand]] = field(default_factory=list)  # what human and receiver do
     commands: list[Asked] = field(default_factory=list)
-    asked: list[int] = field(default_factory=list)
-    wiggled: list[int] = field(default_factory=list)
-    starts: list[int] = field(default_factory=list)
-    hung: list[tuple[int, int]] = field(default_factory=list)
-    phases: list[tuple[int, str]] = field(default_factory=list)
-    drives: list[tuple[int, int, str | None]] = field(default_factory=list)
-    errors: list[tuple[int, BaseException | None]] = field(default_factory=list)
-    log: list[tuple[int, str]] = field(default_factory=list)
-    paused_ms: int = 0
-    pauses: list[tuple[int, int]] = field(default_factory=list)
-    asked_most_ms: int = 2000
-    plans: list[Planned] = field(default_factory=list)
-    frames: list[tuple[int, bool]] = field(default_factory=list)
-    heard: list[tuple[int, int]] = field(default_factory=list)
-    stops: list[tuple[int, int]] = field(default_factory=list)
-    sick: list[tuple[int, bool]] = field(default_factory=list)
+    asked: list[int] = field(default_factory=list)  # when an operator asked to arm the car
+    wiggled: list[int] = field(default_factory=list)  # when a gesture was complete
+    starts: list[int] = field(default_factory=list)  # of the sketch
+    hung: list[tuple[int, int]] = field(default_factory=list)  # from when to when the sketch's loop hung
+    phases: list[tuple[int, str]] = field(default_factory=list)  # what the host is doing
+    drives: list[tuple[int, int, str | None]] = field(default_factory=list)  # begin, end, last sentence; None: killed
+    errors: list[tuple[int, BaseException | None]] = field(default_factory=list)  # that ended a process; None: as asked
+    log: list[tuple[int, str]] = field(default_factory=list)  # the flight log's events
+    paused_ms: int = 0  # for how long the host's process was stopped in all
+    pauses: list[tuple[int, int]] = field(default_factory=list)  # from when to when
+    asked_most_ms: int = 2000  # how old a request may become
+    plans: list[Planned] = field(default_factory=list)  # as they arrived
+    frames: list[tuple[int, bool]] = field(default_factory=list)  # when each came, and whether it was black
+    heard: list[tuple[int, int]] = field(default_factory=list)  # statuses as the host read them, with their command
+    stops: list[tuple[int, int]] = field(default_factory=list)  # when a drive was to end; since when it drove, or 0
+    sick: list[tuple[int, bool]] = field(default_factory=list)  # whether lines or orders are spoilt
     end_ms: int = 0
-
-
-class Port(Protocol):
-    """The host's end of the serial line."""
-
-    def hear(self, data: bytes) -> None:
-        """Take bytes from the Arduino."""
-
-    def unplug(self) -> None:
-        """Notice that the device is gone."""
 
 
 class World:
     """The whole world. Its methods and attributes are what may break.
 
-    clock_ms: the Arduino's when it is switched on. rest_us: the pulses of sticks at rest. rng: decides which lines are
-    lost or garbled. wall_step_s: by how much somebody has set the host's clock.
+    clock_ms: the Arduino's when it is switched on. rest_us: the pulses of sticks at rest. wall_step_s: by how much
+    somebody has set the host's clock.
     """
 
     def __init__(self, clock_ms: int = 0, car: Car | None = None):
@@ -261,7 +240,7 @@ class World:
         self.hand = Hand(list(self.rest_us), list(self.rest_us))
         self.lens, self.mind = Lens(), Mind()
         self.board: Board | None = None
-        self.port: Port | None = None  # while somebody has it open
+        self.port: Any = None  # the host's end of the line, while it is open: hear(data) and unplug()
         self.mad_us = 0
         self.alive = True  # whether the host's process is
         self.paused_until_ms = 0
@@ -306,11 +285,9 @@ class World:
                 heapq.heappop(self._due)[2]()
             if self.now_ms >= until_ms:
                 return
-            ms = min(until_ms, self._due[0][0] if self._due else until_ms) - self.now_ms
-            if not self.board or self._hung_ms:
-                self.now_ms += ms
-                continue
-            ms, said = self.board.run(ms)
+            ms, said = min(until_ms, self._due[0][0] if self._due else until_ms) - self.now_ms, b""
+            if self.board and not self._hung_ms:
+                ms, said = self.board.run(ms)
             self.now_ms += ms
             for line in said.splitlines(keepends=True):
                 self.up.send(line)
@@ -330,16 +307,16 @@ class World:
 
     def suspend(self, ms: int) -> None:
         """Suspend the host's machine for a while."""
-        before_ms = max(self.paused_until_ms, self.now_ms)
-        self.pause(ms)
-        self.suspended_ms += self.paused_until_ms - before_ms
+        self.suspended_ms += self.pause(ms)
 
-    def pause(self, ms: int) -> None:
-        """Stop the host's process for a while."""
+    def pause(self, ms: int) -> int:
+        """Stop the host's process for a while; return by how much longer it stands still."""
         until_ms = self.now_ms + ms
-        self.seen.paused_ms += max(0, until_ms - max(self.paused_until_ms, self.now_ms))
+        longer_ms = max(0, until_ms - max(self.paused_until_ms, self.now_ms))
+        self.seen.paused_ms += longer_ms
         self.seen.pauses.append((self.now_ms, until_ms))
         self.paused_until_ms = max(self.paused_until_ms, until_ms)
+        return longer_ms
 
     # ---- the board
 

@@ -7,10 +7,12 @@ import contextlib
 import functools
 import math
 import os
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import patch
@@ -22,14 +24,15 @@ from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive import watch
-from rover_lib.onboard.drive.arming import arm_by_plan, arm_when_asked
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
-from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.service import Request, Service
-from rover_lib.onboard.errors import DriveFault, PolicyError, RoverError, sentence_of
+from rover_lib.onboard.drive.session import Arming, Session
+from rover_lib.onboard.errors import PolicyError, RoverError, sentence_of
 from rover_lib.onboard.params import params
 
 RATE_HZ = 30.0
@@ -37,6 +40,7 @@ PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
 LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 WALL_S = 1.7e9
+NO_VIEW = Path("/nowhere/view")
 SIZE = (128, 72)  # of the camera's pictures, and of those that the policy has seen: width, height
 
 
@@ -69,8 +73,7 @@ class VirtualPad(gamepad.Gamepad):
         (pad, self._to_pad), (motion, self._to_motion) = os.pipe(), os.pipe()
         for end in (pad, motion):
             os.set_blocking(end, False)
-        axes = dict.fromkeys((gamepad.STEERING, gamepad.THROTTLE), gamepad.Stick(-self.FULL, self.FULL))
-        super().__init__("virtual", pad, motion, axes)
+        super().__init__("virtual", pad, motion, read=self._where)
         self._known: tuple[bool, list[int]] | None = None  # what its events have told
 
     def close(self) -> None:
@@ -87,17 +90,20 @@ class VirtualPad(gamepad.Gamepad):
             self._send(self._to_motion, gamepad.ABS, 0, self._world.now_ms)
             known = hand.receiver != LOST, list(hand.sticks)
             if known != self._known:
-                self._tell(*known)
+                self._tell(known[0])
                 self._known = known
         return super().sticks(self._world.clock())
 
-    def _tell(self, held: bool, sticks_us: list[int]) -> None:
+    def _where(self, fd: int, axis: int) -> tuple[int, int, int]:
         car = self._world.car
-        actions = car.pwm.actions_from_pulses(*sticks_us)
-        moved = -car.left * (actions.steering or 0.0), -(actions.throttle or 0.0) / car.cap
-        for axis, x in zip((gamepad.STEERING, gamepad.THROTTLE), moved, strict=True):
-            way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
-            self._send(self._to_pad, gamepad.ABS, axis, round(math.copysign(way, x) * self.FULL))
+        actions = car.pwm.actions_from_pulses(*self._world.hand.sticks)
+        x = -car.left * (actions.steering or 0.0) if axis == gamepad.STEERING else -(actions.throttle or 0.0) / car.cap
+        way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
+        return round(math.copysign(way, x) * self.FULL), -self.FULL, self.FULL
+
+    def _tell(self, held: bool) -> None:
+        for axis in gamepad.AXES:
+            self._send(self._to_pad, gamepad.ABS, axis, self._where(-1, axis)[0])
         if not self._known or self._known[0] != held:
             age_s = 1.0 if self._world.hand.pad == STUCK else 0.0
             self._send(self._to_pad, gamepad.KEY, gamepad.BTN_L1, int(held), age_s)
@@ -180,51 +186,46 @@ class Eyes:
     def __init__(self, world: World):
         self._world = world
         self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
+        condition: Any = _Waiting(world)
+        self.camera._changed = condition
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
-        self._next: tuple[np.ndarray | bytes, float] | None = None
-        self._failure: Exception | None = None
         self._shown = 0  # pictures of a film
         self._seen_ms = -1_000_000
-        self._turn, self._idle = threading.Semaphore(0), threading.Semaphore(0)
+        self._given, self._idle = queue.Queue[Any](), queue.Queue[None]()
         self._over = False
         self._thread = threading.Thread(target=self.camera._read, args=(self._pictures(),), daemon=True)
         self._thread.start()
-        self._idle.acquire()
+        self._idle.get()
         self._due_ms = float(world.now_ms)
         self.on_frame: Callable[[], None] = lambda: None
         self._tick()
 
     def _pictures(self) -> Iterator[tuple[np.ndarray | bytes, float | None]]:
         try:
-            while True:
-                self._idle.release()
-                self._turn.acquire()
-                if self._failure:
-                    raise self._failure
-                if self._next is None:
-                    return
-                yield self._next
+            self._idle.put(None)
+            while isinstance(given := self._given.get(), tuple):
+                yield given
+                self._idle.put(None)
+            if given:
+                raise given
         finally:
             self._over = True
-            self._idle.release()
+            self._idle.put(None)
 
-    def _give(self, picture: tuple[np.ndarray | bytes, float] | None) -> None:
-        if self._over:
-            return
-        self._next = picture
-        self._turn.release()
-        self._idle.acquire()
+    def _give(self, picture: tuple[np.ndarray | bytes, float] | Exception | None) -> None:
+        if not self._over:
+            self._given.put(picture)
+            self._idle.get()
         if self._over:
             self._thread.join()
 
     def unplug(self, failure: Exception | None = None) -> None:
         """Let the camera's reader come to the end of its pictures, or raise."""
-        self._failure = failure
-        self._give(None)
+        self._give(failure)
 
     def close(self) -> None:
         self.camera._closing.set()
-        self.unplug()
+        self._give(None)
         self.on_frame = lambda: None
 
     def _tick(self) -> None:
@@ -234,11 +235,9 @@ class Eyes:
         self._due_ms += FRAME_MS
         world.at(round(self._due_ms), self._tick)
         lens = world.lens
-        if lens.silent or world.paused_until_ms > world.now_ms:
-            return
         seen_ms = world.now_ms - lens.late_ms
-        if seen_ms <= self._seen_ms:
-            return  # pictures have become late, and the next one is still on its way
+        if lens.silent or world.paused_until_ms > world.now_ms or seen_ms <= self._seen_ms:
+            return  # the last: pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
         scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
@@ -356,59 +355,101 @@ class _Log:
         self._world.seen.log.append((self._world.now_ms, text))
 
 
-@functools.cache
-def _settings() -> Settings:
-    return Settings.of(params()["drive"])
+class _Session(Session):
+    """The session of `rover drive`, which tells the world what the host is doing."""
+
+    process: "Process"
+
+    def make_pilot(self) -> PolicyPilot:
+        world, planner = self.process.world, self.process.planner
+        args = self.camera, planner, self.commanded, self.settings, RATE_HZ
+        pilot = _Pilot(*args, calibration=world.car.pwm)
+        pilot.world, pilot.planner = world, planner
+        return pilot
+
+    def make_warnings(self, pilot: PolicyPilot) -> Callable[[], list[str]]:
+        """Return the sources of warnings, less what they say of the machine that this runs on."""
+        world = self.process.world
+        clocks = SimpleNamespace(time=functools.partial(wall_clock, world), monotonic=world.clock)
+        with patch.object(watch, "time", clocks):
+            warnings = super().make_warnings(pilot)
+
+        def of_the_drive() -> list[str]:
+            with patch.object(watch, "time", clocks):
+                return [text for text in warnings() if not text.startswith(("this machine", "this virtual machine"))]
+
+        return of_the_drive
+
+    def _arm(self, arming: Arming, stop: threading.Event, said: str) -> Telemetry | None:
+        self.process.world.phase("disarmed")
+        return super()._arm(arming, stop, said)
+
+    def attempt(self, arming: Arming) -> Telemetry | None:
+        world = self.process.world
+        world.phase("arming")
+        try:
+            telemetry = super().attempt(arming)
+        except RoverError as error:
+            world.phase("disarmed")
+            self.log.event(f"not armed: {error}")
+            raise
+        world.phase("driving")
+        self.process.armed()
+        return telemetry
+
+    def over(self) -> str | None:
+        return "stopped from the view (127.0.0.1)" if self.process.world.view_stop else super().over()
 
 
 class Process:
     """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
 
-    service: whether it drives again each time that an operator asks for it with ask(); terminal: whether it waits for
-    the human's gesture. limited, heartbeat: whether a service's drive ends after LIMIT_MS, or without the operator's
-    heartbeats. record: the loop's hook, called with each command. armed: the status with which the car was armed.
+    service, terminal, limited, heartbeat: see Story; ask() is an operator's request. session: what it drives by.
     """
 
-    record: Callable[..., None] | None = None
-    armed: Telemetry | None = None
-
     def __init__(self, world: World, service: bool, terminal: bool = False, limited=False, heartbeat=False):
-        self.world = world
-        self.until = Until(stop=_Stop(world), over=self._over)
-        self._terminal = terminal
-        self._operators = Service(Report(), self.until.stop, clock=world.boottime)
+        self.world, self.stopped, self._terminal = world, _Stop(world), terminal
+        self.report, self.log = Report(), cast(Any, _Log(world))
+        self._operators = Service(self.report, self.stopped, clock=world.boottime)
         turn: Any = _Waiting(world)
         self._operators._turn = turn
         self._limits = Request(LIMIT_MS / 1e3 if limited else None, HEARTBEAT_MS / 1e3 if heartbeat else None)
-        world.seen.asked_most_ms = 31_000 if terminal else 2000
-        self.commanded = Commanded()
+        world.seen.asked_most_ms = 2000 if service else 31_000
         world.alive = True
-        self.eyes = Eyes(world)
-        self.planner = VirtualPlanner(world, self.eyes, self.commanded)
-        self._service = service
-        self.log = cast(Any, _Log(world))
-        self._feed = Feed(world.view, self.log, "virtual", clock=world.clock, sleep=world.sleep) if world.view else None
+        self.eyes, commanded = Eyes(world), Commanded()
+        self.planner = VirtualPlanner(world, self.eyes, commanded)
+        self._feed = Feed(world.view or NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self.session = _Session(
+            DriveOptions(Path("virtual"), hz=RATE_HZ, asked_s=world.boottime()), Settings.of(params()["drive"]),
+            self.report, self.log, self._feed, None, self.eyes.camera, self.planner, commanded, RATE_HZ, "virtual",
+            service=self._operators if service else None, terminal=terminal, boost=contextlib.nullcontext,
+            clock=world.clock, sleep=world.sleep, now=world.boottime,
+        )  # fmt: skip
+        self.session.process = self
+        if not service:
+            world.seen.asked.append(world.now_ms)
 
     def ask(self) -> None:
-        """Let the operator ask to arm the car, as Service._answer_to() does."""
-        operators = self._operators
+        """Let the operator ask to arm the car."""
         self.world.seen.asked.append(self.world.now_ms)
-        if operators._ticket:
-            operators._ticket, operators._request, operators._asked = "", self._limits, True
-            operators._asked_s = self.world.boottime()
+        self._operators.ask(self._operators._ticket, self.world.boottime(), self._limits)
 
     def stop(self, how: str) -> None:
         """End the drive by a signal, or by the view."""
         self.world.seen.stops.append((self.world.now_ms, 0))
         if how == "signal":
-            self.until.stop.set()
+            self.stopped.set()
         else:
             self.world.view_stop = True
 
-    def _over(self) -> str | None:
-        if self.world.view_stop:
-            return "stopped from the view (127.0.0.1)"
-        return (self._operators.over() if self._service else None) or (self._feed.over() if self._feed else None)
+    def armed(self) -> None:
+        """Take note that the car was armed: what ends this drive is due from now on."""
+        world = self.world
+        world.view_stop = False
+        if self.session.service and self._limits.max_seconds:
+            world.seen.stops.append((world.now_ms + LIMIT_MS, world.now_ms))
+        if self.session.service and self._limits.heartbeat_s:
+            world.at(world.now_ms + 1, functools.partial(self._beat, world.now_ms))
 
     def _beat(self, armed_ms: int) -> None:
         """Let the operator's heartbeats come until they are gone."""
@@ -420,16 +461,19 @@ class Process:
 
     def run(self) -> None:
         """Run until it ends. Raises nothing."""
-        world = self.world
+        world, session = self.world, self.session
         error: BaseException | None = None
         try:
             with contextlib.ExitStack() as stack:
-                link = None
-                while link is None or (self._service and not self.until.stop.is_set()):
-                    with self._told(report := Report()):
-                        world.opening()
-                        link = link or stack.enter_context(VirtualLink(world))
-                        self._drive(link, report)
+                with self._told():
+                    world.opening()
+                    session.link = stack.enter_context(VirtualLink(world))
+                    if frame := session.camera.latest():
+                        check_shape(session.camera.source, frame.image, SIZE)
+                    session.drive(self.stopped)
+                while session.service and not self.stopped.is_set():
+                    with self._told():
+                        session.drive(self.stopped, said=self.report.ended)
         except (Killed, Exception) as raised:
             error = raised
         finally:
@@ -438,77 +482,17 @@ class Process:
             world.paused_until_ms = world.now_ms
             world.failing = None
             self.eyes.close()
-            if self._feed:
-                self._feed.close()
+            self._feed.close()
 
     @contextlib.contextmanager
-    def _told(self, report: Report) -> Iterator[None]:
-        """Note a drive's begin, end and closing sentence. A fault or a takeover ends only the drive, not a service."""
+    def _told(self) -> Iterator[None]:
+        """Note a drive's begin, end and closing sentence."""
         world, begin_ms = self.world, self.world.now_ms
         world.phase("opening")
         try:
             yield
-        except DriveFault:
-            if not self._service:
-                raise
         except Exception as error:
-            report.ended = report.ended or sentence_of(error)
+            self.report.ended = self.report.ended or sentence_of(error)
             raise
         finally:
-            world.seen.drives.append((begin_ms, world.now_ms, report.ended if world.alive else None))
-
-    def _drive(self, link: ServoLink, report: Report) -> None:
-        world, camera = self.world, self.eyes.camera
-        world.phase("ready")
-        if frame := camera.latest():
-            check_shape(camera.source, frame.image, SIZE)
-        pilot = _Pilot(camera, self.planner, self.commanded, _settings(), RATE_HZ, calibration=world.car.pwm)
-        pilot.world, pilot.planner = world, self.planner
-        show = functools.partial(self._feed.tick, report, camera, pilot) if self._feed else None
-        arm = functools.partial(self._arm, pilot, link)
-        hooks = Hooks(arm, self._warnings(pilot, link, report), self.record, show)
-        drive(pilot, link, self.log, rate_hz=RATE_HZ, until=self.until, hooks=hooks, report=report,
-              clock=world.clock, sleep=world.sleep)  # fmt: skip
-
-    def _warnings(self, pilot: PolicyPilot, link: ServoLink, report: Report) -> Callable[[], list[str]]:
-        """Return the sources of warnings that drive.py has, less what they say of the machine that this runs on."""
-        clocks = SimpleNamespace(time=functools.partial(wall_clock, self.world), monotonic=self.world.clock)
-        with patch.object(watch, "time", clocks):
-            health = watch.HealthWatch(report, link)
-
-        def warnings() -> list[str]:
-            with patch.object(watch, "time", clocks):
-                said = [*pilot.warnings(), *health()]
-            return [text for text in said if not text.startswith(("this machine", "this virtual machine"))]
-
-        return warnings
-
-    def _arm(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
-        """Arm the car: for whoever asks the service, for a human in a terminal, or at once."""
-        world = self.world
-        world.phase("disarmed")
-        service = self._operators if self._service else None
-        if not service:
-            world.seen.asked.append(world.now_ms)
-        checks = (self.eyes.camera.latest, self.planner.newest, link.latest)
-        attempt = functools.partial(self._attempt, pilot, link)
-        how: dict[str, Any] = {"service": service, "terminal": self._terminal, "clock": world.boottime}
-        return arm_when_asked(attempt, link, self.until.stop, self.log.event, checks, **how)
-
-    def _attempt(self, pilot: PolicyPilot, link: ServoLink) -> Telemetry | None:
-        world = self.world
-        world.phase("arming")
-        wanted = self._operators.check_request if self._service else lambda: None
-        try:
-            self.armed = arm_by_plan(link, self.planner, pilot, _settings(), self.log.event, wanted)
-        except RoverError as error:
-            world.phase("disarmed")
-            self.log.event(f"not armed: {error}")
-            raise
-        world.phase("driving")
-        world.view_stop = False
-        if self._service and self._limits.max_seconds:
-            world.seen.stops.append((world.now_ms + LIMIT_MS, world.now_ms))
-        if self._service and self._limits.heartbeat_s:
-            world.at(world.now_ms + 1, functools.partial(self._beat, world.now_ms))
-        return self.armed
+            world.seen.drives.append((begin_ms, world.now_ms, self.report.ended if world.alive else None))

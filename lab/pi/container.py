@@ -1,9 +1,5 @@
 """Emulate a Pi that is up in seconds: real systemd and sshd, aarch64 programs, but this machine's kernel and network.
 
-    with Container("rover1") as pi:
-        pi.plug(board.port)         # an EmulatedArduino's; it is PORT inside
-        pi.boot()                   # its sshd is on the loopback at pi.port, for the user of debian_image with pi.key
-
 Its systemd is this machine's own program, of the same version, so everything that makes a service's sandbox is real.
 All other programs are aarch64. A container has no kernel of its own, so it has no udev, no V4L2 camera (a FIFO of JPEGs
 replaces it) and no time of its own.
@@ -12,6 +8,7 @@ replaces it) and no time of its own.
 import ast
 import contextlib
 import os
+import platform
 import secrets
 import shutil
 import socket
@@ -154,15 +151,14 @@ def _power_off(nspawn: subprocess.Popen) -> None:
 def _lend_systemd(root: Path) -> None:
     """Copy this machine's own systemd, which must have the Pi's version, into the Pi; everything else stays aarch64.
 
-    systemd sets up the sandboxes of services, which under qemu-user fails (PrivateNetwork=, credentials) or has no
-    effect (seccomp). A sandbox also holds for the emulator in which a service's program runs.
+    Under qemu-user, a service's sandbox fails (PrivateNetwork=, credentials) or has no effect (seccomp).
     """
-    libraries = {Path(word) for word in _run("ldd", SYSTEMD).split() if word.startswith("/")}
+    libraries = {Path(word) for word in run("ldd", SYSTEMD).split() if word.startswith("/")}
     ask = ["dpkg-query", "--show", "--showformat=${Version}"]
-    here, there = _run(*ask, "systemd"), _run(*ask, f"--admindir={root}/var/lib/dpkg", "systemd:arm64")
+    here, there = run(*ask, "systemd"), run(*ask, f"--admindir={root}/var/lib/dpkg", "systemd:arm64")
     if here.partition(".")[0] != there.partition(".")[0]:
-        what = f"systemd is {here} here and {there} on the emulated Pi"
-        raise RoverError(what, remedy=f"remove {cache_root()}/pi-system-*")
+        remedy = f"remove {cache_root()}/pi-system-*"
+        raise RoverError(f"the Pi's systemd must be {here}, as here", found=there, remedy=remedy)
     for path in (SYSTEMD, *libraries):
         target = root / path.relative_to("/")
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -172,26 +168,19 @@ def _lend_systemd(root: Path) -> None:
 
 def _lend_registries(etc: Path) -> None:
     """Give the Pi this machine's access to Debian's and Python's packages: sources, proxies, certificates, pip.conf."""
-    listed = _run("apt-get", "indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Identifier: Packages")
-    release = (etc / "os-release").read_text()
-    codename = next(x.partition("=")[2] for x in release.splitlines() if x.startswith("VERSION_CODENAME="))
+    listed = run("apt-get", "indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Identifier: Packages")
+    codename = platform.freedesktop_os_release()["VERSION_CODENAME"]  # the Pi's too, see debian_image
     suites = {codename, f"{codename}-updates", f"{codename}-security"}
-    sources = sorted({line for line in listed.splitlines() if set(line.split()[1:2]) & suites})
-    if not sources:
-        raise RoverError(f"this machine's apt sources have no Debian {codename}, whose packages the Pi installs")
-    (etc / "apt/sources.list").write_text("".join(f"deb {line}\n" for line in sources))
-    settings = [x for x in _run("apt-config", "dump").splitlines() if x.startswith(("Acquire::http", "Acquire::https"))]
+    sources = sorted({f"deb {line}\n" for line in listed.splitlines() if set(line.split()[1:2]) & suites})
+    (etc / "apt/sources.list").write_text("".join(sources))
+    settings = [x for x in run("apt-config", "dump").splitlines() if x.startswith(("Acquire::http", "Acquire::https"))]
     proxies = getproxies()
     settings += [f'Acquire::{kind}::Proxy "{proxies[kind]}";' for kind in ("http", "https") if kind in proxies]
     (etc / "apt/apt.conf.d/90emulated").write_text("\n".join([*settings, 'Acquire::Languages "none";\n']))
     if CERTIFICATES.exists():
         shutil.copy(CERTIFICATES, etc / CERTIFICATES.relative_to("/etc"))
-    config = _run(sys.executable, "-m", "pip", "config", "list")
+    config = run(sys.executable, "-m", "pip", "config", "list")
     (etc / "pip.conf").write_text(pip_settings(config, proxies.get("https", "")))
-
-
-def _run(*command: object) -> str:
-    return run(*command, error=RoverError)
 
 
 def pip_settings(config: str, proxy: str = "") -> str:

@@ -8,13 +8,11 @@ that would take minutes under emulation; only their configuration is emulated. T
 must install.
 """
 
-import contextlib
 import os
 import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +28,7 @@ PACKAGES = (
     *("systemd", "systemd-sysv", "dbus", "udev", "libpam-systemd", "kmod", "procps"),
     *("openssh-server", "sudo", "python3", "python3-apt", "iproute2", "netbase", "less"),
 )
-RECIPE = 2  # raise it when the image is made in another way, so that older ones are not used
+RECIPE = 3  # raise it when the image is made in another way, so that older ones are not used
 FIRST = "base-passwd"  # unpacked first, as the other packages' scripts ask for its users and groups
 FORCE = ("architecture", "depends", "overwrite", "unsafe-io")
 GROUPS = "adm,dialout,cdrom,sudo,audio,video,plugdev,games,users,input,render,netdev"  # of Raspberry Pi OS's user
@@ -39,9 +37,9 @@ dpkg --configure --pending --force-depends
 for group in {GROUPS.replace(",", " ")}; do getent group $group > /dev/null || groupadd --system $group; done
 useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
 """
-# These programs replace the real ones while the packages are configured. So no service is started, and no bundle of
-# certificates is made, which takes a minute under emulation: a container gets this machine's.
-STAND_INS = {"policy-rc.d": "exit 101", "update-ca-certificates": "exit 0"}
+# These programs stand before the real ones while the packages are configured. So no service is started, and no bundle
+# of certificates is made, which takes a minute under emulation: a container gets this machine's.
+STAND_INS = {"usr/sbin/policy-rc.d": "exit 101", "usr/local/sbin/update-ca-certificates": "exit 0"}
 
 
 class DebianImage(NamedTuple):
@@ -52,10 +50,7 @@ class DebianImage(NamedTuple):
 
 
 def debian_image() -> DebianImage:
-    """Return the Pi's file system and the key to it, from the cache or made now, which takes two minutes.
-
-    Call it within emulation(). Raises RoverError that says what could not be had.
-    """
+    """Return the Pi's file system and the key to it, from the cache or made now, within emulation(), in two minutes."""
     recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
     folder = cache_folder("pi-system", key_of(recipe), _make)
     return DebianImage(folder / "root", folder / "key")
@@ -76,11 +71,18 @@ def _make(folder: Path) -> None:
         _unpack(root, fetch_packages(Path(scratch), PACKAGES))
     run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "emulated Pi", "-f", folder / "key", error=RoverError)
     name = f"rover-make-{os.getpid()}"
-    with _stand_ins(root / "usr" / "sbin"), in_cgroup(name) as enter:
+    stand_ins = [root / path for path in STAND_INS]
+    for program in stand_ins:
+        program.parent.mkdir(parents=True, exist_ok=True)
+        program.write_text(f"#!/bin/sh\n{STAND_INS[str(program.relative_to(root))]}\n")
+        program.chmod(0o755)
+    with in_cgroup(name) as enter:
         chroot = ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", f"--machine={name}"]
         chroot += ["--timezone=off", "--resolv-conf=off", "--link-journal=no", f"--directory={root}"]
         chroot += ["--setenv=DEBIAN_FRONTEND=noninteractive", "--setenv=LC_ALL=C.UTF-8"]
         run(*chroot, "/bin/sh", "-c", CONFIGURE, error=RoverError, preexec_fn=enter)
+    for program in stand_ins:
+        program.unlink()
     _personalize(root, (folder / "key.pub").read_text())
 
 
@@ -108,22 +110,6 @@ def _unpack(root: Path, packages: list[Path]) -> None:
     for part in ([p for p in packages if p.name.startswith(f"{FIRST}_")], packages):
         command = ["dpkg", f"--root={root}", "--log=/dev/null", *forced, "--unpack", *part]
         run(*command, error=RoverError, env=environment)
-
-
-@contextlib.contextmanager
-def _stand_ins(sbin: Path) -> Iterator[None]:
-    for name, line in STAND_INS.items():
-        program = sbin / name
-        if program.exists():
-            program.rename(program.with_suffix(".real"))
-        program.write_text(f"#!/bin/sh\n{line}\n")
-        program.chmod(0o755)
-    yield
-    for name in STAND_INS:
-        program = sbin / name
-        program.unlink()
-        if program.with_suffix(".real").exists():
-            program.with_suffix(".real").rename(program)
 
 
 def _personalize(root: Path, public_key: str) -> None:

@@ -1,14 +1,9 @@
 """Deploy to an emulated Pi, as a newcomer would, and drive: python -m lab pi.
 
-    report = deploy_and_drive("runs/pi.json", "runs/demo")
-
 From a flashed card: provision, and again, which changes nothing; deploy; a damaged artifact is refused, and the model
 in use stays; benchmark, and fetch it; deploy another model, and drive by it; roll back. The Pi is a container, its
-Arduino the real firmware in simavr, its camera a FIFO of JPEGs. Debian's and Python's packages come from the network by
-this machine's own settings.
-
-Times of the emulated programs say nothing about a Pi: they are some ten times slower. An INT8 plan takes half a second
-here, which is too long to drive by. So a policy with a constant plan drives, deployed like any other, at HZ.
+Arduino the real firmware in simavr, its camera a FIFO of JPEGs. Emulated programs are some ten times slower than a
+Pi's, so that a policy with a constant plan drives, deployed like any other, at HZ.
 
 runs/pi.json is a stage "pi" (onboard/stage.py). Its metrics are steps: [{step, seconds, ok}], gates: [{gate, wanted,
 found, holds}] and wrong, a sentence for everything that is not as it should be. pi.log beside it has all that the
@@ -21,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -33,7 +27,7 @@ from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import debian_image
-from lab.pi.emulation import emulation, interruptible, require
+from lab.pi.emulation import emulation, require
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
@@ -47,16 +41,60 @@ DRIVE_S = 10
 LEAST_TICKS = 10  # with the policy driving
 
 
-@dataclass
-class Report:
-    """What the steps found. say: called with a line for each. The file is written after each step."""
+def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lambda text: None) -> list[str]:
+    """Do all steps, write the report whatever fails, and return `wrong`. demo: a run's folder with ARTIFACT.
 
-    path: Path
-    inputs: dict[str, str]
-    say: Callable[[str], None]
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    gates: list[dict[str, Any]] = field(default_factory=list)
-    wrong: list[str] = field(default_factory=list)
+    Raises RoverError if it cannot begin: without root, without the artifact, or if packages cannot be installed.
+    """
+    artifact = demo.absolute() / ARTIFACT
+    if not artifact.is_file():
+        raise RoverError(f"{artifact}: not found", remedy="make demo makes it")
+    require()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        emulation(),
+        tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
+        output.with_suffix(".log").open("w") as log,
+    ):
+        deployment = Deployment(output, {artifact.name: sha256_of(artifact)}, say, Path(folder), log)
+        try:
+            with deployment.step("make the system"):
+                debian_image()
+            with (
+                Container(ROVER) as pi,
+                CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ),
+                EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=NICE) as board,
+            ):
+                (pi.bench / "camera").chmod(0o666)
+                pi.plug(board.port)
+                deployment.run(pi, board, artifact)
+        except RoverError as error:
+            deployment.wrong.append(str(error))
+        deployment.write()
+    return deployment.wrong
+
+
+class Deployment:
+    """The steps, and what they found. The report is written after each step.
+
+    inputs: of the report. say: called with a line for each step and gate. folder: for what comes and goes. log: takes
+    what the playbooks print.
+    """
+
+    def __init__(self, path: Path, inputs: dict[str, str], say: Callable[[str], None], folder: Path, log: TextIO):
+        self.path, self.inputs, self.say, self.folder, self.log = path, inputs, say, folder, log
+        self.steps: list[dict[str, Any]] = []
+        self.gates: list[dict[str, Any]] = []
+        self.wrong: list[str] = []
+        self.variables: dict[str, Any] = {
+            "rover_wheels": str(folder / "wheels"),
+            "rover_fetched": str(folder / "fetched"),
+            "rover_camera": CAMERA,
+            "rover_film": True,
+            "rover_port": PORT,
+            "rover_hz": HZ,
+            "rover_ready_s": READY_S,
+        }
 
     def gate(self, name: str, wanted: str, found: Any, holds: bool) -> None:
         """Add a gate, and a sentence to `wrong` if it does not hold."""
@@ -83,124 +121,66 @@ class Report:
         metrics = {"steps": self.steps, "gates": self.gates, "wrong": self.wrong}
         write_stage(self.path, "pi", params={}, metrics=metrics, inputs=self.inputs)
 
-
-def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lambda text: None) -> Report:
-    """Do all steps, and write the report to `output` whatever fails. demo: a run's folder with ARTIFACT.
-
-    Raises RoverError if it cannot begin: without root, without the artifact, or if packages cannot be installed.
-    """
-    artifact = demo.absolute() / ARTIFACT
-    if not artifact.is_file():
-        raise RoverError(f"{artifact}: not found", remedy="make demo makes it")
-    require()
-    report = Report(output, {artifact.name: sha256_of(artifact)}, say)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        interruptible(),
-        emulation(),
-        tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
-        output.with_suffix(".log").open("w") as log,
-    ):
-        try:
-            with report.step("make the system"):
-                debian_image()
-            with Container(ROVER) as pi, _camera(pi), _arduino(pi) as board:
-                _Deployment(report, pi, board, Path(folder), log).run(artifact)
-        except RoverError as error:
-            report.wrong.append(str(error))
-        finally:
-            report.write()
-    return report
-
-
-@contextlib.contextmanager
-def _camera(pi: Container) -> Iterator[None]:
-    with CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=HZ):
-        (pi.bench / "camera").chmod(0o666)
-        yield
-
-
-@contextlib.contextmanager
-def _arduino(pi: Container) -> Iterator[EmulatedArduino]:
-    with EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=NICE) as board:
-        pi.plug(board.port)
-        yield board
-
-
-class _Deployment:
-    def __init__(self, report: Report, pi: Container, board: EmulatedArduino, folder: Path, log: TextIO):
-        self.report, self.pi, self.board, self.folder, self.log = report, pi, board, folder, log
-        self.fetched = folder / "fetched"
-        self.variables: dict[str, Any] = {
-            "rover_wheels": str(folder / "wheels"),
-            "rover_fetched": str(self.fetched),
-            "rover_camera": CAMERA,
-            "rover_film": True,
-            "rover_port": PORT,
-            "rover_hz": HZ,
-            "rover_ready_s": READY_S,
-        }
-
-    def run(self, artifact: Path) -> None:
-        name = content_hash(artifact)
-        with self.report.step("boot"):
-            self.pi.boot()
-        with _compile_here(self.pi.root):
+    def run(self, pi: Container, board: EmulatedArduino, artifact: Path) -> None:
+        """Do the steps that need the Pi. Raises RoverError if one fails that the next ones need."""
+        self.pi, self.board, name = pi, board, content_hash(artifact)
+        with self.step("boot"):
+            pi.boot()
+        with _compile_here(pi.root):
             self.play("provision")
         again = self.play("provision", "provision again")
-        self.report.gate("provision again", "changed=0", again.changed, again.changed == 0)
-        self.deploy("deploy", artifact, name)
-        self.refuse(artifact, name)
+        self.gate("provision again", "changed=0", again.changed, again.changed == 0)
+        self.deploy("deploy", artifact)
+        self.refuse(artifact)
+        self.expect("after a damaged artifact", name)
         self.play("benchmark", rover_iterations=3)
-        benchmark = self.fetched / f"benchmark-{ROVER}.json"
-        self.report.gate("benchmark", "fetched", benchmark.name, benchmark.is_file())
+        benchmark = self.folder / "fetched" / f"benchmark-{ROVER}.json"
+        self.gate("benchmark", "fetched", benchmark.name, benchmark.is_file())
         constant = self.folder / "policy_constant.pt"
         make_artifact(constant, camera="cam_front", size=(72, 128))
-        self.deploy("deploy another", constant, content_hash(constant))
+        self.deploy("deploy another", constant)
         self.drive()
         self.play("rollback")
         self.expect("rollback", name)
 
     def play(self, book: str, step: str = "", works: bool = True, **variables: Any) -> playbooks.Play:
         """Run a playbook. works: whether it has to; raises RoverError with the end of its output if it fails."""
-        with self.report.step(step or book):
+        with self.step(step or book):
             play = playbooks.run(book, self.pi, self.folder, {**self.variables, **variables})
             self.log.write(f"===== {step or book}\n{play.output}\n")
             if works and not play.ok:
-                self.log.write(f"===== its journal\n{playbooks.read_journal(self.pi)}\n")
                 raise RoverError(f"{book}.yml failed, its output ends: {play.end}")
         return play
 
     def expect(self, what: str, name: str) -> None:
         """Add a gate: whether the model in use is the one of that name."""
         current = (self.pi.root / "var/lib/rover/models/current").readlink().name
-        self.report.gate(what, f"model {name[:12]} in use", current[:12], current == name)
+        self.gate(what, f"model {name[:12]} in use", current[:12], current == name)
 
-    def deploy(self, step: str, artifact: Path, name: str) -> None:
+    def deploy(self, step: str, artifact: Path) -> None:
         self.play("deploy", step, rover_artifact=str(artifact), rover_allow=["mode"])
-        self.expect(step, name)
+        self.expect(step, content_hash(artifact))
 
-    def refuse(self, artifact: Path, name: str) -> None:
-        """Deploy an artifact with one wrong byte. It must be refused, and the model in use must stay."""
+    def refuse(self, artifact: Path) -> None:
+        """Deploy an artifact with one wrong byte, which must be refused."""
         content = bytearray(artifact.read_bytes())
         content[len(content) // 2] ^= 1
         damaged = self.folder / "damaged.pt"
         damaged.write_bytes(content)
         play = self.play("deploy", "deploy a damaged artifact", works=False, rover_artifact=str(damaged))
-        said = f"{ROVER}: failed: " in play.output and "damaged" in play.output
-        self.report.gate("a damaged artifact", "refused", play.end[-300:] if not said else "so", said and not play.ok)
-        self.expect("after a damaged artifact", name)
+        refused = not play.ok and f"{ROVER}: failed: " in play.output and "damaged" in play.output
+        self.gate("a damaged artifact", "refused", play.end[-300:], refused)
 
     def drive(self) -> None:
         """Drive armed: by the flight log, and on the Arduino's throttle pin, which must move the car and then not."""
         self.board.pulses()  # drop what was before
         self.play("drive", rover_arm=True, rover_seconds=DRIVE_S)
-        log = next(iter((self.fetched / ROVER).rglob("flight.log")), None)
+        log = next(iter((self.folder / "fetched" / ROVER).rglob("flight.log")), None)
         driven = sum(state == "A" for state in read_log(log).ticks["state"]) if log else 0
-        self.report.gate("ticks driven", f"at least {LEAST_TICKS}", driven, driven >= LEAST_TICKS)
+        self.gate("ticks driven", f"at least {LEAST_TICKS}", driven, driven >= LEAST_TICKS)
         throttle_us = [e.pulse_us for e in self.board.pulses() if e.kind == "pulse" and e.pin == "throttle"]
         moved = max(throttle_us, default=0.0) > STOPPED_THROTTLE_US >= (throttle_us or [STOPPED_THROTTLE_US + 1])[-1]
-        self.report.gate("throttle's pulses", "moved the car, and stopped it", throttle_us[-1:], moved)
+        self.gate("throttle's pulses", "moved the car, and stopped it", throttle_us[-1:], moved)
 
 
 @contextlib.contextmanager

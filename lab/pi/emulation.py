@@ -11,7 +11,6 @@ from pathlib import Path
 from lab.arduino import emulator as arduino
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.signal_event import signals
 from rover_lib.workshop.run_program import run
 
 NEEDS = {  # commands, each with its Debian package
@@ -30,24 +29,10 @@ RIGHTS = "is this a container without rights?"
 
 
 def require() -> None:
-    """Make sure that this is root, and install what is missing for a Pi and its Arduino.
-
-    Raises RoverError.
-    """
+    """Make sure that this is root, and install what is missing for a Pi and its Arduino. Raises RoverError."""
     if os.geteuid() != 0:
         raise RoverError("an emulated Pi mounts file systems and starts a container", remedy="use sudo")
     install_packages([*missing_packages(NEEDS), *arduino.missing_packages()], "an emulated Pi")
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block as ^C does, so that everything in it is cleaned up."""
-
-    def on_signal(number: int, frame: object) -> None:
-        raise KeyboardInterrupt(signal.Signals(number).name)
-
-    with signals(on_signal):
-        yield
 
 
 @contextlib.contextmanager
@@ -80,22 +65,23 @@ def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
     """
     used = {"name=systemd", "devices"}
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
-    folders = [
-        Path(m[1], name) for m in mounts if m[2] == "cgroup2" or (m[2] == "cgroup" and used & {*m[3].split(",")})
-    ]
-    with contextlib.ExitStack() as stack:
-        stack.callback(_remove_cgroups, folders)
-        try:
-            for folder in folders:
-                folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise RoverError(f"no control group can be made: {error}", remedy=RIGHTS) from None
+    folders = []
+    for _, place, kind, options, *_ in mounts:
+        if kind == "cgroup2" or (kind == "cgroup" and used & {*options.split(",")}):
+            folders.append(Path(place, name))
+    try:
+        for folder in folders:
+            folder.mkdir(exist_ok=True)
 
         def enter() -> None:
             for folder in folders:
                 (folder / "cgroup.procs").write_text("0")
 
         yield enter
+    except OSError as error:
+        raise RoverError(f"no control group can be made: {error}", remedy=RIGHTS) from None
+    finally:
+        _remove_cgroups(folders)
 
 
 def _remove_cgroups(folders: list[Path]) -> None:

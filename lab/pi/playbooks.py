@@ -1,10 +1,5 @@
-"""Run the playbooks of ansible/ as a human would, on a rover that is given by the port of its sshd.
+"""Run the playbooks of ansible/ as a human would, on a rover that is given by the port of its sshd."""
 
-play = run("provision", pi, folder, {"rover_hz": 10})
-play.ok, play.changed, play.output
-"""
-
-import configparser
 import json
 import os
 import re
@@ -20,7 +15,6 @@ from lab.pi.debian_image import USER
 from rover_lib.onboard.errors import RoverError
 
 REPOSITORY = Path(__file__).parents[2]
-INVENTORY = REPOSITORY / "inventory.ini"
 MOST_S = 3600.0
 NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o LogLevel=ERROR"
 
@@ -53,52 +47,35 @@ def run(book: str, pi: Container, folder: Path, variables: Mapping[str, Any]) ->
     """Run ansible/<book>.yml on a rover. A play that fails raises nothing.
 
     folder: for the inventory and Ansible's own files; plays with the same folder share ssh connections. variables:
-    passed with -e. Raises RoverError if there is no Ansible, or if the play takes longer than MOST_S.
+    passed with -e. Raises RoverError if the play takes longer than MOST_S.
     """
     program = Path(sys.executable).with_name("ansible-playbook")
-    if not program.exists():
-        raise RoverError(f"no {program.name} beside {sys.executable}", remedy="pip install -e '.[dev]'")
     (folder / "inventory.ini").write_text(inventory(pi))
     given = {"rover_command": str(program.with_name("rover")), **variables}
     command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml", "-e", json.dumps(given)]
-    with subprocess.Popen(
-        [str(word) for word in command],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        cwd=REPOSITORY,
-        env=_environment(folder),
-        text=True,
-        errors="replace",
-        start_new_session=True,  # a terminal's ^C must reach only this program, which then stops it in order
-    ) as process:
-        try:
-            output, _ = process.communicate(timeout=MOST_S)
-        except subprocess.TimeoutExpired:
-            raise RoverError(f"{book}.yml took more than {MOST_S:g} s") from None
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, 15)
-    return Play(process.returncode, output)
-
-
-def read_journal(pi: Container) -> str:
-    """Return the last lines of the rover's journal, or what ssh says if it cannot be had."""
-    ask = ["ssh", *NO_KNOWN_HOSTS.split(), "-o", "BatchMode=yes", "-i", str(pi.key), "-p", str(pi.port)]
-    ask += [f"{USER}@127.0.0.1", "sudo journalctl --lines=40 --no-pager --output=cat"]
-    done = subprocess.run(ask, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace")
-    return done.stdout + done.stderr
+    try:
+        done = subprocess.run(
+            [str(word) for word in command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            cwd=REPOSITORY,
+            env=_environment(folder),
+            text=True,
+            errors="replace",
+            timeout=MOST_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise RoverError(f"{book}.yml took more than {MOST_S:g} s") from None
+    return Play(done.returncode, done.stdout)
 
 
 def inventory(pi: Container) -> str:
     """Return the repository's inventory.ini with this rover instead of its own."""
-    given = configparser.RawConfigParser(allow_no_value=True, delimiters=("=",))
-    given.optionxform = str  # type: ignore[assignment,method-assign]  # as its documentation says to keep the case
-    given.read(INVENTORY)
+    text = (REPOSITORY / "inventory.ini").read_text()
     where = f"ansible_host=127.0.0.1 ansible_port={pi.port} ansible_ssh_private_key_file={pi.key}"
-    lines = ["[rovers]", f"{pi.name} {where}", "[rovers:vars]"]
-    lines += [f"{key}={value}" for key, value in given["rovers:vars"].items()]
-    return "\n".join([*lines, f"ansible_user={USER}", f"ansible_ssh_extra_args={NO_KNOWN_HOSTS}"]) + "\n"
+    text = re.sub("(?m)^rover1 .*", f"{pi.name} {where}", text)
+    return f"{text}\nansible_user={USER}\nansible_ssh_extra_args={NO_KNOWN_HOSTS}\n"
 
 
 def _environment(folder: Path) -> dict[str, str]:

@@ -5,20 +5,17 @@ once, the `bad` text that takes its place, and the `test` file whose tests that 
 with `random: true`, random drives must notice it too. To add lines of another subject, add a file.
 
 A line that can be broken unnoticed is a line that no test holds. Where an invariant of the random drives is about the
-line, they must notice it too, within RANDOM_DRIVES. Each worker has a copy of the repository, and a process that has
-imported what all tests need: for each mutant it changes the file, forks, and runs the tests in the child.
+line, they must notice it too, within RANDOM_DRIVES.
 """
 
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
@@ -27,9 +24,15 @@ import yaml
 
 from lab.arduino.emulator import REPOSITORY
 from rover_lib.onboard.errors import RoverError
+from rover_lib.workshop.run_program import run
 
 RANDOM_DRIVES = 2000
-MOST_S = 600  # for the tests of one mutant; a test that hangs has noticed it
+NOTICED = 3  # the exit code of random drives of which one breaks an invariant
+DRIVE = f"""
+from lab.driving.random_drives import find_broken
+raise SystemExit({NOTICED} if find_broken(range({RANDOM_DRIVES})) else 0)
+"""
+PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
 PLANTED = Path(__file__).with_name("planted")
 
 
@@ -52,129 +55,62 @@ def read_mutants() -> list[Mutant]:
     return [Mutant(**row) for table in tables for row in table]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a mutant. caught: by its test. noticed: by random drives, None if they were not asked."""
-
-    mutant: Mutant
-    caught: bool
-    noticed: bool | None
-    seconds: float
-
-    @property
-    def survived(self) -> bool:
-        return not self.caught or self.noticed is False
-
-    def __str__(self) -> str:
-        drives = {None: "", True: ", noticed by random drives", False: ", NOT noticed by random drives"}[self.noticed]
-        return f"{'caught' if self.caught else 'SURVIVED'}{drives}: {self.mutant.name} ({self.seconds:.0f} s)"
+def make_copy(folder: Path) -> None:
+    """Copy the repository's files, those that git does not know yet too, into a folder."""
+    listed = run("git", "-C", REPOSITORY, "ls-files", "-co", "--exclude-standard", error=RoverError)
+    for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(REPOSITORY / name, folder / name)
 
 
-WORKER = """
-import json, os, sys
-import cv2, numpy, pytest, hypothesis, serial, torch
-for line in sys.stdin:
-    ask = json.loads(line)
-    if not (child := os.fork()):
-        sys.path.insert(0, os.getcwd())
-        with open(ask["log"], "w") as log:
-            os.dup2(log.fileno(), 1), os.dup2(log.fileno(), 2)
-        code = 9
-        try:
-            if ask["pytest"]:
-                code = int(pytest.main(ask["pytest"]))
-            else:
-                from lab.driving.random_drives import find_broken
-                print(found := find_broken(range(ask["drives"])), flush=True)
-                code = int(bool(found))
-        finally:
-            os._exit(code)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
+def exit_code(folder: Path, *arguments: str) -> int:
+    """Run Python in a copy; return its exit code. Raises RoverError if what was planted cannot be compiled."""
+    env = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": str(folder / ".cache")}
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=os.environ | env, capture_output=True, text=True, errors="replace"
+    )
+    if "gcc failed" in (said := done.stdout + done.stderr):
+        raise RoverError("what was planted cannot be compiled", found=said[-2000:])
+    return done.returncode
 
 
-class Copy:
-    """A copy of the repository, and a process that runs tests in it; a context manager."""
-
-    def __enter__(self) -> "Copy":
-        self._stack = ExitStack()
-        self.folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="rover-mutants-")))
-        listed = subprocess.run(
-            ["git", "ls-files", "-co", "--exclude-standard"], cwd=REPOSITORY, capture_output=True, text=True
-        )
-        for name in listed.stdout.split("\n"):
-            if (
-                name
-                and not name.startswith(("results", "notebooks", "pictures", "docs"))
-                and (REPOSITORY / name).is_file()
-            ):
-                (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(REPOSITORY / name, self.folder / name)
-        cache = str(self.folder / ".cache")
-        env = os.environ | {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": cache}
-        command = [sys.executable, "-c", WORKER]
-        pipe = subprocess.PIPE
-        self._worker = subprocess.Popen(command, cwd=self.folder, env=env, stdin=pipe, stdout=pipe, text=True)
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._worker.kill()
-        self._worker.communicate()
-        self._stack.close()
-
-    def run(self, files: Sequence[str], words: str) -> int:
-        """Run the tests of those files that match `words`; return pytest's exit code."""
-        options = ["-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers"]
-        return self._ask(pytest=[*options, "-k", words, *files])
-
-    def drive(self) -> bool:
-        """Drive randomly; return whether an invariant was broken."""
-        return self._ask(pytest=[], drives=RANDOM_DRIVES) == 1
-
-    def _ask(self, **what: object) -> int:
-        assert self._worker.stdin and self._worker.stdout
-        self._worker.stdin.write(json.dumps({**what, "log": str(self.folder / "log.txt")}) + "\n")
-        self._worker.stdin.flush()
-        code = int(self._worker.stdout.readline())
-        if code == 9 or "gcc failed" in self.log:
-            raise RoverError("what was planted cannot run", found=self.log)
-        return code
-
-    @property
-    def log(self) -> str:
-        return (self.folder / "log.txt").read_text(errors="replace")[-2000:]
-
-
-def try_mutants(mutants: Sequence[Mutant], jobs: int, drives: bool) -> list[Outcome]:
+def try_mutants(
+    mutants: Sequence[Mutant], jobs: int, drives: bool, say: Callable[[str], None]
+) -> dict[str, int | list[str]]:
     """Plant each mutant and see whether its test fails, and with `drives` whether random drives notice it.
 
+    say: called with a line for each. Returns how many there were, who survived, and how many random drives noticed.
     Raises RoverError if a mutant's line is not there, or if a named test does not pass without mutants.
     """
     for mutant in mutants:
         if (count := (REPOSITORY / mutant.file).read_text().count(mutant.good)) != 1:
             raise RoverError(f"{mutant.file}: {mutant.good!r} is there {count} times", remedy=f"mend {mutant.name!r}")
-    with ExitStack() as stack:
-        copies: Queue[Copy] = Queue()
-        for _ in range(jobs):
-            copies.put(stack.enter_context(Copy()))
-        copy = copies.get()
+    with tempfile.TemporaryDirectory(prefix="rover-mutants-") as scratch, ThreadPoolExecutor(jobs) as pool:
+        copies: Queue[Path] = Queue()
+        for job in range(jobs):
+            make_copy(Path(scratch, str(job)))
+            copies.put(Path(scratch, str(job)))
         words = " or ".join(sorted({m.words for m in mutants}))
-        if copy.run(sorted({m.test for m in mutants}), words):
-            raise RoverError("the named tests fail without mutants", found=copy.log)
-        copies.put(copy)
+        if exit_code(copies.queue[0], *PYTEST, "-k", words, *sorted({m.test for m in mutants})):
+            raise RoverError("the named tests fail without mutants", remedy="run them")
 
-        def attempt(mutant: Mutant) -> Outcome:
+        def attempt(mutant: Mutant) -> tuple[bool, bool | None]:
             copy, begin_s = copies.get(), time.monotonic()
-            path = copy.folder / mutant.file
+            path = copy / mutant.file
             good = path.read_text()
             try:
                 path.write_text(good.replace(mutant.good, mutant.bad))
-                caught = copy.run([mutant.test], mutant.words) == 1  # 5: no test has that name
-                noticed = copy.drive() if drives and mutant.random else None
+                caught = exit_code(copy, *PYTEST, "-k", mutant.words, mutant.test) == 1  # 5: no test has that name
+                noticed = exit_code(copy, "-c", DRIVE) == NOTICED if drives and mutant.random else None
             finally:
                 path.write_text(good)
                 copies.put(copy)
-            return Outcome(mutant, caught, noticed, time.monotonic() - begin_s)
+            by_drives = {None: "", True: ", noticed by random drives", False: ", NOT noticed by random drives"}[noticed]
+            seconds = time.monotonic() - begin_s
+            say(f"{'caught' if caught else 'SURVIVED'}{by_drives}: {mutant.name} ({seconds:.0f} s)")
+            return caught, noticed
 
-        with ThreadPoolExecutor(jobs) as pool:
-            return list(pool.map(attempt, mutants))
+        outcomes = dict(zip([m.name for m in mutants], pool.map(attempt, mutants), strict=True))
+    survived = [name for name, (caught, noticed) in outcomes.items() if not caught or noticed is False]
+    noticed = sum(noticed is True for _, noticed in outcomes.values())
+    return {"mutants": len(outcomes), "survived": survived, "noticed_by_random_drives": noticed}

@@ -16,7 +16,7 @@ import nbformat
 
 from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import parameters_in
 
 ROOT = Path(__file__).parents[2]
@@ -32,26 +32,12 @@ PLACE = re.compile(r"(<!-- table (\w+), by page_tables -->\n)(.*?)(<!-- end -->)
 Row = tuple[str, ...]
 
 
-def pages(root: Path = ROOT) -> dict[Path, str]:
-    """The pages that may have tables, with their texts."""
-    return {path: path.read_text() for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))}
+def changed_pages(root: Path = ROOT) -> dict[Path, str]:
+    """Return the new texts of the pages in `root` whose tables differ from its results/ and notebooks/.
 
-
-def update(root: Path = ROOT) -> list[Path]:
-    """Write the tables of the pages in `root` anew; returns the pages that changed. Raises RoverError, and writes
-    nothing then.
+    Raises RoverError unless the pages have each table once.
     """
-    old = pages(root)
-    new = render_pages(old, root)
-    changed = [path for path in old if new[path] != old[path]]
-    for path in changed:
-        with atomic_path(path) as temporary:
-            temporary.write_text(new[path])
-    return changed
-
-
-def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
-    """The pages with their tables as results/ and notebooks/ in `root` have them. Raises RoverError."""
+    texts = {path: path.read_text() for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))}
     names = [match[2] for text in texts.values() for match in PLACE.finditer(text)]
     if sorted(names) != sorted(TABLES):
         raise RoverError("the pages must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
@@ -61,25 +47,22 @@ def render_pages(texts: Mapping[Path, str], root: Path) -> dict[Path, str]:
         lines = [header, ("---",) * len(header), *rows]
         return match[1] + "".join(map(_line, lines)) + match[4]
 
-    return {path: PLACE.sub(place, text) for path, text in texts.items()}
+    new = {path: PLACE.sub(place, text) for path, text in texts.items()}
+    return {path: text for path, text in new.items() if text != texts[path]}
 
 
-def _clock(root: Path) -> dict[str, str]:
-    """What each shape of a policy takes on the cores that drive, as "low to high"; computed."""
-    rows = _metrics(root / "results" / "clock", "clock")["policies"]
-    return {shape_of(row): span_of(row) for row in rows if row["threads"] == DRIVING}
+def _clock(root: Path) -> dict[tuple, str]:
+    """What each shape of a policy takes on the cores that drive, computed, as "low to high" with two digits each."""
+    times = {}
+    for row in _metrics(root / "results" / "clock", "clock")["policies"]:
+        if row["threads"] == DRIVING:
+            low, high = (float(f"{row[f'predicted_{end}_ms']:.2g}") for end in ("low", "high"))
+            times[_shape_of(row)] = f"{low:g} to {high:g}"
+    return times
 
 
-def span_of(row: Mapping[str, Any]) -> str:
-    """Return the ends of a computed time with two digits each."""
-    return " to ".join(f"{float(f'{row[key]:.2g}'):g}" for key in ("predicted_low_ms", "predicted_high_ms"))
-
-
-def shape_of(row: Mapping[str, Any]) -> str:
-    """Return what tells a policy from others: its picture, its decoder, and how much of its backbone it computes."""
-    return "x".join(
-        str(row.get(key)) for key in ("width", "height", "decoder_layers", "feedforward", "backbone_channels")
-    )
+def _shape_of(row: Mapping[str, Any]) -> tuple:
+    return tuple(row.get(key) for key in ("width", "height", "decoder_layers", "feedforward", "backbone_channels"))
 
 
 def _line(fields: Row) -> str:
@@ -106,19 +89,16 @@ def _demo(root: Path) -> list[Row]:
 def _faults(root: Path) -> list[Row]:
     """What was done to a driving car, and what became of it."""
     report, random = (_metrics(root / "results" / "lab", name) for name in ("faults", "random"))
-    of = {e: [f for f in report["faults"] if f["expected"] == e] for e in ("stopped", "continues", "refused", "human")}
 
     def right(expected: str) -> str:
-        return f"{sum(not f['wrong'] for f in of[expected])} of {len(of[expected])}"
+        rows = [fault for fault in report["faults"] if fault["expected"] == expected]
+        return f"{sum(not fault['wrong'] for fault in rows)} of {len(rows)}"
 
     broken = f"{len(random['broken'])} of {random['drives']:,}"
     worst, takeover = (report["summary"][key] for key in ("worst_stopped_after_ms", "takeover_ms"))
     return [
         ("what", "figure"),
-        (
-            "faults that must stop a driving car: throttle off",
-            f"{right('stopped')}, after at most {worst:.0f} ms",
-        ),
+        ("faults that must stop a driving car: throttle off", f"{right('stopped')}, after at most {worst:.0f} ms"),
         ("faults that must not stop it: it drove on while its plan was young enough", right("continues")),
         ("faults that must keep it from being armed", right("refused")),
         ("from a moved stick to the human's pulses", f"at most {takeover:.0f} ms"),
@@ -128,11 +108,8 @@ def _faults(root: Path) -> list[Row]:
 
 def _drives(root: Path) -> list[Row]:
     """Hits of the demo's policy when its plans are late, and when the car is pushed."""
-    rows = [
-        r
-        for r in _metrics(root / "results" / "demo", "drive")["rows"]
-        if r["compensate"] and r["ensemble"] is None and r["hits"]
-    ]
+    driven = _metrics(root / "results" / "demo", "drive")["rows"]
+    rows = [r for r in driven if r["compensate"] and r["ensemble"] is None and r["hits"]]
     alone, pushed = ({r["latency_ms"]: r for r in rows if bool(r["pushes"]) == way} for way in (False, True))
     latencies = sorted(alone.keys() & pushed.keys())
     trials = rows[0]["trials"]
@@ -157,7 +134,7 @@ def _students(run: str, root: Path) -> list[Row]:
             f"{student['name']}: {shape}",
             format(student["size_mb"], ".1f"),
             f"{student['instructions_g']:.3g}",
-            times.get(shape_of(student), ""),
+            times.get(_shape_of(student), ""),
             str(student["hits"]),
             f"{student['pushed_hits']} at {student['pushed_latency_ms']:.2g} ms",
             " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
@@ -205,11 +182,8 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
 
 def _metrics(folder: Path, stage: str) -> dict[str, Any]:
     """A stage's metrics. Raises RoverError if it is not there."""
-    paths = sorted(folder.glob(f"{stage}.json"))
-    if len(paths) != 1:
-        found = [path.name for path in paths] or "none"
-        raise RoverError(f"{folder.name}/{stage}.json must be there once", found=found, remedy="make notebooks")
-    return read_stage(paths[0], stage.removesuffix("-*"))["metrics"]
+    path = next(folder.glob(f"{stage}.json"), folder / f"{stage}.json")
+    return read_stage(path, stage.removesuffix("-*"))["metrics"]
 
 
 def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
@@ -218,5 +192,6 @@ def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
 
 
 if __name__ == "__main__":
-    for path in update():
+    for path, text in changed_pages().items():
+        path.write_text(text)
         print(f"{path.name}: written")

@@ -103,12 +103,15 @@ def drive(ctx: click.Context, **options: Any) -> None:
 
 def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
+    from rover_lib.onboard.car.host import boottime
+
+    asked_s = boottime()  # before the other imports, which may take seconds
     from rover_lib.onboard.drive.drive import drive_car
     from rover_lib.onboard.drive.loop import Report
     from rover_lib.onboard.drive.opening import DriveOptions
     from rover_lib.onboard.errors import DriveFault
 
-    o = DriveOptions(**options)
+    o = DriveOptions(**options, asked_s=asked_s)
     if o.service and o.dry_run:
         raise click.UsageError("--service drives a car: no --dry-run")
     if o.record_mb and not o.record:

@@ -89,6 +89,17 @@ static void fail(const char *what) {
     exit(1);
 }
 
+static bool is_throttle(uint32_t us) { return fast() ? us >= 40 && us <= 980 : us >= 800 && us <= 2200; }
+
+/* What the pins get of the human's throttle: of a gamepad's no more than of the host's. */
+static uint16_t passed_us(uint16_t us) {
+    int least_us = car[6] - (int)cap_us(), most_us = car[6] + (int)cap_us();
+    if (!GAMEPAD) return us;
+    if (least_us < car[5]) least_us = car[5];
+    if (most_us > car[7]) most_us = car[7];
+    return (uint16_t)(us < least_us ? least_us : us > most_us ? most_us : us);
+}
+
 /* On the way from where it was to what is wanted, and no further than `most` from where it was. */
 static bool on_the_way(int before, int now, int wanted_there, uint32_t most) {
     int low = before < wanted_there ? before : wanted_there, high = before < wanted_there ? wanted_there : before;
@@ -108,7 +119,7 @@ static void check(void) {
     if (lost) throttle_may_pass = false;
     if (vehicle.state == MANUAL && before_state != MANUAL) throttle_may_pass = at_rest >= 8;
     if (vehicle.state == MANUAL) {
-        uint16_t throttle_us = throttle_may_pass ? seen_us[1] : car[6];
+        uint16_t throttle_us = throttle_may_pass ? passed_us(seen_us[1]) : car[6];
         bool throttle = vehicle.throttle_us == throttle_us || vehicle.throttle_us == car[6];
         if (!neutral && (vehicle.steering_us != seen_us[0] || !throttle)) fail("not the human's");
     } else if (vehicle.state == AUTONOMOUS) {
@@ -143,7 +154,7 @@ static void see_steering(uint16_t us, uint32_t at_ms) {
 }
 
 static void see_throttle(uint16_t us, uint32_t at_ms) {
-    if (fast() ? us >= 40 && us <= 980 : us >= 800 && us <= 2200) { /* else it is no pulse */
+    if (is_throttle(us)) {
         seen_us[1] = us;
         seen_before_ms[1] = seen_ms[1], seen_ms[1] = at_ms;
         at_rest = abs(us - car[6]) <= 32 ? at_rest + 1 : 0;
@@ -165,11 +176,10 @@ static void see_sticks(const struct command *sticks) {
         return;
     }
     uint32_t steering_us = sticks->steering_us, throttle_us = sticks->throttle_us;
-    if (steering_us < car[1] || steering_us > car[3] || throttle_us < car[5] || throttle_us > car[7]) return;
+    if (steering_us < car[1] || steering_us > car[3] || !is_throttle(throttle_us)) return;
     sticks_ms = at_ms;
     see_steering((uint16_t)steering_us, at_ms);
-    uint32_t least_us = car[6] - cap_us(), most_us = car[6] + cap_us();
-    see_throttle((uint16_t)(throttle_us < least_us ? least_us : throttle_us > most_us ? most_us : throttle_us), at_ms);
+    see_throttle((uint16_t)throttle_us, at_ms);
 }
 
 static void relay(void);

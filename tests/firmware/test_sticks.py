@@ -95,7 +95,9 @@ def test_no_line_counts_twice(board, again):
     assert board.status.old_commands == before + 10
 
 
-@pytest.mark.parametrize("pulses", [(0, 120), (1456, 0), (899, 120), (2013, 120), (1456, 712), (70000, 120)])
+@pytest.mark.parametrize(
+    "pulses", [(0, 120), (899, 120), (2013, 120), (1456, 39), (1456, 981), (70000, 120), (1456, 65656)]
+)
 def test_no_other_pulses(board, pulses):
     board.send_sticks(*pulses, board.now_ms)
     assert board.status.out_of_range == 1
@@ -109,3 +111,25 @@ def test_a_moved_stick_takes_over(armed, stick):
     pins = armed.drive(1600, 200, 100)
     assert (armed.status.state, armed.status.reason) == (State.MANUAL, "h")
     assert moved_after_ms(pins) <= 40
+
+
+@pytest.mark.parametrize("throttle_us", [190, 60])
+def test_a_raw_stick_is_judged_and_the_cap_stands_at_the_pins(board, throttle_us):
+    """A cap near neutral put each stick at rest: it armed, and took nothing over. So did one that was pulled back."""
+    assert board.command("L", 126) == "k"
+    board.wiggle()
+    board.sticks[THROTTLE] = throttle_us
+    board.run(40)
+    assert board.command("A") == "t"
+    board.sticks[THROTTLE] = 120
+    board.run(200)
+    board.wiggle()
+    assert board.command("A") == "k"
+    board.sticks[THROTTLE] = throttle_us
+    assert {us for _, us in board.drive(1456, 126, 400)[100:]} == {120}
+    assert (board.status.state, board.status.reason) == (State.MANUAL, "h")
+    board.sticks[THROTTLE] = 120
+    board.run(200)
+    board.sticks[THROTTLE] = throttle_us
+    assert board.run(40)[-1] == (1456, min(126, max(120, throttle_us)))
+    assert not board.may_keep

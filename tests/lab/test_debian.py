@@ -12,17 +12,17 @@ from rover_lib.onboard.errors import RoverError
 def test_commands_and_files_tell_what_is_missing(tmp_path, monkeypatch):
     header = tmp_path / "some.h"
     header.touch()
-    monkeypatch.setattr(debian, "which", lambda name: None if name.startswith("no-") else name)
+    (tmp_path / "there").touch()
+    monkeypatch.setenv("PATH", str(tmp_path))
     needs = {"no-b": "b", "no-a": "a", "no-a2": "a", "there": "c", str(header): "d", f"{header}pp": "e"}
     assert missing_packages(needs) == ["a", "b", "e"]
 
 
 def test_packages_are_named_when_they_cannot_be_installed(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    with pytest.raises(RoverError, match=r"counting needs the Debian packages qemu-user gcc, .*") as raised:
+    with pytest.raises(RoverError) as raised:
         install_packages(["qemu-user", "gcc"], "counting")
-    assert raised.value.remedy.startswith("sudo apt-get install ")
-    assert raised.value.remedy.endswith(" qemu-user gcc")
+    assert raised.value.remedy.startswith("sudo apt-get install ") and raised.value.remedy.endswith(" qemu-user gcc")
 
 
 def test_root_installs_them_by_the_newest_lists(monkeypatch):

@@ -28,6 +28,7 @@ from rover_lib.onboard.car.picture import LEAST, MOST_BYTES, block_sums, brightn
 from rover_lib.onboard.errors import CameraError
 
 FIRST_FRAME_S = 5.0
+STALLED_S = 1.0
 CLOSE_S = 1.0
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # a JPEG's data contains no FF D9: there 00 follows each FF
 PICTURES = (".jpg", ".jpeg")
@@ -107,6 +108,7 @@ class Camera:
         """held: a folder or a file of pictures is repeated until begin() is called, and from then on shown once."""
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
+        self._clock = clock
         self._stamps = _Stamps(clock, wall_clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' block_sums(), one row each
         self._remembered = 0  # how many pictures have been stored there in all
@@ -115,8 +117,9 @@ class Camera:
         self._held = held
         if not held:
             self._begun.set()
-        self._changed = threading.Condition()  # guards the four below
+        self._changed = threading.Condition()  # guards the five below
         self._frame: Frame | None = None
+        self._arrived_s = 0.0  # when it came, by `clock`
         self._failure: CameraError | None = None
         self._first_s = 0.0
         self._thread: threading.Thread | None = None
@@ -159,22 +162,27 @@ class Camera:
             self._thread.join(CLOSE_S)
 
     def latest(self) -> Frame | None:
-        """Return the newest frame, None before the first. Raises CameraError once reading has failed."""
+        """Return the newest frame, None before the first. Raises CameraError as wait() does."""
         with self._changed:
-            if self._failure:
-                raise self._failure
+            self._check()
             return self._frame
 
     def wait(self, after: int, timeout_s: float) -> Frame | None:
         """Wait for a frame with a number above `after`, and return the newest; None if none comes in time.
 
-        Raises CameraError once reading has failed.
+        Raises CameraError once reading has failed, or if a camera that gave frames has given none for STALLED_S.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._failure or self._closing.is_set() or self.frames > after, timeout_s)
-            if self._failure:
-                raise self._failure
+            self._check()
             return self._frame if self._frame and self._frame.number > after else None
+
+    def _check(self) -> None:
+        if self._failure:
+            raise self._failure
+        silent_s = self._clock() - self._arrived_s
+        if self._frame and silent_s > STALLED_S and not self._closing.is_set():
+            raise CameraError(f"{self.source}: no frame for {silent_s:.1f} s", remedy="plug the camera in again")
 
     @property
     def frames(self) -> int:
@@ -251,7 +259,7 @@ class Camera:
         repeats = before.repeats + 1 if before and same >= SAME else 0
         frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
         with self._changed:
-            self._frame = frame
+            self._frame, self._arrived_s = frame, self._clock()
             self._first_s = self._first_s or captured_s
             self._changed.notify_all()
 

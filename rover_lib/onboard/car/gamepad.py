@@ -1,10 +1,10 @@
 """A gamepad on this machine as the human's transmitter, for an Arduino without a receiver (car.yml: `human: gamepad`).
 
 The sticks are read by a ServoLink, which sends them to the Arduino in answer to each of its statuses. All that decides
-is there: gesture, takeover, loss, cap. Here are two rules. The human counts only while the dead-man button L1 is held,
-from a press that was seen. And they count only while the gamepad sends something all the time, of itself: the motion
-sensors of a DualShock, DualSense or Switch Pro Controller do. The kernel reports no value that stays the same, so a
-gamepad without them is as silent in a still hand as one whose battery is empty, and is refused.
+is there: gesture, takeover, loss, cap. Here are three rules. The human counts only while L1 is held, from a press that
+was seen; only while the gamepad sends something all the time, as the motion sensors of a DualShock, DualSense or Switch
+Pro Controller do; and only once the kernel has told where both sticks are. The kernel reports no value that stays the
+same, so a gamepad without sensors is as silent in a still hand as one whose battery is empty, and is refused.
 
 The kernel's devices are read directly: PyPI's evdev is compiled where it is installed, and a rover has no compiler.
 """
@@ -24,7 +24,7 @@ from rover_lib.onboard.errors import CarError
 
 EVENT = struct.Struct("llHHi")  # struct input_event: seconds, microseconds, type, code, value
 SYN, KEY, ABS, DROPPED, BTN_L1 = 0x00, 0x01, 0x03, 3, 0x136
-STEERING, THROTTLE = 0x00, 0x04  # ABS_X, the left stick; ABS_RY, the right one
+AXES = STEERING, THROTTLE = 0x00, 0x04  # ABS_X, the left stick; ABS_RY, the right one
 SENSORS = 1 << 6  # INPUT_PROP_ACCELEROMETER
 EVIOCSCLOCKID, EVIOCGABS = 0x400445A0, 0x80184540
 DEAD = 0.1  # of a stick's way, to either side of its middle
@@ -34,34 +34,43 @@ OPEN_S = 1.0  # for its first events
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Stick:
-    """The range of a stick's values."""
+ReadStick = Callable[[int, int], tuple[int, int, int]]  # of a file descriptor and an axis: its value, least and most
 
-    low: int
-    high: int
 
-    def deflection(self, value: int) -> float:
-        """How far it is from its middle, in [-1, 1]; 0 near it."""
-        x = max(-1.0, min(1.0, (2 * value - self.low - self.high) / (self.high - self.low)))
-        return 0.0 if abs(x) < DEAD else (abs(x) - DEAD) / (1 - DEAD) * (1 if x > 0 else -1)
+def read_stick(fd: int, axis: int) -> tuple[int, int, int]:
+    """Return an axis's present value and the ends of its range, from the kernel. Raises OSError."""
+    numbers = array.array("i", bytes(24))  # value, minimum, maximum, fuzz, flat, resolution
+    fcntl.ioctl(fd, EVIOCGABS + axis, numbers)
+    value, low, high = numbers[:3]
+    if low >= high:
+        raise OSError(22, f"its axis {axis} goes from {low} to {high}")
+    return value, low, high
+
+
+def deflection(value: int, low: int, high: int) -> float:
+    """Return how far a stick is from its middle, in [-1, 1]; 0 near it. low, high: the ends of its range."""
+    x = max(-1.0, min(1.0, (2 * value - low - high) / (high - low)))
+    return 0.0 if abs(x) < DEAD else (abs(x) - DEAD) / (1 - DEAD) * (1 if x > 0 else -1)
 
 
 class Gamepad:
     """An open gamepad. One thread at a time may read it.
 
     pad, motion: file descriptors of its sticks and of its motion sensors, non-blocking, with times of CLOCK_MONOTONIC.
-    sticks: the ranges of STEERING and THROTTLE.
+    identity: tells it from others. read: asks the kernel for a stick of `pad`, at the opening and after lost events.
     """
 
-    def __init__(self, name: str, pad: int, motion: int, sticks: dict[int, Stick]):
-        self.name = name
-        self._pad, self._motion, self._ranges = pad, motion, sticks
-        self._values = dict.fromkeys(sticks, 0.0)
+    def __init__(self, name: str, pad: int, motion: int, identity: str = "", read: ReadStick = read_stick):
+        self.name, self.identity = name, identity
+        self._pad, self._motion, self._read_stick = pad, motion, read
+        self._values: dict[int, float] = {}  # of each stick that is known
+        self._ranges: dict[int, tuple[int, int]] = {}
         self._held = False
+        self._lost = False  # the kernel dropped events: what it sends up to the next report is a part only
         self._heard_s = float("-inf")
         self._rest = {pad: b"", motion: b""}
         self.gone = ""  # why it can be read no more
+        self._ask()
 
     def close(self) -> None:
         """Close both devices; again, it does nothing."""
@@ -73,29 +82,36 @@ class Gamepad:
     def sticks(self, now_s: float | None = None) -> tuple[float, float] | None:
         """Return (steering, throttle) as they are now, each in [-1, 1], right and forward positive.
 
-        None while the human has let go: L1 is up, or the gamepad is gone or silent, after which L1 must be pressed
-        again. Never waits, raises nothing.
+        None while the human has let go: L1 is up, the gamepad is gone or silent, after which L1 must be pressed again,
+        or it is not known where a stick is. Never waits, raises nothing.
         """
         now_s = time.monotonic() if now_s is None else now_s
         if self.gone:  # others may have the numbers of its files by now
             return None
-        for fd in (self._motion, self._pad):
-            try:
-                self._read(fd, now_s)
-            except OSError as error:
-                _log.warning("the gamepad %s is gone (%s): the car is nobody's", self.name, error.strerror)
-                self.gone = str(error.strerror)
-                break
+        try:
+            for fd in (self._motion, self._pad):
+                self._take_all(fd, now_s)
+        except OSError as error:
+            _log.warning("the gamepad %s is gone (%s): the car is nobody's", self.name, error.strerror)
+            self.gone = str(error.strerror)
         if self.gone or now_s - self._heard_s > ALIVE_S:
             self._held = False
-        return (self._values[STEERING], -self._values[THROTTLE]) if self._held else None
+        if not self._held or len(self._values) < len(AXES):
+            return None
+        return self._values[STEERING], -self._values[THROTTLE]
 
     @property
     def silent_s(self) -> float:
         """Seconds since its newest event; infinity before the first."""
         return time.monotonic() - self._heard_s
 
-    def _read(self, fd: int, now_s: float) -> None:
+    def _ask(self) -> None:
+        for axis in AXES:
+            value, *ends = self._read_stick(self._pad, axis)
+            self._ranges[axis] = ends[0], ends[1]
+            self._values[axis] = deflection(value, *self._ranges[axis])
+
+    def _take_all(self, fd: int, now_s: float) -> None:
         while True:
             try:
                 data = os.read(fd, 64 * EVENT.size)
@@ -114,35 +130,63 @@ class Gamepad:
 
     def _take(self, kind: int, code: int, value: int, *, young: bool) -> None:
         """Take an event of the sticks. young: it has not waited, so that a press of L1 is one of now."""
-        if kind == ABS and code in self._ranges:
-            self._values[code] = self._ranges[code].deflection(value)
+        if kind == SYN and code == DROPPED:
+            self._lost, self._held = True, False
+            self._values.clear()
+        elif self._lost:
+            if kind == SYN:
+                self._lost = False
+                self._ask()
+        elif kind == ABS and code in AXES:
+            self._values[code] = deflection(value, *self._ranges[code])
         elif kind == KEY and code == BTN_L1 and value != 2:  # 2: the kernel repeats it
             self._held = value == 1 and young
-        elif kind == SYN and code == DROPPED:  # events were lost, perhaps of all these
-            self._held = False
-            self._values = dict.fromkeys(self._values, 0.0)
 
 
 @dataclass(frozen=True)
 class Found:
-    """A gamepad that the kernel knows: the devices of its sticks, and of its motion sensors (None: it has none)."""
+    """A gamepad that the kernel knows.
+
+    pad, motion: the devices of its sticks, and of its motion sensors (None: it has none). identity: its own address, or
+    where it is plugged in.
+    """
 
     name: str
     pad: Path
     motion: Path | None
+    identity: str = ""
 
     def __str__(self) -> str:
         return f"{self.name} ({self.pad.name}{'' if self.motion else ', without motion sensors: cannot be used'})"
+
+    def open(self) -> Gamepad:
+        """Open it. Raises CarError."""
+        fds: list[int] = []
+        try:
+            for path in (self.pad, self.motion or self.pad):
+                fds.append(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
+                fcntl.ioctl(fds[-1], EVIOCSCLOCKID, struct.pack("i", time.CLOCK_MONOTONIC))
+            return Gamepad(self.name, *fds, identity=self.identity)
+        except OSError as error:
+            for fd in fds:
+                os.close(fd)
+            raise CarError(
+                f"the gamepad {self} cannot be read ({error.strerror})",
+                remedy="is this user in group input? sudo usermod -aG input $USER, and log in again",
+            ) from error
 
 
 def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/input")) -> list[Found]:
     """Return all devices that have L1 and both sticks, with the motion sensors of the same gamepad."""
 
+    def text(node: Path, name: str) -> str:
+        with contextlib.suppress(OSError):
+            return (node / "device" / name).read_text().strip()
+        return ""
+
     def bits(node: Path, name: str) -> int:
-        with contextlib.suppress(OSError, ValueError):
-            words = (node / "device" / name).read_text().split()
-            return sum(int(word, 16) << 8 * struct.calcsize("l") * i for i, word in enumerate(reversed(words)))
-        return 0
+        words = reversed(text(node, name).split())
+        return sum(int(word, 16) << 8 * struct.calcsize("l") * i for i, word in enumerate(words))
 
     nodes = sorted(sys.glob("event*"), key=lambda node: int(node.name[5:]))
     whole = {node: (node / "device" / "device").resolve() for node in nodes}
@@ -152,50 +196,33 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
     for node in nodes:
         axes, keys = bits(node, "capabilities/abs"), bits(node, "capabilities/key")
         if axes & wanted == wanted and keys >> BTN_L1 & 1:
-            with contextlib.suppress(OSError):
-                name = ascii((node / "device" / "name").read_text().strip())[1:-1][:60]
-                found.append(Found(name, dev / node.name, motion.get(whole[node])))
+            name = ascii(text(node, "name"))[1:-1][:60]
+            identity = f"{name} {text(node, 'uniq') or text(node, 'phys')}"
+            found.append(Found(name, dev / node.name, motion.get(whole[node]), identity))
     return found
 
 
-def open_gamepad(list_them: Callable[[], list[Found]] = list_gamepads) -> Gamepad:
-    """Open the only gamepad that can be used. CarError says why there is none, or why it cannot be read."""
-    found = list_them()
-    usable = [(pad, pad.motion) for pad in found if pad.motion]
+def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: Gamepad | None = None) -> Gamepad:
+    """Open the only gamepad that can be used, and wait up to OPEN_S for its first event.
+
+    again: one that is gone; only the same one is opened, and nothing is waited for. CarError says why there is
+    none, or why it cannot be read.
+    """
+    found = (list_them or list_gamepads)()
+    usable = [pad for pad in found if pad.motion and (not again or pad.identity == again.identity)]
     if len(usable) != 1:
+        connect = f"{again.name} again" if again else "a DualShock 4, DualSense or Switch Pro Controller"
         raise CarError(
             "which gamepad is the human's?" if usable else "no gamepad that can be used is connected",
             found=", ".join(map(str, found)) or "none in /dev/input",
-            remedy="connect only one" if usable else "connect a DualShock 4, DualSense or Switch Pro Controller",
+            remedy="connect only one" if usable else f"connect {connect}",
         )
-    pad, motion = usable[0]
-    fds: list[int] = []
-    try:
-        for path in (pad.pad, motion):
-            fds.append(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
-            fcntl.ioctl(fds[-1], EVIOCSCLOCKID, struct.pack("i", time.CLOCK_MONOTONIC))
-        gamepad = Gamepad(pad.name, fds[0], fds[1], {axis: _range(fds[0], axis) for axis in (STEERING, THROTTLE)})
-    except OSError as error:
-        for fd in fds:
-            os.close(fd)
-        raise CarError(
-            f"the gamepad {pad} cannot be read ({error.strerror})",
-            remedy="is this user in group input? sudo usermod -aG input $USER, and log in again",
-        ) from error
+    gamepad = usable[0].open()
     end_s = time.monotonic() + OPEN_S
-    while gamepad.silent_s > ALIVE_S and time.monotonic() < end_s:
+    while not again and gamepad.silent_s > ALIVE_S:
+        if time.monotonic() > end_s:
+            gamepad.close()
+            raise CarError(f"the gamepad {usable[0]} sends nothing", remedy="switch it on, or plug it in again")
         time.sleep(0.02)
         gamepad.sticks()
-    if gamepad.silent_s > ALIVE_S:
-        gamepad.close()
-        raise CarError(f"the gamepad {pad} sends nothing", remedy="switch it on, or plug it in again")
     return gamepad
-
-
-def _range(fd: int, axis: int) -> Stick:
-    numbers = array.array("i", bytes(24))  # value, minimum, maximum, fuzz, flat, resolution
-    fcntl.ioctl(fd, EVIOCGABS + axis, numbers)
-    low, high = numbers[1:3]
-    if low >= high:
-        raise OSError(22, f"its axis {axis} goes from {low} to {high}")
-    return Stick(low, high)

@@ -9,7 +9,9 @@ reports the warning to its caller. It uses libjpeg-turbo too, is as fast (0.98 m
 same bits, and lets other threads run meanwhile.
 """
 
+import math
 import re
+import struct
 from pathlib import Path
 
 import cv2
@@ -23,6 +25,10 @@ MOST_BYTES = 8_000_000  # of a JPEG
 MOST_PIXELS = 3840 * 2160  # 25 MB decoded
 MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a whole plain JPEG
 FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
+BASELINE, SCAN, RESTART_INTERVAL = 0xC0, 0xDA, 0xDD  # markers
+RESTART = re.compile(rb"\xff[\xd0-\xd7]")
+TABLES = (0xDB, 0xC4)  # markers of quantization and Huffman tables
+MOST_PIECES, MOST_TABLES = 10_000, 4000  # restart intervals, and bytes of tables: each interval is decoded with them
 LEAST = (48, 27)  # width and height below which there are no blocks to compare
 ROWS, COLUMNS = 9, 16  # of blocks
 SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
@@ -44,12 +50,64 @@ def decode_jpeg(data: bytes) -> np.ndarray:
         try:
             return simplejpeg.decode_jpeg(data, "BGR")
         except ValueError as error:
-            filled = re.search(r"(\d+) extraneous bytes before marker", str(error))  # libjpeg reports it only as text
-            if not filled or int(filled[1]) > FILLED_MOST:
-                raise
+            _check_only_filler(data, error)
             return simplejpeg.decode_jpeg(data, "BGR", strict=False)
     except ValueError as error:
         raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
+
+
+def _check_only_filler(data: bytes, warning: ValueError) -> None:
+    """Raise ValueError unless a JPEG is complete but for a few bytes of filler before markers.
+
+    warning: the first one, and the only one that simplejpeg reports: what follows filler may be torn. So each restart
+    interval is decoded as a picture of its own, where a warning about filler is the last one.
+    """
+    segments, scan_at = _segments(data)
+    named = {segment[1]: segment for segment in segments}
+    if RESTART_INTERVAL not in named and _is_filler(warning) and "marker 0xd9" in str(warning):
+        return  # nothing follows it
+    if not ("extraneous bytes" in str(warning) and {RESTART_INTERVAL, BASELINE} <= named.keys()):
+        raise warning
+    interval, frame = int.from_bytes(named[RESTART_INTERVAL][4:6], "big"), named[BASELINE]
+    height, width, parts = struct.unpack(">HHB", frame[5:10])
+    sampling = frame[11::3] if parts > 1 else b"\x11"  # horizontal and vertical, four bits each
+    block = 8 * max(s >> 4 for s in sampling), 8 * max(s & 15 for s in sampling)
+    blocks = math.ceil(width / block[0]) * math.ceil(height / block[1])
+    scan, end, _ = data[scan_at:].partition(b"\xff\xd9")
+    pieces = RESTART.split(scan)
+    in_turn = all(marker[1] & 7 == i % 8 for i, marker in enumerate(RESTART.findall(scan)))
+    tables = b"".join(segment for segment in segments if segment[1] in TABLES)
+    if not (end and in_turn and interval > 0 and (len(pieces) - 1) * interval < blocks <= len(pieces) * interval):
+        raise warning
+    if len(pieces) > MOST_PIECES or len(tables) > MOST_TABLES:
+        raise warning
+    for i, piece in enumerate(pieces):
+        row = [v.to_bytes(2, "big") for v in (block[1], block[0] * min(interval, blocks - i * interval))]
+        picture = b"\xff\xd8", tables, frame[:5], *row, frame[9:], named[SCAN], piece, end
+        try:
+            simplejpeg.decode_jpeg(b"".join(picture), "GRAY", min_height=1, min_width=1, min_factor=8)  # the fastest
+        except ValueError as error:
+            if not _is_filler(error):
+                raise
+
+
+def _is_filler(warning: ValueError) -> bool:
+    found = re.search(r"(\d+) extraneous bytes before marker", str(warning))  # libjpeg reports it only as text
+    return found is not None and int(found[1]) <= FILLED_MOST
+
+
+def _segments(data: bytes) -> tuple[list[bytes], int]:
+    """Return a JPEG's segments up to the header of its first scan, and where the scan begins. Raises ValueError."""
+    at, segments = 2, [b"  "]
+    while segments[-1][1] != SCAN:
+        while data[at : at + 2] == b"\xff\xff":
+            at += 1
+        segment = data[at : at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")]
+        if len(segment) < 4 or segment[0] != 0xFF:
+            raise ValueError("its header is damaged")
+        segments.append(segment)
+        at += len(segment)
+    return segments[1:], at
 
 
 def read_jpeg(path: Path | str) -> np.ndarray:

@@ -8,6 +8,7 @@ three things: it sends nothing out of range, it sends neutral when the link is l
 import contextlib
 import fcntl
 import logging
+import math
 import os
 import termios
 import threading
@@ -19,7 +20,7 @@ from numbers import Integral
 
 import serial
 
-from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.car import PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
 from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
 from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.protocol import (
@@ -50,6 +51,8 @@ STALE_S = 0.5  # a status that is older means silence: the Arduino sends one eve
 LATE_S = 0.150  # the Arduino rejects older commands, and a link as slow as this is unfit for driving
 DATED = (">A", ">D")  # commands that carry the time of the newest status that the host had read
 READ_TIMEOUT_S = 0.05
+REACH_US = 64  # of a gamepad's throttle stick, at least: the Arduino takes more than 32 for moved
+LEAST_US = 40, PULSE_MIN_US  # of a throttle's pulse: a fast one, like the recorded car's, and others
 RELAY_EVERY_S = 0.015  # a gamepad's sticks at most: beside 100 commands a second, the line has room for these
 
 # serial.SerialException is an OSError, termios.error is not; TypeError: pyserial's, if another thread closed it.
@@ -300,14 +303,15 @@ class ServoLink:
     def remedy(self, missing: str) -> str:
         """Return what this car's human does about what is missing, a key of MISSING.
 
-        Here a gamepad that was gone is opened again, which may take a second; if it cannot be, that is what is missing.
+        Here a gamepad that was gone is opened again, if it is the same one; if it cannot be, that is what is missing.
+        Never waits.
         """
         if missing != "s" or self.car.human != "gamepad":
             return MISSING[missing]
         if self._gamepad and self._gamepad.gone:
             self._gamepad.close()
             try:
-                self._gamepad = open_gamepad()
+                self._gamepad = open_gamepad(again=self._gamepad)
             except CarError as error:
                 return str(error)
         return "hold L1 of the gamepad"
@@ -511,9 +515,13 @@ class ServoLink:
             return
         self._relayed_s, pulses_us = now, (0, 0)
         if sticks := gamepad.sticks():
-            throttle = max(sticks[1] * self.car.cap, self.calibration.throttle.low)
-            pulses = self.calibration.pulses(-sticks[0] * self.car.left, throttle)
-            pulses_us = pulses.steering_us, pulses.throttle_us
+            channel = self.calibration.throttle
+            # Also backwards on a car that cannot, and beyond a small cap: the Arduino judges the stick, then limits it.
+            reach_us = math.copysign(max(self.car.cap_us, REACH_US), channel.span_pct)
+            pulses_us = (
+                self.calibration.steering.pulse_us(-sticks[0] * self.car.left),
+                max(round(channel.neutral_us + sticks[1] * reach_us), LEAST_US[channel.period_us >= PERIOD_MIN_US]),
+            )
         with contextlib.suppress(LinkError):  # the next call of another thread raises what it means
             self._write(frame(f">S {heard.boot} {heard.uptime_ms} {pulses_us[0]} {pulses_us[1]}"))
 

@@ -3,7 +3,7 @@
     report = Report()
     drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev/ttyUSB0"), report)
 
-The loop itself is in loop.py, what the car does at a tick in pilot.py, and how it is armed in arming.py.
+The loop itself is in loop.py, what the car does at a tick in pilot.py, and how it is armed in session.py.
 """
 
 import contextlib
@@ -12,25 +12,21 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 from rover_lib.onboard.artifact.manifest import Artifact, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import default_view
-from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive.arming import TAKEN_OVER, Arming, arm_when_asked
-from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
-from rover_lib.onboard.drive.flight_log import FlightLog
+from rover_lib.onboard.car.servo_link import ServoLink
+from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess
-from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
+from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.opening import DriveOptions, OtherCar, another_car, check_no_film, open_flight_log
-from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
 from rover_lib.onboard.drive.service import Service
-from rover_lib.onboard.drive.watch import HealthWatch, exit_if_hung, stop_on_signals
-from rover_lib.onboard.errors import DriveFault, RoverError
+from rover_lib.onboard.drive.session import Session
+from rover_lib.onboard.drive.watch import exit_if_hung, stop_on_signals
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
 
@@ -84,77 +80,11 @@ def drive_car(
             rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits,
         )  # fmt: skip
         stack.enter_context(planner)
-        opened = _Opened(options, settings, report, log, service, feed, link, camera, policy, planner, commanded)
-        opened.drive(stop)
+        session = Session(
+            options, settings, report, log, feed, link, camera, planner, commanded,
+            rate_hz=policy.rate_hz, mode=policy.manifest["mode"], pids=(os.getpid(), *policy.pids), service=service,
+            terminal=sys.stdin.isatty(),
+        )  # fmt: skip
+        session.drive(stop)
         while service and not stop.is_set():
-            opened.drive(stop, said=report.ended)
-
-
-@dataclass(frozen=True)
-class _Opened:
-    """All that a drive has opened. service: None: there is one drive. link: None: no motor is driven."""
-
-    options: DriveOptions
-    settings: Settings
-    report: Report
-    log: FlightLog
-    service: Service | None
-    feed: Feed
-    link: ServoLink | None
-    camera: Camera
-    policy: PolicyProcess
-    planner: Planner
-    commanded: Commanded
-
-    def drive(self, stop: SignalEvent, said: str = "") -> None:
-        """Arm the car when somebody asks for it, and drive once. said: how the previous drive ended.
-
-        Raises as loop.drive() does, but a service's drive may end by a fault or a takeover.
-        """
-        options, report, log, link, service = self.options, self.report, self.log, self.link, self.service
-        rate_hz, pwm = self.policy.rate_hz, this_car().pwm
-        pilot = PolicyPilot(self.camera, self.planner, self.commanded, self.settings, rate_hz, calibration=pwm)
-        health = HealthWatch(report, link, [os.getpid(), *self.policy.pids])
-        checks = [self.camera.latest, self.planner.newest, *([link.latest] if link else [])]
-        checks.append(partial(self._show_waiting, said))
-        with Arming(
-            options, self.settings, link, log, self.planner, self.camera, pilot,
-            mode=self.policy.manifest["mode"], still_wanted=service.check_request if service else lambda: None,
-        ) as arming:  # fmt: skip
-            report.clear()
-
-            def arm() -> Telemetry | None:
-                telemetry = arm_when_asked(
-                    arming.arm, link, stop, log.event, checks, service=service, said=said, terminal=sys.stdin.isatty()
-                )
-                self.camera.begin()  # a film must start with the loop, not while arming waits
-                return telemetry
-
-            show = partial(self.feed.tick, report, self.camera, pilot)
-            hooks = Hooks(arm, lambda: [*pilot.warnings(), *health()], arming.record if options.record else None, show)
-            until = Until(options.ticks, options.max_seconds, stop, self._over)
-            try:
-                drive(pilot, link, log, rate_hz=options.hz, until=until, hooks=hooks, report=report)
-            except DriveFault as error:
-                if link and error.kind == "taken over":
-                    arming.record_human(link, stop, self._human_over)
-                if not service:
-                    raise
-            finally:
-                self.feed.ended(report, self.camera, link)
-
-    def _over(self) -> str | None:
-        return (self.service.over() if self.service else None) or self.feed.over()
-
-    def _show_waiting(self, said: str) -> None:
-        asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
-        self.feed.show(WAITING, said, self.report, self.camera, self.link)
-        if asked and not self.service:
-            raise RoverError(asked, kind="not armed")
-
-    def _human_over(self) -> str | None:
-        if self.service:
-            self.service.alive()
-        self.report.status = TAKEN_OVER
-        self.feed.show(TAKEN, TAKEN_OVER, self.report, self.camera, self.link)
-        return self.feed.over()
+            session.drive(stop, said=report.ended)

@@ -4,14 +4,14 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car.camera import path_of
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.car.host import default_log
+from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
@@ -39,7 +39,8 @@ class DriveOptions:
     throttle_limit, blend_ticks, ensemble: replace the values of params.yml. threads: of the policy; None: all cores but
     one. log_file: None: the user's. service: run as a systemd service, disarmed until a human arms it. film: the camera
     may be recorded pictures (a folder, a FIFO, an .mjpeg), which do not show where the car is. latency_ms: make each
-    plan take at least this long, for comparisons. view: the socket of a view; None: the user's.
+    plan take at least this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car
+    was asked for, by boottime().
     """
 
     artifact: Path
@@ -60,6 +61,7 @@ class DriveOptions:
     film: bool = False
     latency_ms: float = 0.0
     view: Path | None = None
+    asked_s: float = field(default_factory=boottime)
 
 
 def check_no_film(camera: str) -> None:

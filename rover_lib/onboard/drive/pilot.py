@@ -19,6 +19,11 @@ COASTS_S = 0.5  # a car whose throttle is released rolls on for this time
 # after it was told.
 BEGINS_S = 0.12
 LATE_FRAME_S = 0.2  # six frames of a camera
+# The newest picture may be this old: with a tick of 33 ms, the car stops within 0.2 s of a camera's last picture. A
+# camera at 15 Hz, whose pictures arrive 50 ms late, shows ones of 117 ms.
+MISSING_S = 0.14
+LATE_WARNING_S = 0.1
+READ_S = 0.005  # time for the camera's thread, after a pause of the whole process
 CUT = 0.005  # of throttle; less is rounding and blending
 CAP = "is there a cap or dirt on the lens?"
 HOLE_S = 0.3  # a gap between actions after which another episode has begun
@@ -66,9 +71,11 @@ class Sight:
         self._blank_s: float | None = None  # since when the picture has been blank
 
     def check(self) -> None:
-        """Raise CameraError if nobody may drive by the newest frame: it is frozen, black or without contrast."""
+        """Raise CameraError if nobody may drive by the newest frame: it is frozen, black, without contrast or none."""
         frame = self._camera.latest()
-        if frame and (fault := frozen(frame, self._settings) or blank(frame, self._settings)):
+        if not frame:
+            raise CameraError("the camera has given no picture")
+        if fault := frozen(frame, self._settings) or blank(frame, self._settings):
             raise fault
 
     def sent(self, at_s: float, throttle: float) -> None:
@@ -80,7 +87,11 @@ class Sight:
             self._moving_s = None
 
     def watch(self, frame: Frame, now_s: float) -> None:
-        """Raise CameraError if the newest frame is frozen while the car moves, or pictures were blank for too long."""
+        """Raise CameraError if the newest frame is old, or frozen while the car moves, or blank for too long."""
+        if now_s - frame.captured_s > MISSING_S:
+            frame = self._camera.wait(frame.number, READ_S) or frame
+            if (age_s := now_s - frame.captured_s) > MISSING_S:
+                raise CameraError(f"no new frame for {age_s:.2f} s", remedy="is the camera plugged in?")
         moves = self._moving_s is not None and now_s - self._moving_s > BEGINS_S
         if moves and (fault := frozen(frame, self._settings)):
             raise fault
@@ -131,17 +142,18 @@ class PolicyPilot:
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
         if frame:
-            self._sight.watch(frame, now_s)
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
+            self._sight.watch(frame, now_s)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
         plan = self._planner.newest()
         if plan is not None and plan is not self._follower.plan:
             self._follower.add(plan, now_s)
         command = self._follower.command(now_s)
         if command is None:
-            asking_s = self._planner.asking_s
-            why = f"the policy has not answered for {asking_s:.1f} s" if asking_s > 0.1 else "no new frame came"
-            raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
+            raise DriveFault(
+                f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): "
+                f"the policy has not answered for {self._planner.asking_s:.1f} s"
+            )
         self._cut = max(self._cut, command.cut)
         pulses = self._calibration.pulses(command.steering, command.throttle)
         return Order(
@@ -171,7 +183,7 @@ class PolicyPilot:
         if self._cut > CUT and not self._said_cut:
             self._said_cut, limit = True, self._settings.throttle_limit
             yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
-        if age_s > LATE_FRAME_S:
+        if age_s > LATE_WARNING_S:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"

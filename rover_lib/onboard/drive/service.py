@@ -2,27 +2,17 @@
 
 A human arms the car by `sudo rover arm-car` on the rover, or by `ansible-playbook ansible/drive.yml -e rover_arm=true`.
 Both use a socket that only root may use: they ask the service what the car would drive by, and then send a request to
-arm. The request contains the model's content hash, so that nobody arms a model that another operator has just deployed.
-It also contains a ticket, which the service changes at each start and after each attempt, so that one request is one
-attempt and no old request can arm the car later. The Arduino has the last word. As long as something is missing, the
-service says what (switch the transmitter on, let go of the throttle, wiggle the steering) and refuses requests. Moving
-a stick takes the car back.
+arm. The request contains the model's content hash, so that nobody arms a model that another operator has just deployed,
+and a ticket, which changes with each attempt, so that no old request can arm the car later.
 
-However a drive ends, also by a takeover, the same process then waits disarmed with the port still open. Opening the
-port again might reset the Arduino, and take the car from the human who has just taken over. While a takeover is
-recorded, nobody can arm the car. A permanent fault (the camera or the port is gone) ends the service; systemd starts it
-again, disarmed.
+However a drive ends, also by a takeover, the same process then waits disarmed with the port still open: opening it
+again might reset the Arduino, and take the car from the human. A permanent fault (the camera or the port is gone) ends
+the service; systemd starts it again, disarmed. The status text (systemctl show --property=StatusText) begins with one
+of STATES; deploy.yml restarts the service only while this is "disarmed".
 
-A drive ends after the service's --max-seconds, or earlier if the request says so. A request from another machine also
-promises heartbeats: if no `rover arm-car --heartbeat` comes within the time that the request gives, the drive ends.
-
-The service's status text (systemctl show --property=StatusText) begins with one of STATES; deploy.yml restarts the
-service only while this is "disarmed".
-
-systemd's watchdog is fed only by work that was really done: ticks of the control loop while the car drives; the checks
-of camera, policy and Arduino while it is disarmed; ticks of the recording while a human who took over is recorded; and
-for a limited time after a drive, while its episode is finished. If the loop or the process hangs, systemd kills it
-after WatchdogSec; by then the Arduino has long stopped the car, 150 ms after the last command.
+The watchdog is fed only by work that was really done: ticks of the control loop while the car drives; the checks of
+camera, policy and Arduino while it is disarmed; ticks of the recording while a human who took over is recorded; and for
+a limited time after a drive, while its episode is finished.
 """
 
 import contextlib
@@ -30,6 +20,7 @@ import json
 import math
 import os
 import secrets
+import select
 import socket
 import struct
 import subprocess
@@ -37,6 +28,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +73,7 @@ class Request:
 def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise RoverError for a request to arm that is too old: whoever sent it may no longer be watching the car."""
     most_s = REQUEST_S if most_s is None else most_s
-    if not age_s <= most_s:  # also refuses NaN
+    if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
         raise RoverError(
             f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may",
             remedy="ask again",
@@ -117,11 +109,12 @@ class Service:
             threading.Thread(target=self._feed, name="watchdog", daemon=True),
             threading.Thread(target=self._listen, name="operators", daemon=True),
         ]
-        self._turn = threading.Condition()  # guards the five below
+        self._turn = threading.Condition()  # guards the six below
         self._ticket = ""  # for the next attempt; empty: nobody can ask for one now
         self._request: Request | None = None  # that of the present attempt or drive
         self._asked = False
-        self._asked_s = 0.0
+        self._asked_s = math.nan
+        self._hung_up: Callable[[], bool] = lambda: False
         self._answer: dict[str, Any] | None = None
         self._armed_s = self._heard_s = 0.0
 
@@ -205,8 +198,10 @@ class Service:
         raise RoverError("told to stop before a human armed the car", kind="not armed")
 
     def check_request(self) -> None:
-        """Call this just before the Arduino is told to arm. Raises RoverError if the operator asked too long ago."""
+        """Call just before the Arduino is told. Raises RoverError if the operator asked too long ago or is gone."""
         check_age(self._clock() - self._asked_s)
+        if self._hung_up():
+            raise RoverError("whoever asked for the car is gone", remedy="ask again", kind="not armed")
 
     def alive(self) -> None:
         """Tell the watchdog that the work after a drive goes on. Call it again and again during that work."""
@@ -241,32 +236,38 @@ class Service:
                 connection.settimeout(1.0)
                 _, uid, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
                 if uid == 0 or uid == os.geteuid() >= PERSONS:
-                    answer = self._answer_to(**json.loads(connection.recv(QUESTION_BYTES)))
+                    answer = self._answer_to(connection, **json.loads(connection.recv(QUESTION_BYTES)))
                     connection.send(json.dumps(answer).encode())
 
-    def _answer_to(
-        self, ask: str, model: str = "", ticket: str = "", asked_s: float | None = None, **limits: float | None
-    ) -> dict[str, Any]:
-        """Return the answer to an operator's question.
+    def ask(self, ticket: str, asked_s: float, request: Request, hung_up: Callable[[], bool] = lambda: False) -> str:
+        """Take a request to arm the car in the next attempt. Return why it is not taken, "" if it is.
 
-        asked_s: when the operator sent it, by boottime(): this process or machine may have been suspended since then.
+        asked_s: when it was sent, by the service's clock. hung_up: whether the operator no longer waits for the answer.
         """
+        with self._turn:
+            if not self._ticket:
+                return self._text or "it is not ready"
+            if ticket != self._ticket:
+                return "the service was started or tried again meanwhile: ask anew"
+            self._ticket, self._request, self._asked, self._answer = "", request, True, None
+            self._asked_s, self._hung_up = asked_s, hung_up
+            self._turn.notify_all()
+        return ""
+
+    def _answer_to(
+        self, operator: socket.socket, ask: str, model: str = "", ticket: str = "", asked_s: Any = None, **limits: Any
+    ) -> dict[str, Any]:
+        """Return the answer to an operator's question. asked_s: see ask()."""
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
             return {"text": self._text, "missing": self._missing, "model": self._model, "ticket": self._ticket}
-        now_s = self._clock()
-        asked_at_s = now_s if asked_s is None else min(float(asked_s), now_s)
+        if model != self._model:
+            return {"armed": False, "text": "the request names another model: ask anew"}
         request = Request(**{name: None if value is None else float(value) for name, value in limits.items()})
+        if refusal := self.ask(ticket, float(asked_s), request, partial(_is_closed, operator)):
+            return {"armed": False, "text": refusal}
         with self._turn:
-            if not self._ticket:
-                return {"armed": False, "text": self._text or "it is not ready"}
-            if (model, ticket) != (self._model, self._ticket):
-                text = "the request names another model, or the service was started or tried again meanwhile: ask anew"
-                return {"armed": False, "text": text}
-            self._ticket, self._request, self._asked, self._answer = "", request, True, None
-            self._asked_s = asked_at_s
-            self._turn.notify_all()
             while not self._done.is_set():
                 if self._turn.wait_for(lambda: self._answer, FEED_S):
                     return self._answer or {}
@@ -303,6 +304,14 @@ class Service:
         self._text = text
         with contextlib.suppress(OSError):
             self._systemd.status("\n".join([self._text, *more]))
+
+
+def _is_closed(connection: socket.socket) -> bool:
+    """Return whether the other end has hung up."""
+    try:
+        return bool(select.select([connection], [], [], 0)[0]) and not connection.recv(1, socket.MSG_PEEK)
+    except OSError:
+        return True
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:

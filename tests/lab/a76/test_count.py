@@ -1,10 +1,8 @@
 """Counting against what is known: a program whose instructions can be counted by hand, and itself."""
 
-import os
-import shutil
 import struct
 import subprocess
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,9 +15,9 @@ from lab.a76 import core as a76
 from lab.a76 import count_run as counting
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, emulate, prepare
-from lab.a76.count import STEADY, Counted, count_artifact
+from lab.a76.count import STEADY, count_artifact
 from lab.a76.count_run import count_run
-from lab.a76.symbols import Functions, GuestFunctions, by_kernel
+from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.care import pi5
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -33,7 +31,6 @@ pytestmark = [pytest.mark.emulated, needs.qemu]
 # Of the thin policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
 BUDGETS_M = {"policy_fp32": 55.8, "policy_static": 10.8, "policy_static.onnx": 11.8}
 SVC = 0xD4000001
-SMALL = "policy_static_54x96"
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
 
@@ -91,7 +88,6 @@ def test_a_known_program_is_counted_exactly(plugin_only, tmp_path):
         ([0x4E21D820], 2),  # scvtf v0.4s, v1.4s: the first pipe converts, in two cycles
         ([0x4C402160] * 2, 4),  # ld1 of four registers
         ([0x3D800160] * 3, 3),  # str q0: one a cycle
-        ([0xF9400160, 0xF9800160], 1),  # a load, and a prefetch, which is no store
     ],
 )
 def test_instructions_wait_for_their_ports(plugin_only, tmp_path, words, cycles):
@@ -125,15 +121,6 @@ def test_lines_are_counted_by_the_cache_that_lacks_them(plugin_only, tmp_path, a
     assert (done.near_lines(SECTION), done.far_lines(SECTION)) == (near, far)
 
 
-def test_what_hangs_is_ended(plugin_only, tmp_path, monkeypatch):
-    monkeypatch.setattr(a76, "SILENCE_S", 0.5)
-    hangs = program(tmp_path / "hangs", [0x14000000])  # a branch to itself
-    with pytest.raises(RoverError, match=r"printed nothing for 0\.5 s"):
-        emulate(plugin_only, [hangs], tmp_path)
-    running = [p / "cmdline" for p in Path("/proc").iterdir() if p.name.isdigit()]
-    assert not any(str(hangs).encode() in p.read_bytes() for p in running if os.access(p, os.R_OK))
-
-
 def test_functions_are_named_by_address(tmp_path):
     source = tmp_path / "two.c"
     source.write_text("int first(int a) { return a * 3; }\nint second(int a) { return first(a) - 1; }\n")
@@ -147,15 +134,13 @@ def test_functions_are_named_by_address(tmp_path):
     assert names[0x5000000000 + at["first"]] == names[0x5000000000 + at["second"] - 1] == "first"
     assert names[0x5000000000 + at["second"] + 4] == "second"
     assert names[0x5000010010] == names[0x10] == "[unknown]"
-    with pytest.raises(RoverError, match="not a 64-bit ELF"):
-        Functions(source)
 
 
 def test_kernels_are_summed_and_the_rest_is_other():
     rows = [(1, 10, 5, 2, 1, 9), (2, 1, 5, 0, 0, 9), (3, 100, 1, 1, 0, 6), (4, 1, 1, 0, 0, 5)]
     names = {1: "_Z3fooi", 2: "_Z3fooi", 3: "bar", 4: "baz"}
     kernels = by_kernel(np.array(rows, BLOCK), names, at_most=2)
-    assert kernels == {"bar": (100, 100, 0), "foo": (55, 20, 10), "other": (1, 0, 0)}
+    assert kernels == {"bar": (100, 0), "foo": (55, 10), "other": (1, 0)}
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +160,6 @@ def tiny_run(thin, tmp_path_factory) -> Path:
     static = q.quantize(checkpoint, scheme, calibration)
     digest = export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
     export(static, checkpoint, folder / "policy_static.onnx.zip", calibration=calibration, **options)
-    shutil.copy(folder / "policy_static.pt", folder / f"{SMALL}.pt")  # its name is that of a size without an FP32
     modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
     inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
     write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
@@ -191,30 +175,11 @@ def again(thin) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def counts() -> dict[str, Counted]:
-    """What the emulated Pi said of each artifact of `report`."""
-    return {}
-
-
-def as_planned(counted: Counted, plan: counting.Plan) -> Counted:
-    """The same emulated inferences, as many as are asked for."""
-    return replace(counted, chunks=counted.chunks[: len(plan.frames)], inferences=counted.inferences[: plan.counted])
-
-
-@pytest.fixture(scope="module")
-def report(core, tiny_run, again, counts) -> dict:
+def report(core, tiny_run, again) -> dict:
     """count_run on held-out frames from memory. FP32 is counted like a slow one: a frame takes four seconds."""
-    count_all = counting._count_all
-
-    def keep(core, artifacts, plans, *args):
-        counts.update(count_all(core, artifacts, {stem: plans[stem] for stem in plans if stem != SMALL}, *args))
-        counts[SMALL] = as_planned(counts["policy_static"], plans[SMALL])
-        return counts
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(counting, "SLOW_GMAC", 0.0)
         patch.setattr(counting, "open_run", lambda run_dir: again)
-        patch.setattr(counting, "_count_all", keep)
         return count_run(tiny_run, frames=12)
 
 
@@ -249,18 +214,11 @@ def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     assert "policy_static.onnx" in reports.table(report)
 
 
-def test_an_image_size_without_fp32_is_only_counted(report):
-    small = report["metrics"]["artifacts"][SMALL]
-    assert small["instructions_g"] > small["sdot_g"] > 0
-    assert small["tenth_g"] is None and not [key for key in small if "mae" in key or "reference" in key]
-
-
 def test_gates_are_of_what_drives(report):
-    rows = {row["gate"]: row for row in report["metrics"]["gates"]}
-    assert not [name for name in rows if "instructions" in name or "54x96" in name or "fp32" in name]
-    assert not rows["policy_static frames judged on the emulated core"]["passed"]
-    assert rows["policy_static peak_memory_mb"]["passed"] and rows["policy_static peak_memory_loading_mb"]["passed"]
-    assert rows["policy_static cost of the tenth plan against the third, %"]["passed"]
+    rows = {row["gate"]: row["passed"] for row in report["metrics"]["gates"]}
+    assert not [name for name in rows if "instructions" in name or "fp32" in name]
+    assert not rows["policy_static frames judged on the emulated core"]
+    assert rows["policy_static peak_memory_mb"] and rows["policy_static peak_memory_loading_mb"]
 
 
 def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
@@ -273,21 +231,18 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again,
         count_run(tiny_run, frames=4)
 
 
-def test_a_loaded_policy_is_warm(report):
-    static = report["metrics"]["artifacts"]["policy_static"]
-    for which in ("first_g", "second_g", "tenth_g"):
-        assert static[which] == pytest.approx(static["instructions_g"], rel=0.01), which
-
-
-def test_counts_stay_within_their_budget(report):
-    counted = {stem: report["metrics"]["artifacts"][stem]["instructions_g"] * 1e3 for stem in BUDGETS_M}
+def test_a_loaded_policy_is_warm_and_counts_stay_within_their_budget(report):
+    artifacts = report["metrics"]["artifacts"]
+    static = artifacts["policy_static"]
+    assert [static[f"{n}_g"] for n in ("first", "second", "tenth")] == pytest.approx(
+        [static["instructions_g"]] * 3, rel=0.01
+    )
+    counted = {stem: artifacts[stem]["instructions_g"] * 1e3 for stem in BUDGETS_M}
     assert counted == pytest.approx(BUDGETS_M, rel=0.02), "set BUDGETS_M if it is meant"
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):
     broken = tmp_path / "broken.onnx.zip"  # importing torch would take the core half a minute
     broken.write_bytes((tiny_run / "policy_static.onnx.zip").read_bytes()[:-1000])
-    with pytest.raises(
-        RoverError, match=r"ended with 1 after load: error: .*broken\.onnx\.zip: not an artifact, or cut short"
-    ):
+    with pytest.raises(RoverError, match=r"ended with 1 after load: error: .*broken\.onnx\.zip: not an artifact"):
         count_artifact(core, broken, memory_samples(1), counted=3)

@@ -57,12 +57,6 @@ def test_a_judgement(expected, what, sentence):
     assert any(sentence in w for w in wrong) if sentence else wrong == []
 
 
-def test_a_pulse_that_a_reset_cut_is_a_pulse():
-    found = seen(then((0.1, 1456, 120)))
-    found = replace(found, events=[*found.events, PinEvent(AT + 0.5, "cut", "throttle", 300.0, 0.0)])
-    assert judge(STOPPED, found, GATES).figures["max_throttle_us_after"] == 300
-
-
 def test_a_row_that_this_machine_spoilt_is_known():
     fault, steady = on_pins.PinRow("a fault", "link", CONTINUES, "", "", lambda bench: None), seen(then())
     assert not on_pins._spoilt(fault, steady, GATES)

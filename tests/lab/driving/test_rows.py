@@ -10,16 +10,14 @@ from click.testing import CliRunner
 
 from lab.__main__ import main
 from lab.arduino.emulator import REPOSITORY
-from lab.driving import faults
 from lab.driving.on_pins import PIN_ROWS
-from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED
+from lab.driving.pins import CONTINUES, HUMAN, REFUSED, STOPPED, Gates
 from lab.driving.rows import all_rows, rows_of, run_row
 from lab.driving.stories import KEPT
 from lab.driving.virtual import LOST, STUCK, World
 from lab.driving.virtual_host import VirtualLink
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.servo_link import LinkError, State
-from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 
 SAFETY = (REPOSITORY / "docs" / "safety.md").read_text()
@@ -66,7 +64,7 @@ def test_a_fault_that_ends_otherwise_is_wrong(name, expected):
 
 
 def test_every_row_is_judged_and_there_are_enough():
-    gates = faults.Gates.of_params()
+    gates = Gates.of_params()
     here = rows_of(Car())
     assert len(here) >= gates.rows and sum(row.expected == STOPPED for row in here) >= gates.stopped_rows
     assert len(PIN_ROWS) == len({row.name for row in PIN_ROWS}) == 12
@@ -96,16 +94,12 @@ class Relay:
         self.world = World(car=Car(human="gamepad"))
         self.link = VirtualLink(self.world)
         self.link.open()
-        self.does(0.3)
 
-    def does(self, seconds, steering_us=0, throttle_us=0, **hand):
-        """Let the human hold the sticks so (from rest) and return the throttle's pulses."""
-        vars(self.world.hand).update(hand, sticks=[1456 + steering_us, 120 + throttle_us])
+    def does(self, seconds, steering_us=0, **hand):
+        """Let the human hold the steering stick so (from rest)."""
+        vars(self.world.hand).update(hand, sticks=[1456 + steering_us, 120])
         self.world.handle()
-        begin_ms = self.world.now_ms
         self.world.sleep(seconds)
-        events = self.world.board.events()
-        return [event.throttle_us for ms, event in events if ms >= begin_ms - self.world._started_ms]
 
     def wiggles(self):
         for steering_us in (300, -300, 0):
@@ -118,29 +112,10 @@ class Relay:
         return str(refusal.value)
 
 
-@pytest.fixture
-def relay():
+@needs.gcc
+def test_nothing_arms_it_unattended():
     relay = Relay()
-    yield relay
-    relay.link.close()
-    relay.world.close()
-
-
-@needs.gcc
-@pytest.mark.parametrize("fault", [{"receiver": LOST}, {"pad": "pulled out"}, {"pad": "out of reach"}])
-def test_a_human_at_full_throttle_who_is_lost_stops(relay, fault):
-    assert relay.does(0.5, 100, 591)[-1] == 238  # the cap
-    relay.does(0.2, 100, 591, **fault)
-    assert set(relay.does(1.0, 100, 591)) <= {120}
-    if "receiver" in fault:  # a stick that is stuck gives no throttle to whoever presses L1 again
-        assert set(relay.does(0.5, 100, 591, receiver="live")) <= {120}
-        relay.does(0.3)
-        assert relay.does(0.5, 0, 100)[-1] == 220
-
-
-@needs.gcc
-def test_nothing_arms_it_unattended(relay):
-    relay.does(0.5, receiver=LOST)
+    relay.does(0.8, receiver=LOST)
     relay.wiggles()
     assert "hold L1" in relay.refused()
     relay.does(0.6, receiver="live", pad=STUCK)  # held since before
@@ -154,6 +129,8 @@ def test_nothing_arms_it_unattended(relay):
     assert "wiggled" in relay.refused()
     relay.wiggles()
     assert relay.link.arm().state is State.AUTONOMOUS
+    relay.link.close()
+    relay.world.close()
 
 
 # ---- the command
@@ -162,8 +139,6 @@ def test_nothing_arms_it_unattended(relay):
 def test_a_fault_that_is_none():
     done = CliRunner().invoke(main, ["faults", "--only", "camera melted"])
     assert done.exit_code == 1 and "camera melted" in done.output
-    with pytest.raises(RoverError):
-        faults.run_faults(kinds=["weather"])
 
 
 @pytest.mark.emulated

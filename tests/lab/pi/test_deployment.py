@@ -1,5 +1,6 @@
 """What a deployment to an emulated Pi makes of what it sees, without a Pi: `python -m lab pi` has that."""
 
+import io
 import os
 from types import SimpleNamespace
 
@@ -48,7 +49,7 @@ def test_it_begins_only_with_an_artifact_and_as_root(tmp_path, monkeypatch):
 
 def test_what_fails_is_said_and_written(tmp_path):
     said = []
-    report = deployment.Report(tmp_path / "pi.json", {"a.pt": "00"}, said.append)
+    report = deployment.Deployment(tmp_path / "pi.json", {"a.pt": "00"}, said.append, tmp_path, io.StringIO())
     report.gate("provision again", "changed=0", 0, True)
     report.gate("rollback", "model a in use", "b", False)
     with pytest.raises(RoverError), report.step("deploy"):

@@ -67,6 +67,8 @@ def test_frames_have_the_sensors_time_stamps(csi):
         ("gone", "rpicam-vid has ended: ERROR: .* no cameras available"),
         ("silent", "no frame within"),
         ("die 20", "rpicam-vid has ended: ERROR: .* failed to write"),
+        ("freeze 20", "no frame for 1"),
+        ("lose 20", "no frame for 1"),  # each later picture would wait for its time stamp, which is the next one's
     ],
 )
 def test_what_goes_wrong_is_said(csi, monkeypatch, fault, sentence):

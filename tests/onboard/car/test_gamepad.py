@@ -1,98 +1,165 @@
-"""A gamepad's rules, by FIFOs that speak struct input_event: this kernel has no uinput, and no real one was tried."""
+"""A gamepad's rules, by pipes that speak struct input_event: this kernel has no uinput, and no real one was tried."""
 
-import time
-from functools import partial
+import os
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from virtual_gamepad import VirtualGamepad, open_virtual
 
 from rover_lib.onboard.car import gamepad as gamepads
-from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
-from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN
-from rover_lib.onboard.car.servo_link import MISSING, ServoLink
+from rover_lib.onboard.car.gamepad import (
+    ABS,
+    AXES,
+    BTN_L1,
+    DROPPED,
+    EVENT,
+    KEY,
+    STEERING,
+    SYN,
+    THROTTLE,
+    Found,
+    Gamepad,
+)
+from rover_lib.onboard.car.servo_link import MISSING, ServoLink, frame, parse
 from rover_lib.onboard.errors import CarError
 
+FULL = 32767
+REPORT = (SYN, 0, 0)
+
+
+class Pad:
+    """An open gamepad in virtual time. values: where the kernel says that its sticks are."""
+
+    def __init__(self):
+        self.now_s = 100.0
+        self.values = dict.fromkeys(AXES, 0)
+        self.open()
+
+    def open(self):
+        (pad, self._to_pad), (motion, self._to_motion) = os.pipe(), os.pipe()
+        for end in (pad, motion):
+            os.set_blocking(end, False)
+        self.opened = Gamepad("virtual", pad, motion, "A", lambda fd, axis: (self.values[axis], -FULL, FULL))
+
+    def unplug(self):
+        os.close(self._to_pad)
+        os.close(self._to_motion)
+
+    def send(self, *events, age_s=0.0):
+        """Send events of the sticks that are that old, as one report unless a SYN is among them."""
+        at_s = self.now_s - age_s
+        for event in events if any(kind == SYN for kind, _, _ in events) else (*events, REPORT):
+            os.write(self._to_pad, EVENT.pack(int(at_s), round(at_s % 1 * 1e6), *event))
+
+    def hold(self, held):
+        self.send((KEY, BTN_L1, int(held)))
+
+    def move(self, steering, throttle):
+        self.send((ABS, STEERING, round(steering * FULL)), (ABS, THROTTLE, round(-throttle * FULL)))
+
+    def sticks(self, moving=True):
+        """What the host reads of it. moving: its motion sensors send, too."""
+        if moving:
+            os.write(self._to_motion, EVENT.pack(int(self.now_s), round(self.now_s % 1 * 1e6), ABS, 0, 1))
+        return self.opened.sticks(self.now_s)
+
 
 @pytest.fixture
-def pad(tmp_path):
-    with VirtualGamepad(tmp_path) as pad:
-        yield pad
+def pad():
+    pad = Pad()
+    yield pad
+    pad.opened.close()
 
 
-@pytest.fixture
-def opened(pad):
-    opened = open_virtual(pad.folder)
-    time.sleep(0.05)
-    yield opened
-    opened.close()
-
-
-def test_the_human_counts_while_l1_is_held(pad, opened):
+def test_the_human_counts_while_l1_is_held(pad):
     pad.move(1, 1)
-    assert opened.sticks() is None
+    assert pad.sticks() is None
     pad.hold(True)
-    assert opened.sticks() == (1, 1)
+    assert pad.sticks() == (1, 1)
     pad.move(-0.55, -0.05)  # near its middle a stick rests
-    assert opened.sticks() == (pytest.approx(-0.5, abs=1e-4), 0)
+    assert pad.sticks() == (pytest.approx(-0.5, abs=1e-4), 0)
     pad.hold(False)
-    assert opened.sticks() is None
+    assert pad.sticks() is None
 
 
-@pytest.mark.parametrize("what", ["repeated", "old", "another button"])
-def test_only_a_press_that_is_seen_counts(pad, opened, what):
+@pytest.mark.parametrize(
+    ("event", "age_s"), [((KEY, BTN_L1, 2), 0), ((KEY, BTN_L1, 1), 0.2), ((KEY, BTN_L1 + 1, 1), 0)]
+)
+def test_only_a_press_that_is_seen_counts(pad, event, age_s):
     """A button that is stuck, or events that waited, are nobody."""
-    if what == "repeated":
-        pad.send(KEY, BTN_L1, 2)
-    elif what == "old":
-        pad.send(KEY, BTN_L1, 1, age_s=0.2)
-    elif what == "another button":
-        pad.send(KEY, BTN_L1 + 1, 1)
+    pad.send(event, age_s=age_s)
     pad.move(0.5, 0)
-    assert opened.sticks() is None
+    assert pad.sticks() is None
 
 
-@pytest.mark.parametrize("what", ["silence", "lost events"])
-def test_after_a_loss_l1_must_be_pressed_again(pad, opened, what):
+def test_where_the_sticks_are_is_asked_at_the_opening(pad):
+    """A throttle held at its end counted as at rest until it moved."""
+    pad.values = {STEERING: -FULL, THROTTLE: -FULL}
+    pad.open()
     pad.hold(True)
-    pad.move(0.5, 0.5)
-    assert opened.sticks()
-    if what == "silence":
-        assert opened.sticks(time.monotonic() + 0.15) is None
-    else:
-        pad.send(SYN, DROPPED, 0)
-        assert opened.sticks() is None
-    pad.send(ABS, STEERING, 0)
-    time.sleep(0.02)
-    assert opened.sticks() is None
+    assert pad.sticks() == (-1, 1)
+
+
+def test_after_lost_events_all_is_asked_again_and_l1_pressed_again(pad):
+    """What comes between the loss and the next report is a part only: an L1 in it does not count."""
     pad.hold(True)
-    assert opened.sticks()
-
-
-def test_one_that_is_unplugged_is_nobody(pad, opened, caplog):
+    assert pad.sticks() == (0, 0)
+    pad.values[THROTTLE] = -FULL  # this event is among the lost ones
+    pad.send((SYN, DROPPED, 0), (KEY, BTN_L1, 1), (ABS, STEERING, FULL))
+    assert pad.sticks() is None
+    pad.send(REPORT)
+    assert pad.sticks() is None
     pad.hold(True)
-    assert opened.sticks()
-    pad.unplug()
-    assert opened.sticks() is None
-    assert opened.sticks() is None
-    assert caplog.text.count("is gone") == 1
+    assert pad.sticks() == (0, 1)
 
 
-def test_one_that_is_back_is_opened_again(pad, monkeypatch):
-    """Whoever waits to be armed asks what is missing ten times a second."""
+def test_after_a_silence_l1_must_be_pressed_again(pad):
+    """Old events are no signs of life: they waited while the radio was out of reach, or the process had no time."""
+    pad.hold(True)
+    assert pad.sticks()
+    pad.now_s += 0.15
+    pad.send((ABS, STEERING, FULL), age_s=0.11)
+    assert pad.sticks(moving=False) is None
+    pad.move(1, 0)
+    assert pad.sticks() is None
+    pad.hold(True)
+    assert pad.sticks() == (1, 0)
+
+
+def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeypatch, caplog):
+    """Whoever waits to be armed asks what is missing ten times a second, and systemd's watchdog waits with them."""
     link = ServoLink("none", car=Car(human="gamepad"))
-    link._gamepad = first = open_virtual(pad.folder)
-    pad.unplug()
-    assert first.sticks() is None and first.gone
-    monkeypatch.setattr(servo_link, "open_gamepad", partial(gamepads.open_gamepad, list))
-    assert "no gamepad that can be used is connected" in link.remedy("s")
-    pad.plug()
-    monkeypatch.setattr(servo_link, "open_gamepad", lambda: open_virtual(pad.folder))
-    assert link.remedy("s") == "hold L1 of the gamepad"
-    time.sleep(0.05)
+    link._gamepad = first = pad.opened
     pad.hold(True)
-    assert link._gamepad is not first and link._gamepad.sticks() and first.sticks() is None
-    link._gamepad.close()
+    assert pad.sticks()
+    pad.unplug()
+    assert first.sticks(pad.now_s) is None and first.sticks(pad.now_s) is None
+    assert caplog.text.count("is gone") == 1
+    there = []
+    monkeypatch.setattr(gamepads, "list_gamepads", lambda: there)
+    monkeypatch.setattr(gamepads.time, "sleep", None)  # nothing is waited for
+    assert "no gamepad that can be used is connected" in link.remedy("s")
+    there.append(Found("virtual", Path("B"), Path("B"), identity="B"))
+    assert "connect virtual again" in link.remedy("s") and link._gamepad is first
+    there.append(Found("virtual", Path("A"), Path("A"), identity="A"))
+    monkeypatch.setattr(Found, "open", lambda found: (pad.open(), pad.opened)[1])
+    assert link.remedy("s") == "hold L1 of the gamepad"
+    assert link._gamepad is pad.opened is not first and first.sticks() is None
+
+
+@pytest.mark.parametrize("cap_us", [118, 6])
+def test_the_arduino_gets_each_stick_as_far_as_it_judges(cap_us):
+    """Scaled to a small cap, or to a car without reverse, a stick at its end looked like one at rest."""
+    link, sent = ServoLink("none", car=replace(Car(human="gamepad"), cap_us=cap_us)), []
+    link._write = sent.append
+    for host_s, sticks in enumerate([(0.5, 1.0), (0.0, -1.0), (-1.0, 0.0), None], 1):
+        link._telemetry = parse(frame("<S 7 1000 5 k M r w 1456 120 238 - - - - 1 2 3 4")[:-1], host_s)
+        link._relay(SimpleNamespace(sticks=lambda sticks=sticks: sticks), host_s)
+    far_us = max(cap_us, 64)
+    wanted = (1734, 120 + far_us), (1456, max(120 - far_us, 40)), (900, 120), (0, 0)
+    assert sent == [frame(f">S 7 1000 {steering} {throttle}") for steering, throttle in wanted]
 
 
 def kernel(root, *nodes):

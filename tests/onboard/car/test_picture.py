@@ -1,6 +1,7 @@
 """Pictures that nobody vouches for: what is refused and at what cost, and what tells a camera from a picture of one."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -9,6 +10,8 @@ import hostile
 import numpy as np
 import pytest
 from hostile import HOSTILE, WHOLE, jpeg, scene
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rover_lib.onboard.car.picture import block_sums, brightness, decode_jpeg, read_jpeg
 from rover_lib.onboard.errors import CameraError
@@ -48,6 +51,32 @@ def test_what_a_camera_may_send_is_decoded_as_opencv_does():
     begin = WHOLE.index(b"\xff\xc4")
     without_tables = WHOLE[:begin] + WHOLE[hostile.SCAN - 14 :]  # as webcams send them
     assert (decode_jpeg(without_tables) == decode_jpeg(WHOLE)).all()
+
+
+FILLED = re.compile(rb"(?=\xff[\xd0-\xd7])").sub(b"UU", hostile.RESTARTS, 3)  # as a Logitech C270 sends nearly each one
+
+
+def test_filler_before_markers_is_no_damage():
+    for filled in (FILLED, hostile.RESTARTS[:-2] + b"UUUU\xff\xd9", WHOLE[:-2] + b"UU\xff\xd9"):
+        assert filled not in (hostile.RESTARTS, WHOLE)
+        assert (decode_jpeg(filled) == decode_jpeg(hostile.RESTARTS if filled.count(b"\xff\xd0") else WHOLE)).all()
+
+
+@given(st.integers(100, len(hostile.RESTARTS) - hostile.SCAN), st.integers(1, 3000))
+def test_what_is_torn_after_filler_is_torn(from_end, missing):
+    """libjpeg's first warning is about the filler, and simplejpeg has no other: half a picture was missing."""
+    whole, filled = (
+        data[: len(data) - from_end] + data[min(len(data) - from_end + missing, len(data) - 2) :]
+        for data in (hostile.RESTARTS, FILLED)
+    )
+    assert is_taken(filled) == is_taken(whole)
+
+
+def is_taken(data):
+    try:
+        return decode_jpeg(data) is not None
+    except CameraError:
+        return False
 
 
 def test_a_file_that_is_none(tmp_path):

@@ -297,6 +297,9 @@ class Eyes:
     def __init__(self):
         self.frame = Frame(np.zeros((4, 4, 3), np.uint8), 0.0, 1, 0, 100.0, 40.0)
 
+    def wait(self, after, timeout_s):
+        return None
+
     def see(self, now_s, repeats=0, mean=100.0, contrast=40.0):
         self.frame = Frame(self.frame.image, now_s, self.frame.number + 1, repeats, mean, contrast)
 
@@ -357,12 +360,24 @@ def test_what_the_limit_cuts_is_said_once(pilot):
 
 def test_a_plan_that_is_too_old(pilot):
     drives(pilot, 0.5)
-    pilot.order(1.4)
-    with pytest.raises(DriveFault, match=r"too old to drive by \(1 s\): no new frame came"):
-        pilot.order(1.5)
     pilot.plans.asking_s = 0.8
-    with pytest.raises(DriveFault, match=r"policy has not answered for 0\.8 s"):
-        pilot.order(1.6)
+    for now_s in (1.4, 1.5):
+        pilot.eyes.see(now_s)
+        if now_s < 1.5:
+            pilot.order(now_s)
+    with pytest.raises(DriveFault, match=r"too old .* \(1 s\): the policy has not answered for 0\.8 s"):
+        pilot.order(1.5)
+
+
+def test_a_camera_that_gives_no_more_pictures(pilot):
+    """The throttle stayed full for 0.55 s, and was off after 0.98. After a pause, the camera's thread comes first."""
+    drives(pilot, 0.5)
+    last_s = pilot.eyes.frame.captured_s
+    pilot.order(last_s + 0.135)
+    with pytest.raises(CameraError):
+        pilot.order(last_s + 0.145)
+    pilot.eyes.wait = lambda after, timeout_s: replace(pilot.eyes.frame, captured_s=last_s + 0.1)
+    pilot.order(last_s + 0.145)
 
 
 def test_a_frozen_camera(pilot):
@@ -417,6 +432,9 @@ def test_nobody_arms_a_car_that_sees_nothing_new(pilot, seen, fault):
     pilot.check_sight()
     pilot.eyes.see(0.0, **seen)
     with pytest.raises(CameraError, match=fault):
+        pilot.check_sight()
+    pilot.eyes.frame = None
+    with pytest.raises(CameraError):
         pilot.check_sight()
 
 
@@ -493,14 +511,14 @@ def test_frames_and_plans_that_are_late_are_said(pilot):
     drives(pilot, 0.5)
     assert list(pilot.warnings()) == []
     last_s = 0.5 - PERIOD
-    pilot.order(last_s + 0.19)
+    pilot.order(last_s + 0.09)
     assert list(pilot.warnings()) == []
     pilot.plans.asking_s = 0.35
-    pilot.order(last_s + 0.35)
+    pilot.order(last_s + 0.13)
     pilot.plans.asking_s = 0.0
     drives(pilot, 0.2, start_s=1.0)
     frames, policy = pilot.warnings()
-    assert frames == "no new frame for 0.35 s"
+    assert frames == "no new frame for 0.13 s"
     assert policy.startswith("the policy took 0.35 s or more")
     assert list(pilot.warnings()) == []
 

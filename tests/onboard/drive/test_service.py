@@ -32,13 +32,14 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import service as s
-from rover_lib.onboard.drive.arming import Arming, arm_capped, arm_when_asked, arm_when_ready
+from rover_lib.onboard.drive.arming import arm_capped, arm_when_asked, arm_when_ready, wanted_since
 from rover_lib.onboard.drive.drive import drive_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import PolicyError
+from rover_lib.onboard.drive.session import Arming, Session
+from rover_lib.onboard.errors import CameraError, PolicyError
 from rover_lib.onboard.recording.episode import json_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
@@ -139,7 +140,8 @@ def armed() -> str:
 
 def ask_to_arm(**more) -> dict:
     """Ask as `rover arm-car` does, with a good ticket."""
-    return s.ask_service(**{"ask": "arm", "model": "ab12", "ticket": s.ask_service(ask="state")["ticket"], **more})
+    asked = {"ask": "arm", "model": "ab12", "ticket": s.ask_service(ask="state")["ticket"], "asked_s": host.boottime()}
+    return s.ask_service(**asked | more)
 
 
 def test_ready_and_disarmed_until_a_human_arms(systemd, tmp_path):
@@ -185,7 +187,7 @@ def test_one_request_is_one_attempt(systemd):
         if len(calls) == 1:
             raise LinkError("not yet")
 
-    asked = {"ask": "arm", "model": "ab12"}
+    asked = {"ask": "arm", "model": "ab12", "asked_s": host.boottime()}
 
     def twice() -> None:
         asked["ticket"] = s.ask_service(ask="state")["ticket"]
@@ -204,20 +206,42 @@ def test_nobody_can_ask_for_the_car_while_it_drives(systemd):
         assert asked[0]["armed"] and s.ask_service(ask="state")["ticket"] == ""
 
 
-@pytest.mark.parametrize("old", [{"asked_s": -1e9}, {"asked_s": math.nan}, {}])
+@pytest.mark.parametrize("old", [{"asked_s": s} for s in (-1e9, math.nan, math.inf, 101.0)] + [{"asked_s": 100.0}])
 def test_an_operator_who_asked_long_ago_is_asked_again(systemd, monkeypatch, old):
     """The camera was slow, or this process was stopped: the car must not set off when nobody expects it any more."""
     monkeypatch.setattr(s, "REQUEST_S", REQUEST_S)
     calls, now = [], [100.0]
 
     def arm(service):
-        if not old:
+        if old["asked_s"] == 100:
             now[0] += s.REQUEST_S + 0.1  # arming itself takes too long
         service.check_request()
         calls.append(1)
 
     answer, _ = waits_unarmed(systemd, lambda: ask_to_arm(**old), arm, clock=lambda: now[0])
     assert not calls and not answer["armed"] and "ask again" in answer["text"]
+
+
+def test_who_has_hung_up_gets_no_car(systemd, tmp_path):
+    """The car set off although nobody waited for it any more."""
+    calls = []
+
+    def operator() -> None:
+        question = {"ask": "arm", "model": "ab12", "asked_s": host.boottime()}
+        question["ticket"] = s.ask_service(ask="state")["ticket"]
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.connect(str(tmp_path / "operators"))
+            connection.send(json.dumps(question).encode())
+        until(lambda: calls)
+
+    def arm(service):
+        time.sleep(0.2)  # as long as a fresh plan takes
+        calls.append("tried")
+        service.check_request()
+        calls.append("armed")
+
+    waits_unarmed(systemd, operator, arm, clock=host.boottime)
+    assert calls == ["tried"]
 
 
 def test_a_request_names_the_model_that_it_arms(systemd):
@@ -246,7 +270,9 @@ def test_nonsense_arms_nothing(systemd, tmp_path, nonsense):
     assert waits_unarmed(systemd, talk)[0] == "disarmed: waiting for a human to arm it"
 
 
-@pytest.mark.parametrize("limits", [{"max_seconds": -1}, {"asked_s": 10**400}, {"asked_s": "soon"}], ids=range(3))
+@pytest.mark.parametrize(
+    "limits", [{"max_seconds": -1}, {"asked_s": 10**400}, {"asked_s": "soon"}, {"asked_s": None}], ids=range(4)
+)
 def test_a_request_with_a_number_that_is_none_is_no_attempt(systemd, limits):
     """All else in it is right: the model, and the ticket, which stays good."""
 
@@ -444,8 +470,10 @@ def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
     monkeypatch.setattr(host.time, "clock_gettime", {time.CLOCK_BOOTTIME: 5000.0}.__getitem__)
     s.arm_car(s.Request())
     assert asked[-1]["asked_s"] == 5000.0
-    for function in (s.Service.__init__, arm_when_ready, arm_when_asked):
-        assert inspect.signature(function).parameters["clock"].default() == 5000.0
+    for function in (s.Service.__init__, wanted_since, Session.__init__):
+        parameters = inspect.signature(function).parameters
+        assert (parameters.get("clock") if function is not Session.__init__ else parameters["now"]).default() == 5000.0
+    assert DriveOptions(Path("policy.pt")).asked_s == 5000.0
 
 
 # arming.py
@@ -459,12 +487,37 @@ def test_an_old_plan_is_renewed_before_the_car_is_armed():
         asked.append(age_s)
         raise PolicyError("no fresh plan")
 
+    with pytest.raises(PolicyError):
+        arms(renew)
+    assert asked == [Settings().fade_s]
+
+
+def arms(renew=lambda age_s: None, check_sight=lambda: None, asked_s=0.0):
+    """Arm at 40 s by a session whose car was asked for at asked_s."""
     planner = SimpleNamespace(without_rest=contextlib.nullcontext, renew=renew)
-    link = SimpleNamespace(request=lambda keep: None, lower_cap=lambda us: pytest.fail("armed"))
-    log, options, settings = SimpleNamespace(event=lambda *_: None), DriveOptions(Path("policy.pt")), Settings()
-    with pytest.raises(PolicyError), Arming(options, settings, link, log, planner, None, None, mode="static") as arming:
-        arming.arm()
-    assert asked == [settings.fade_s]
+    cap = replace(STATUS, cap_us=238)
+    link = SimpleNamespace(request=lambda keep: None, calibration=PwmCalibration(), lower_cap=lambda us: cap)
+    link.arm = lambda: "armed"
+    log, options = SimpleNamespace(event=lambda *_: None), DriveOptions(Path("policy.pt"), asked_s=asked_s)
+    session = Session(options, Settings(), Report(), log, None, link, None, planner, None, 30.0, "static",
+                      boost=contextlib.nullcontext, now=lambda: 40.0)  # fmt: skip
+    with Arming(session, SimpleNamespace(check_sight=check_sight)) as arming:
+        return arming.arm()
+
+
+def test_no_car_is_armed_whose_camera_shows_nothing():
+    def check_sight():
+        raise CameraError("black")
+
+    assert arms(asked_s=11.0) == "armed"
+    with pytest.raises(CameraError):
+        arms(check_sight=check_sight, asked_s=11.0)
+
+
+def test_no_car_is_armed_for_a_command_of_long_ago():
+    """Loading a policy took 45 s, and the 30 s began after it."""
+    with pytest.raises(s.RoverError):
+        arms()
 
 
 def lacking(steps):
@@ -477,20 +530,21 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
     """In the order in which a human does it; said once each."""
     link, stop, said, checked = lacking(iter("sstwww-")), threading.Event(), [], []
     checks = [lambda: checked.append(1)]
-    assert arm_when_asked(armed, link, stop, said.append, checks, terminal=True) == "telemetry"
+    wanted = {"still_wanted": lambda: None, "terminal": True}
+    assert arm_when_asked(armed, link, stop, said.append, checks, **wanted) == "telemetry"
     assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
     assert len(checked) == 6
     stop.set()  # who goes away gets nothing
     with pytest.raises(s.RoverError):
-        arm_when_asked(lambda: pytest.fail("armed"), lacking(itertools.repeat("s")), stop, print, terminal=True)
+        arm_when_asked(lambda: pytest.fail("armed"), lacking(itertools.repeat("s")), stop, print, **wanted)
 
 
 @pytest.mark.parametrize("missing", ["ww-", "-"])
 def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
     """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
-    now = iter([0.0, 3600.0] if missing == "-" else [0.0, 20.0, 31.0])
+    wanted = wanted_since(0.0, iter([3600.0] if missing == "-" else [20.0, 31.0]).__next__)
     with pytest.raises(s.RoverError, match="at most 30"):
-        arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), now.__next__)
+        arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), wanted)
 
 
 # The whole: rover drive --service, as systemd starts it
@@ -641,9 +695,23 @@ def drive_fakes(monkeypatch, tmp_path):
         for name, fake in {"ServoLink": link, "PolicyProcess": Policy, "Artifact": OneFile, "Camera": Eyes}.items():
             monkeypatch.setattr(f"rover_lib.onboard.drive.drive.{name}", fake)
         given = {"artifact": tmp_path / "policy.pt", "camera": str(tmp_path), "film": True, "service": True}
-        drive_car(DriveOptions(**given, log_file=tmp_path / "flight.log", **options), Report())
+        drive_car(DriveOptions(**given | {"log_file": tmp_path / "flight.log"} | options), Report())
 
     return drive
+
+
+def test_the_age_of_a_command_begins_before_its_policy_is_loaded(monkeypatch, drive_fakes):
+    now_s = [100.0]
+
+    def loads(policy):
+        now_s[0] += 45
+        return policy
+
+    monkeypatch.setattr(host.time, "clock_gettime", lambda clock: now_s[0])
+    monkeypatch.setattr(Policy, "__enter__", loads)
+    with pytest.raises(s.RoverError):
+        drive_fakes(Link, service=False)
+    assert Link.arms == []
 
 
 @pytest.mark.slow

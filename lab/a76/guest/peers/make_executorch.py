@@ -2,12 +2,11 @@
 
     make_executorch.py CHECKPOINT CALIBRATION ARTIFACT
 
-It runs on the workstation with ExecuTorch's packages before ours (see lab/a76/peers.py). Arguments and the printed JSON
-line are those of make_onnxruntime.py, but ARTIFACT is a .pte.
+Arguments and the printed JSON line are those of make_onnxruntime.py, but ARTIFACT is a .pte. The same parts are INT8
+or float as there.
 
 The recipe is the quantizer's own: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set
 for the whole graph, with a filter: if it is set by module type or name, the quantizer silently skips convolutions.
-The same parts are INT8 or float as in make_onnxruntime.py.
 """
 
 import json
@@ -43,21 +42,17 @@ def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 def is_int8(node: torch.fx.Node) -> bool:
     """Return whether the quantizer may quantize a node, by the module that the node comes from."""
     stack = list(node.meta.get("nn_module_stack", {}).values())
-    if node.op != "call_function" or not stack:  # weights, and nodes without a module: parts of other nodes' patterns
+    if node.op != "call_function" or not stack:  # weights, and parts of other nodes' patterns
         return True
     name, kind = stack[-1]
     kind = kind if isinstance(kind, str) else f"{kind.__module__}.{kind.__qualname__}"
     return kind in INT8 and not str(name).endswith(STAYS_FLOAT)
 
 
-def layers_of(graph: torch.fx.Graph) -> dict[str, bool]:
-    """Return for each convolution and linear layer, by its module, whether its input and weight both come from INT8."""
-    found = {}
-    for node in graph.nodes:
-        if node.op == "call_function" and str(node.target).startswith(LAYERS):
-            name, _ = list(node.meta["nn_module_stack"].values())[-1]
-            found[str(name)] = all("dequantize" in str(source.target) for source in node.args[:2])
-    return found
+def int8_layers(graph: torch.fx.Graph) -> int:
+    """Count the convolutions and linear layers whose input and weight both come from INT8."""
+    layers = [n for n in graph.nodes if n.op == "call_function" and str(n.target).startswith(LAYERS)]
+    return sum(all("dequantize" in str(source.target) for source in node.args[:2]) for node in layers)
 
 
 def main(checkpoint: str, calibration: str, artifact: str) -> None:
@@ -73,7 +68,7 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
         for observation in observations(calibration):
             graph(*map(torch.from_numpy, observation))
         graph = convert_pt2e(graph)
-        layers = layers_of(graph.graph)
+        int8 = int8_layers(graph.graph)
         edge = to_edge_transform_and_lower(
             torch.export.export(graph, example),
             partitioner=[XnnpackPartitioner()],
@@ -83,12 +78,8 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
     if left := [target for target in left if any(product in target for product in PRODUCTS)]:
         sys.exit(f"error: XNNPACK did not take {len(left)} convolutions and linears: {left[:3]}")
     Path(artifact).write_bytes(edge.to_executorch().buffer)
-    report = {
-        "int8_layers": sum(layers.values()),
-        "float_layers": [name for name, int8 in layers.items() if not int8],
-        "versions": {"executorch": version("executorch"), "torchao": version("torchao"), "torch": torch.__version__},
-    }
-    print(json.dumps(report))
+    versions = {"executorch": version("executorch"), "torchao": version("torchao"), "torch": torch.__version__}
+    print(json.dumps({"int8_layers": int8, "versions": versions}))
 
 
 if __name__ == "__main__":

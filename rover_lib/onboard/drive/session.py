@@ -1,0 +1,227 @@
+"""Arm the car and drive, once or again and again, with all that a drive has opened.
+
+    session = Session(options, settings, report, log, feed, link, camera, planner, commanded, rate_hz=30, mode="static")
+    session.drive(stop)
+
+`rover drive` and the laboratory's random drives arm and drive by this code; only what is opened differs.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.car.camera import Camera
+from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.host import boottime
+from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
+from rover_lib.onboard.drive.arming import arm_capped, arm_when_asked, wanted_since
+from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
+from rover_lib.onboard.drive.flight_log import FlightLog
+from rover_lib.onboard.drive.inference import Planner
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, Warnings, drive
+from rover_lib.onboard.drive.opening import DriveOptions
+from rover_lib.onboard.drive.pilot import PolicyPilot
+from rover_lib.onboard.drive.plan import Commanded, Settings
+from rover_lib.onboard.drive.service import Service
+from rover_lib.onboard.drive.takeover import TakeoverRecorder
+from rover_lib.onboard.drive.watch import HealthWatch, boost_priority
+from rover_lib.onboard.errors import DriveFault, RoverError, sentence_of
+from rover_lib.onboard.recording.episode import About
+from rover_lib.onboard.recording.recorder import Recorder, room_for
+
+TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
+
+
+@dataclass
+class Session:
+    """All that a drive has opened.
+
+    link: None: no motor is driven. rate_hz, mode: of the policy. pids: of all processes that drive. service: None:
+    there is one drive, asked for by the options. terminal: whether somebody sees what is missing, and is waited for.
+    boost: what gives this process priority while the car drives. clock, sleep: of the loop; now: boottime().
+    """
+
+    options: DriveOptions
+    settings: Settings
+    report: Report
+    log: FlightLog
+    feed: Feed
+    link: ServoLink | None
+    camera: Camera
+    planner: Planner
+    commanded: Commanded
+    rate_hz: float
+    mode: str
+    pids: tuple[int, ...] = ()
+    service: Service | None = None
+    terminal: bool = False
+    boost: Callable[[FlightLog], AbstractContextManager] = boost_priority
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+    now: Callable[[], float] = boottime
+
+    def drive(self, stop: threading.Event, said: str = "") -> None:
+        """Arm the car when somebody asks for it, and drive once. said: how the previous drive ended.
+
+        Raises as loop.drive() does, but a service's drive may end by a fault or a takeover.
+        """
+        options, pilot = self.options, self.make_pilot()
+        warnings = self.make_warnings(pilot)
+        with Arming(self, pilot) as arming:
+            self.report.clear()
+            arm = partial(self._arm, arming, stop, said)
+            show = partial(self.feed.tick, self.report, self.camera, pilot)
+            hooks = Hooks(arm, warnings, arming.record if options.record else None, show)
+            until = Until(options.ticks, options.max_seconds, stop, self.over)
+            try:
+                drive(pilot, self.link, self.log, rate_hz=options.hz, until=until, hooks=hooks, report=self.report,
+                      clock=self.clock, sleep=self.sleep)  # fmt: skip
+            except DriveFault as error:
+                if error.kind == "taken over":
+                    arming.record_human(stop, self._human_over)
+                if not self.service:
+                    raise
+            finally:
+                self.feed.ended(self.report, self.camera, self.link)
+
+    @property
+    def car(self) -> Car:
+        return self.link.car if self.link else this_car()
+
+    def make_pilot(self) -> PolicyPilot:
+        """Return a pilot for one drive."""
+        pwm = self.car.pwm
+        return PolicyPilot(self.camera, self.planner, self.commanded, self.settings, self.rate_hz, calibration=pwm)
+
+    def make_warnings(self, pilot: PolicyPilot) -> Warnings:
+        """Return the sources of what is logged once a second."""
+        health = HealthWatch(self.report, self.link, self.pids)
+        return lambda: [*pilot.warnings(), *health()]
+
+    def make_recorder(self, folder: Path, room: int | None) -> AbstractContextManager[Recorder]:
+        """Return a recorder of one drive. room: the bytes that it may take; None: limited by the disk."""
+        port = self.link.port if self.link else ""
+        about = About(f"driven by {self.mode}", arduino_port=port, source="rover drive", car=self.car)
+        return Recorder(folder, self.camera, about, rate_hz=self.options.hz, most_bytes=room)
+
+    def attempt(self, arming: "Arming") -> Telemetry | None:
+        """Arm the car now, or raise."""
+        return arming.arm()
+
+    def over(self) -> str | None:
+        """Why this drive must end, by its operator or the view; None if it may go on."""
+        return (self.service.over() if self.service else None) or self.feed.over()
+
+    def check_wanted(self) -> None:
+        """Raise RoverError if whoever asked for the car did so too long ago, or is gone."""
+        (self.service.check_request if self.service else wanted_since(self.options.asked_s, self.now))()
+
+    def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
+        checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest]
+        if self.link:
+            checks.append(self.link.latest)
+        checks.append(partial(self._show_waiting, said))
+        attempt, notify = partial(self.attempt, arming), self.log.event
+        how: dict[str, Any] = {"service": self.service, "said": said, "terminal": self.terminal}
+        telemetry = arm_when_asked(attempt, self.link, stop, notify, checks, still_wanted=self.check_wanted, **how)
+        self.camera.begin()  # a film must start with the loop, not while arming waits
+        return telemetry
+
+    def _show_waiting(self, said: str) -> None:
+        asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
+        self.feed.show(WAITING, said, self.report, self.camera, self.link)
+        if asked and not self.service:
+            raise RoverError(asked, kind="not armed")
+
+    def _human_over(self) -> str | None:
+        if self.service:
+            self.service.alive()
+        self.report.status = TAKEN_OVER
+        self.feed.show(TAKEN, TAKEN_OVER, self.report, self.camera, self.link)
+        return self.feed.over()
+
+
+class Arming:
+    """Prepares a drive and arms the car; a context manager, whose end finishes the episode and lowers the priority.
+
+    If arming is refused, what it began is undone.
+    """
+
+    def __init__(self, session: Session, pilot: PolicyPilot):
+        self._session, self._pilot, options = session, pilot, session.options
+        self._room: int | None = None
+        if options.record and options.record_mb:
+            self._room = room_for(options.record, options.record_mb)  # now, because it may take a while
+        self._recorder: TakeoverRecorder | None = None
+        self._armed: Telemetry | None = None
+        self._driving, self._recording = ExitStack(), ExitStack()
+
+    def __enter__(self) -> "Arming":
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        if self._recorder:
+            self._recorder.flush()
+        try:
+            self._driving.__exit__(*exc)
+        finally:
+            try:
+                self._recording.__exit__(*exc)
+            finally:
+                if self._recorder and (outcome := self._recorder.recorder.path or self._recorder.recorder.failure):
+                    self._session.log.event(f"recorded: {outcome}")
+
+    def arm(self) -> Telemetry | None:
+        """Arm the car if the newest plan is fresh and the camera sees. Return the status that confirms it.
+
+        Raises PolicyError without a fresh plan, CameraError for a camera that shows nothing, and as arm_capped() does;
+        it may then be called again.
+        """
+        session = self._session
+        with ExitStack() as recording, ExitStack() as driving:
+            if session.link:
+                session.link.request(keep=True)
+            driving.enter_context(session.planner.without_rest())
+            if folder := session.options.record:
+                recorder = recording.enter_context(session.make_recorder(folder, self._room))
+                self._recorder = TakeoverRecorder(recorder, session.mode)
+            driving.enter_context(session.boost(session.log))
+            session.planner.renew(session.settings.fade_s)
+            self._pilot.check_sight()
+            if session.link:
+                limit = session.settings.throttle_limit
+                self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)
+            self._driving, self._recording = driving.pop_all(), recording.pop_all()
+        return self._armed
+
+    def record(self, *row: Any, **columns: Any) -> None:
+        """Write a command into the episode, for the loop's hooks."""
+        if self._recorder:
+            self._recorder.command(*row, **columns)
+
+    def record_human(self, stop: threading.Event, over: Callable[[], str | None]) -> None:
+        """After a takeover in a recorded drive, record the human until TakeoverRecorder.human() ends.
+
+        Raises nothing: the human has the car, and opening the port again might take it away from them.
+        """
+        session = self._session
+        if not self._recorder or not session.link:
+            return
+        self._driving.close()  # the host no longer drives: ordinary priority, and one plan per second
+        recorder, log = self._recorder.recorder, session.log
+        log.event(TAKEN_OVER)
+        try:
+            takeover = self._recorder.human(
+                session.link, self._armed, rate_hz=session.options.hz, stop=stop, over=over, clock=session.clock
+            )
+            recorder.note(takeover=vars(takeover))
+            log.event(str(takeover))
+            recorder.close(takeover.ended if takeover.fault else None)
+        except Exception as error:
+            log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
