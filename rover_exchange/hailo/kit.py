@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.lib.format import open_memmap
 
 from rover_exchange.hailo.networks import Network, networks
 from rover_lib.onboard.artifact.manifest import Artifact, largest_tolerance
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, parameters_by_block, zero_colour
@@ -49,10 +49,7 @@ def write_kit(
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
     front, whole, rest = networks(policy)
     described = {}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
-        folder = Path(temporary) / out.name
-        folder.mkdir()
+    with build_folder(out) as folder:
         manifest = _manifest(Path(run_dir), samples, folder)
         onnx.save(rest, folder / "transformer.onnx")
         for name, network in (("backbone", front), ("whole", whole)):
@@ -64,7 +61,6 @@ def write_kit(
         write_calibration(policy, chosen, folder, progress)
         content = {"schema": 1, "networks": described, "manifest": manifest}
         (folder / "kit.json").write_text(json.dumps(content, indent=1))
-        folder.rename(out)
 
 
 def write_calibration(policy: ACT, samples: Sequence[Sample], folder: Path, progress: Progress) -> None:

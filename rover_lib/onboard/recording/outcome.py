@@ -13,12 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import DATA_BYTES, HIT, MISSED
+from rover_lib.onboard.recording.episode import DATA, DATA_BYTES, HIT, MISSED
 from rover_lib.onboard.stage import atomic_path, read_plain
 
 NONE = "none"
 CHOICES = (HIT, MISSED, NONE)
-DATA = "episode_data.json"
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:

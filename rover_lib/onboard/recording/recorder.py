@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter, find_killed
+from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter, find_killed, remove_if_empty
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
@@ -74,7 +74,7 @@ class Recorder:
             self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
             self._thread.start()
         except BaseException:
-            self._writer.discard()
+            self._writer.close()
             raise
 
     def __enter__(self) -> "Recorder":
@@ -170,15 +170,13 @@ class Recorder:
         except Exception as error:  # whatever it is, the car drives on, and what was recorded is kept
             self._fail(sentence_of(error))
         if self._unwanted:
-            return self._writer.discard()
+            return self._writer.close(unwanted=True)
         if self.failure:
             self._writer.metadata["fault"] = self.failure
         if self._lost:
             self._writer.metadata["controls_lost"] = self._lost
         try:
-            path = self._writer.finish()
-            os.sync()  # a reported episode must survive if the car is switched off right after
-            self.path = path
+            self.path = self._writer.finish()
         except Exception as error:
             self._fail(sentence_of(error))
 
@@ -224,7 +222,7 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
-    if killed := find_killed(folder):
+    if killed := [part for part in find_killed(folder) if not remove_if_empty(part)]:
         text = f"{len(killed)} recordings here were killed; `rover record {folder} --finish` keeps what they have"
         _log.warning(text)
     while True:
