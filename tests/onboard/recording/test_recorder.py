@@ -182,7 +182,7 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, virtual, monkeypatch):
     free(1_000_000)
     virtual.wait(0.1)
     until(lambda: recorder.failure)
-    assert len(load_recordings(recorder.close(), chunk=2).samples) == 1 and "as good as full" in recorder.failure
+    assert len(load_recordings(recorder.close(), chunk=2).samples) == 1 and "almost full" in recorder.failure
     free(30_000_000)
     assert module.room_for(tmp_path, 2000.0) == 15_000_000  # room to be packed is left
 
