@@ -30,6 +30,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.durable import lock_folder, move_durably, sync_disk
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import atomic_path, plain, read_plain
@@ -105,8 +106,7 @@ class EpisodeWriter:
         flags: bool = False,
     ):
         self.folder, self.about = Path(folder), about
-        self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
-        self.jpeg_quality, self.flags = jpeg_quality, flags
+        self.resolution, self.jpeg_quality, self.flags = resolution, jpeg_quality, flags
         car = about.car or Car()
         self.pwm = car.pwm
         self.metadata: dict[str, Any] = {}  # further entries of the episode's metadata
@@ -178,35 +178,32 @@ class EpisodeWriter:
         Without flags they are 0 where no pulse was measured, as the firmware has it.
         """
         self._must_be_open()
+        self._check_time(t_system_s)
         row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
-        row["arduino_timestamp"] = self._whole("arduino_timestamp", arduino_ms)
-        row["system_timestamp"] = self._time(t_system_s)
+        row["arduino_timestamp"], row["system_timestamp"] = arduino_ms, float(t_system_s)
         for name, pulse_us, period_us, flag in (
             ("steering", steering_us, steering_period_us, FLAG_FIELDS[0]),
             ("throttle", throttle_us, throttle_period_us, FLAG_FIELDS[1]),
         ):
             action = None
             if not (self.flags and (pulse_us is None or period_us is None)):
-                pulse_us = self._whole(f"{name}_raw_us", pulse_us)
-                period_us = self._whole(f"{name}_period_us", period_us)
+                if not is_whole(pulse_us, 0) or not is_whole(period_us, 0):
+                    what = f"{self.folder.name}: pulse and period of {name} must be whole numbers from 0"
+                    raise EpisodeError(what, found=f"{pulse_us!r} and {period_us!r}")
                 action = self.pwm.channel(name).action(pulse_us, period_us)
             if action is not None or not self.flags:
                 row[f"{name}_normalized"] = round(action or 0.0, 4) + 0.0  # + 0.0: no "-0.0" in the file
                 row[f"{name}_raw_us"], row[f"{name}_period_us"] = pulse_us, period_us
             if self.flags:
                 row[flag] = action is not None
-        if extra:
-            if taken := extra.keys() & {*CONTROL_FIELDS, *FLAG_FIELDS}:
-                raise EpisodeError(f"{self.folder.name}: column {min(taken)} is taken", remedy="give it another name")
-            row |= plain(extra)
-            self._extra |= dict.fromkeys(extra)
-        self._append("control", row, row["system_timestamp"])
+        self._extra |= dict.fromkeys(extra)
+        self._append("control", plain(extra) | row, t_system_s)
         self.controls += 1
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
         """Add one picture, (height, width, 3) uint8 BGR of the episode's resolution, at system time `t_s`."""
         part = self._must_be_open()
-        t_s = self._time(t_s)
+        self._check_time(t_s)
         if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
             self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
         shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
@@ -216,9 +213,7 @@ class EpisodeWriter:
             raise EpisodeError(what, found=found, remedy="check the camera")
         number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
-        ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
-        if not ok:
-            raise EpisodeError(f"{self.folder.name}: frame {number} is not JPEG", remedy="check the camera")
+        _, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
         picture = part / relative
         try:
             with self._disk():
@@ -227,7 +222,7 @@ class EpisodeWriter:
             with contextlib.suppress(OSError):  # half a file is no picture, and the episode may go on without it
                 picture.unlink()
             raise
-        self._append("frame", {"frame_id": number, "timestamp": t_s, "image_path": relative}, t_s)
+        self._append("frame", {"frame_id": number, "timestamp": float(t_s), "image_path": relative}, t_s)
         self.frames, self.picture_bytes = number, self.picture_bytes + len(jpeg)
 
     def finish(self) -> Path:
@@ -288,11 +283,7 @@ class EpisodeWriter:
                 yield row
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
-        try:
-            line = json.dumps(row, allow_nan=False).encode() + b"\n"
-        except (TypeError, ValueError) as e:
-            what = f"{self.folder.name}: a column cannot be written ({e})"
-            raise EpisodeError(what, remedy="give numbers or text") from None
+        line = json.dumps(row, allow_nan=False).encode() + b"\n"
         with self._disk():
             if self._unsynced:
                 raise self._unsynced
@@ -315,11 +306,8 @@ class EpisodeWriter:
         try:
             yield
         except OSError as e:
-            kept = f"`rover record {self.folder.parent} --finish` keeps what was recorded" if self._part else ""
-            raise EpisodeError(
-                f"{self.folder}: cannot be written ({e.strerror or e})",
-                remedy=f"make room; {kept or 'or name another folder'}",
-            ) from e
+            remedy = f"make room; `rover record {self.folder.parent} --finish` keeps what was recorded"
+            raise EpisodeError(f"{self.folder}: cannot be written ({e.strerror or e})", remedy=remedy) from e
 
     def _must_be_open(self) -> Path:
         """Return the hidden folder. Raises EpisodeError if there is none."""
@@ -327,19 +315,9 @@ class EpisodeWriter:
             raise EpisodeError(f"{self.folder.name}: not open", remedy="use it as `with EpisodeWriter(...) as writer:`")
         return self._part
 
-    def _whole(self, name: str, value: object) -> int:
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0", found=f"{value!r}")
-        return int(value)
-
-    def _time(self, t_s: float) -> float:
-        try:
-            found = float(t_s)
-        except (TypeError, ValueError, OverflowError):
-            found = math.nan
-        if not math.isfinite(found):
+    def _check_time(self, t_s: float) -> None:
+        if not is_number(t_s):
             raise EpisodeError(f"{self.folder.name}: a time must be finite seconds", found=repr(t_s))
-        return found
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
@@ -352,8 +330,8 @@ class EpisodeWriter:
             remedy = f"check that the camera and the Arduino deliver; {part.name} has what there is"
             raise EpisodeError(f"{self.folder.name}: too little for an episode", found=found, remedy=remedy)
         about = self.about
-        start_s = self._first_s if about.start_time_s is None else self._time(about.start_time_s)
-        end_s = self._last_s if about.end_time_s is None else self._time(about.end_time_s)
+        start_s = self._first_s if about.start_time_s is None else about.start_time_s
+        end_s = self._last_s if about.end_time_s is None else about.end_time_s
         duration_s = end_s - start_s
         head = {
             "episode_id": self.folder.name,
