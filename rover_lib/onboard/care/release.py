@@ -16,7 +16,6 @@ synced before its folder gets its name, and the folder before `current` is renam
 
 import contextlib
 import json
-import os
 import re
 import shutil
 import socket
@@ -30,6 +29,7 @@ from typing import Any
 from filelock import Timeout
 
 from rover_lib.onboard.artifact.acceptance import THIS_CAR, Expected, inspect_artifact
+from rover_lib.onboard.durable import sync
 from rover_lib.onboard.errors import RoverError, printable
 from rover_lib.onboard.stage import private_lock, sha256_of
 
@@ -190,10 +190,10 @@ class Releases:
             if release.exists():
                 for file in (POLICY, ORIGIN):
                     (new / file).replace(release / file)
-                _sync(release)
+                sync(release)
             else:
                 new.rename(release)
-            _sync(self.releases)
+            sync(self.releases)
             return Staged(release.name, True)
 
     def switch(self, name: str) -> bool:
@@ -250,7 +250,7 @@ class Releases:
             for name in removed:
                 away = self.releases / f".gone-{name}"  # after a power cut it is there completely, or not at all
                 (self.releases / name).rename(away)
-                _sync(self.releases)
+                sync(self.releases)
                 shutil.rmtree(away)
             if removed:
                 self._write_history([name for name in self._history() if name not in removed])
@@ -290,7 +290,7 @@ class Releases:
             new = self.models / ".new-current"
             new.symlink_to(Path("releases", name))
             new.replace(self.current_link)
-        _sync(self.models)
+        sync(self.models)
 
     def _history(self) -> list[str]:
         try:
@@ -307,9 +307,9 @@ class Releases:
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
             new.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
-            _sync(new)
+            sync(new)
             new.replace(self.models / "history.json")
-            _sync(self.models)
+            sync(self.models)
 
     def _used_before(self) -> list[str]:
         """Return the releases that were in use before the present one and still exist: the newest first, each once."""
@@ -339,20 +339,11 @@ def _let_service_read(folder: Path) -> None:
     """Let the service's user read a release, whatever the umask is, and write all of it to the disk."""
     for file in folder.iterdir():
         file.chmod(0o644)
-        _sync(file)
+        sync(file)
     folder.chmod(0o755)
-    _sync(folder)
+    sync(folder)
 
 
 def _up_to_last(history: list[str], name: str | None) -> list[str]:
     """Return the history up to the last time that a release was in use; all of it if it never was."""
     return history[: len(history) - history[::-1].index(name)] if name in history else history
-
-
-def _sync(path: Path) -> None:
-    """Write a file or folder to the disk. Only then does a rename in the folder survive a power cut."""
-    file = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
