@@ -1,6 +1,6 @@
 """Measure to which side a recorded car turns for positive steering, from what its camera shows.
 
-    print(measure_recorded("episodes/episode_20260101_120000").words())
+    print(measure_turning("episode_20260101_120000", steering, samples).words())
 
 When a car turns right, the background moves to the left. So steering is correlated with the horizontal shift of the
 pictures' upper part between frames (OpenCV's optical flow, the median of the points that are found again both ways).
@@ -12,15 +12,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.picture import read_jpeg
-from rover_lib.onboard.errors import CameraError, EpisodeError
-from rover_lib.onboard.recording.episode import DATA, json_controls, no_pulse, number_of
+from rover_lib.onboard.errors import EpisodeError
 
 WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
 STEP = 2  # frames from one examined picture to the next
@@ -41,19 +38,6 @@ class Shot(Protocol):
     @property
     def row(self) -> int: ...
     def frame_bgr(self) -> np.ndarray: ...
-
-
-@dataclass(frozen=True)
-class _File:
-    time_s: float
-    row: int
-    path: Path
-
-    def frame_bgr(self) -> np.ndarray:
-        try:
-            return read_jpeg(self.path)
-        except (OSError, CameraError) as e:
-            raise EpisodeError(f"{self.path}: cannot be read ({e})") from None
 
 
 @dataclass(frozen=True)
@@ -82,27 +66,6 @@ class Turning:
             return f"{self.episode}: too few pictures that move to tell which way it steers"
         how = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
         return f"{self.episode}: " + (f"positive steering is {self.side} ({how})" if self.side else f"not sure ({how})")
-
-
-def measure_recorded(folder: Path | str) -> Turning:
-    """Measure a drive that this project's recorder wrote, or the newest one in a folder of them.
-
-    Raises EpisodeError if there are no two controls and pictures.
-    """
-    folder = max((p for p in Path(folder).glob("episode_*") if p.is_dir()), default=Path(folder))
-    data, controls, shots = folder / DATA, [], []
-    for row in json_controls(data):
-        found = [number_of(row.get(name)) for name in ("system_timestamp", "steering_normalized")]
-        if not no_pulse(row, "steering") and all(v is not None and math.isfinite(v) for v in found):
-            controls.append(found)
-    for i, row in enumerate(json_controls(data, "frame_samples")):
-        path = (folder / str(row.get("image_path"))).resolve()
-        if (at_s := number_of(row.get("timestamp"))) is not None and path.is_relative_to(folder.resolve()):
-            shots.append(_File(at_s, i, path))
-    if len(controls) < 2 or len(shots) < 2:
-        raise EpisodeError(f"{folder}: no drive to measure", remedy="rover record --max-seconds 60 episodes, and drive")
-    times_s, steering = np.array(controls, np.float64).T
-    return measure_turning(folder.name, np.interp([s.time_s for s in shots], times_s, steering), shots)
 
 
 def measure_turning(name: str, steering: np.ndarray, samples: Sequence[Shot]) -> Turning:
