@@ -4,7 +4,6 @@ python -m lerobot_robot_rover runs/mine/policy_static.pt mine
 lerobot-record --policy.path=mine ...
 """
 
-import tempfile
 from pathlib import Path
 
 import click
@@ -12,28 +11,22 @@ import click
 from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
 from lerobot_robot_rover.modeling_rover_artifact import RoverArtifactPolicy
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
-from rover_lib.onboard.errors import ParamsError, RoverError
+from rover_lib.onboard.errors import RoverError
 
 
 def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
     """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
 
-    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, ParamsError for a folder
-    that exists. The folder appears complete, or not at all.
+    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, FileExistsError for a
+    folder that exists.
     """
-    folder = Path(folder)
-    if folder.exists():
-        raise ParamsError(f"{folder}: is there already", remedy="name a new folder")
     config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
     policy = RoverArtifactPolicy(config)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
-        new = Path(temporary) / folder.name
-        policy.save_pretrained(new)
-        for pipeline in make_rover_artifact_pre_post_processors(config):
-            pipeline.save_pretrained(new)
-        new.rename(folder)
-    return folder
+    Path(folder).mkdir(parents=True)
+    policy.save_pretrained(folder)
+    for pipeline in make_rover_artifact_pre_post_processors(config):
+        pipeline.save_pretrained(folder)
+    return Path(folder)
 
 
 @click.command()

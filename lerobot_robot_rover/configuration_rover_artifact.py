@@ -34,26 +34,20 @@ class RoverArtifactConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.n_action_steps < 1 or (self.threads is not None and self.threads < 1):
-            raise ParamsError(
-                "a policy needs n_action_steps and threads from 1", found=f"{self.n_action_steps} and {self.threads}"
-            )
+            found = f"{self.n_action_steps} and {self.threads}"
+            raise ParamsError("a policy needs n_action_steps and threads from 1", found=found)
 
     @property
     def file(self) -> Path:
-        """The artifact's file. Raises ParamsError if none was named, or if it does not exist."""
-        if not self.artifact:
-            raise ParamsError(
-                "no artifact is named", remedy="--policy.artifact=runs/mine/policy_static.pt, or a packed --policy.path"
-            )
-        named = Path(self.artifact)
-        places = [Path(self.pretrained_path) / named, named] if self.pretrained_path else [named]
+        """The artifact's file. Raises ParamsError if it does not exist."""
+        places = [Path(self.pretrained_path or "") / self.artifact, Path(self.artifact)]
         for place in places:
             if place.is_file():
                 return place
-        raise ParamsError(f"{self.artifact}: not found", remedy="name a policy_<mode>.pt of a run")
+        remedy = "--policy.artifact=runs/mine/policy_static.pt, or a packed --policy.path"
+        raise ParamsError("the artifact is not there", found=repr(self.artifact), remedy=remedy)
 
     def get_optimizer_preset(self) -> OptimizerConfig:
-        """Raise PolicyError: nothing in an artifact can be trained."""
         raise not_trained()
 
     def get_scheduler_preset(self) -> None:

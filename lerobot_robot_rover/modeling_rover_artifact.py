@@ -115,9 +115,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
         """Write the artifact and a config that names it, and says what it sees and gives."""
-        file, manifest = self.config.file, self._process.manifest
-        inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
-        for c in manifest["cameras"]:
+        file, inputs = self.config.file, {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
+        for c in self._process.manifest["cameras"]:
             inputs[f"{OBS_IMAGES}.{c['name']}"] = PolicyFeature(FeatureType.VISUAL, (3, c["height"], c["width"]))
         outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (2,))}
         shutil.copyfile(file, save_directory / file.name)
@@ -129,33 +128,23 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         cameras = [camera["name"] for camera in manifest["cameras"]]
         names = manifest["state_names"], manifest["action_names"]
         if names != ([*ACTIONS], [*ACTIONS]) or len(cameras) != 1:
-            raise PolicyError(
-                "the rover has one camera, and steering and throttle as state and actions",
-                found=f"an artifact of {cameras}, {names[0]} and {names[1]}",
-            )
+            what = "the rover has one camera, and steering and throttle as state and actions"
+            raise PolicyError(what, found=f"an artifact of {cameras}, {names[0]} and {names[1]}")
         self._camera = cameras[0]
         rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), _stop_s()
         if self.config.n_action_steps > (most := min(chunk, int(stop_s * rate_hz))):
-            raise ParamsError(
-                f"n_action_steps may be {most} at most: `rover drive` stops by a plan of {stop_s:g} s",
-                found=self.config.n_action_steps,
-            )
+            what = f"n_action_steps may be {most} at most: `rover drive` stops by a plan of {stop_s:g} s"
+            raise ParamsError(what, found=self.config.n_action_steps)
         if sentence := another_car(manifest, this_car()):
             _log.warning(sentence)
         for asks, option in ((find_rollout(), "--fps"), (dataset_meta, "--dataset.fps")):
             if asks is not None and asks.fps != rate_hz:
                 remedy = f"{option}={rate_hz:g}"
                 raise PolicyError(f"this artifact's actions are {rate_hz:g} a second", found=asks.fps, remedy=remedy)
-        if dataset_meta is None:
-            return
-        pictures = sorted(name for name in dataset_meta.features if name.startswith(OBS_IMAGES))
-        if f"{OBS_IMAGES}.{self._camera}" not in pictures:
-            without = "--dataset.video=true: LeRobot records no pictures otherwise"
-            raise PolicyError(
-                f"this artifact looks through {self._camera}",
-                found=f"a dataset of {pictures or 'no pictures'}",
-                remedy=f"--robot.camera_name={self._camera}" if pictures else without,
-            )
+        pictures = sorted(n for n in dataset_meta.features if n.startswith(OBS_IMAGES)) if dataset_meta else []
+        if dataset_meta and f"{OBS_IMAGES}.{self._camera}" not in pictures:
+            remedy = f"--robot.camera_name={self._camera} --dataset.video=true"
+            raise PolicyError(f"this artifact looks through {self._camera}", found=pictures, remedy=remedy)
 
 
 def _stop_s() -> float:

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
@@ -26,21 +27,16 @@ HOLD_S = 0.1
 ARMED_S = 3.0  # the answers to the cap and to arming, 0.5 s each, and time for a busy machine
 
 
+Clock = Callable[[], float]
+
+
 class Ride:
     """One drive, from arming to neutral. For one thread beside its own.
 
     Use it once: begin(), then put() at least every HOLD_S, then end().
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        link: ServoLink,
-        settings: Settings,
-        log: Log,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-    ):
+    def __init__(self, camera: Camera, link: ServoLink, settings: Settings, log: Log, clock: Clock = time.monotonic):
         self._camera, self._link, self._settings, self._log, self._clock = camera, link, settings, log, clock
         self._sight = Sight(camera, settings)
         self._action = (0.0, 0.0)
@@ -75,10 +71,8 @@ class Ride:
         if self.over:
             self.check()
             late_ms = (self._clock() - self._given_s) * 1e3
-            raise DriveFault(
-                f"LeRobot's loop gave no action for {late_ms:.0f} ms, and after {HOLD_S * 1e3:g} the car was stopped",
-                remedy="is the policy too slow for it? `rover drive` plans while it drives",
-            )
+            what = f"LeRobot's loop gave no action for {late_ms:.0f} ms, and after {HOLD_S * 1e3:g} the car was stopped"
+            raise DriveFault(what, remedy="is the policy too slow for it? `rover drive` plans while it drives")
         self._action, self._given_s = (steering, throttle), self._clock()
 
     def check(self) -> None:
@@ -105,8 +99,7 @@ class Ride:
         if frame:
             self._sight.watch(frame, now_s)
         steering, throttle = self._action
-        pulses = self._link.calibration.pulses(steering, throttle)
-        number = frame.number if frame else 0
+        pulses, number = self._link.calibration.pulses(steering, throttle), frame.number if frame else 0
         return Order(steering, throttle, pulses.steering_us, pulses.throttle_us, frame=number)
 
     def sent(self, at_s: float, order: Order) -> None:
@@ -127,17 +120,10 @@ class Ride:
     def _run(self) -> None:
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
+        until, hooks = Until(stop=self._stop, over=self._late), Hooks(self._arm, HealthWatch(self.report, self._link))
+        given: dict[str, Any] = {"rate_hz": RATE_HZ, "report": self.report, "clock": self._clock}
         try:
-            drive(
-                self,
-                self._link,
-                self._log,
-                rate_hz=RATE_HZ,
-                until=Until(stop=self._stop, over=self._late),
-                hooks=Hooks(self._arm, HealthWatch(self.report, self._link)),
-                report=self.report,
-                clock=self._clock,
-            )
+            drive(self, self._link, self._log, until=until, hooks=hooks, **given)
         except BaseException as error:  # of any kind: LeRobot's loop must learn of it
             self._error = error
         finally:

@@ -24,6 +24,8 @@ def find_rollout() -> Any:
 def check_rollout(config: Any) -> None:
     """Raise ParamsError for what a car cannot take, with all options that must be given. config: of find_rollout."""
     strategy, options = config.strategy, []
+    if type(strategy).__name__ == DAGGER:  # its pause repeats an action, by which a car drives on
+        raise ParamsError("DAgger's pause would drive a car on", remedy="record takeovers: rover drive --record")
     if config.interpolation_multiplier != 1:  # the robot waits for a new picture each time: a plan would last longer
         options.append("--interpolation_multiplier=1")
     if config.teleop is not None and getattr(strategy, "smooth_handover", False):  # drives from one action to another
@@ -31,7 +33,5 @@ def check_rollout(config: Any) -> None:
     if config.teleop is None and getattr(strategy, "reset_to_initial_position", False):
         options.append("--strategy.reset_to_initial_position=false")
     if options:
-        raise ParamsError(
-            "lerobot-rollout would move this car as it moves an arm, between positions that a car does not have",
-            remedy=" ".join(options),
-        )
+        what = "lerobot-rollout would move this car as an arm, between positions that a car does not have"
+        raise ParamsError(what, remedy=" ".join(options))

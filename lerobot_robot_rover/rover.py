@@ -3,7 +3,6 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from lerobot_robot_rover.line import ACTIONS, CarPart, line_to, named, unnamed
 from lerobot_robot_rover.ride import RATE_HZ, Ride
-from lerobot_robot_rover.rollout import DAGGER, check_rollout, find_rollout
+from lerobot_robot_rover.rollout import check_rollout, find_rollout
 from rover_lib.onboard.car.camera import Camera, check_shape, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime, default_log
@@ -28,7 +27,7 @@ from rover_lib.onboard.drive.opening import check_no_film
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.drive.watch import find_unfinished_drive
-from rover_lib.onboard.errors import CameraError, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.errors import CameraError, PolicyError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 
@@ -36,7 +35,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 @RobotConfig.register_subclass("rover")
 @dataclass(kw_only=True)
 class RoverConfig(RobotConfig):
-    """The rover's settings in LeRobot. Raises ParamsError for impossible values.
+    """The rover's settings in LeRobot.
 
     port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder, FIFO or .mjpeg of JPEGs. camera_name:
     the picture is `observation.images.<camera_name>` in the dataset. width, height: size of the pictures that LeRobot
@@ -52,13 +51,6 @@ class RoverConfig(RobotConfig):
     throttle_limit: float | None = None
     film: bool = False
     log: Path | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.width < 1 or self.height < 1:
-            raise ParamsError("a picture has a width and a height from 1", found=f"{self.width} and {self.height}")
-        if not self.camera_name.isidentifier():
-            raise ParamsError("camera_name must be a name, such as cam_front", found=repr(self.camera_name))
 
 
 class Rover(CarPart, Robot):
@@ -101,9 +93,6 @@ class Rover(CarPart, Robot):
             raise DeviceAlreadyConnectedError(f"the rover at {self.config.port} is connected already")
         if rollout := find_rollout():
             check_rollout(rollout)
-        self._dagger = rollout.strategy if type(getattr(rollout, "strategy", None)).__name__ == DAGGER else None
-        self._given: dict[str, Any] | None = None
-        self._humans = False
         if not self.config.film:
             check_no_film(self.config.camera)
         with ExitStack() as stack:
@@ -132,11 +121,11 @@ class Rover(CarPart, Robot):
 
         Both are neutral before the first action. Waits for a picture that LeRobot has not seen. If the car is not
         armed, it first waits for the human's gesture, as connect() does. Raises CameraError for a camera that stopped,
-        froze or shows nothing, LinkError if the link is gone, and DriveFault or TakenOver if that ended the drive.
+        froze or shows nothing, LinkError if the link is gone, and DriveFault if that ended the drive.
         """
         self._check_connected()
         if self._ride:
-            self._unless_taken_over(self._ride.check)
+            self._ride.check()
         if self._ride and self._ride.over:
             self._end_ride()
             self._action = NEUTRAL
@@ -160,19 +149,10 @@ class Rover(CarPart, Robot):
         action: finite steering and throttle, at most 0.25 beyond an end of their range. They are clipped to it, and the
         throttle of an action that is sent also to the limit. Raises PolicyError for other actions, LinkError if arming
         is refused, and what ended the drive.
-
-        In DAgger, LeRobot "holds the position" in a pause by giving one and the same action again and again. A car that
-        did so would drive on: it is put in neutral and disarmed, until there is a new one.
         """
         self._check_connected()
         steering, throttle = self._valid(action)
-        paused, self._given = bool(self._dagger) and action is self._given, action
-        self._humans &= not paused
-        if paused or self._humans:
-            self._end_ride()
-            self._line.take_humans_action()
-            steering, throttle = NEUTRAL
-        elif self._line.take_humans_action():
+        if self._line.take_humans_action():
             self._end_ride()
             self._sight.sent(time.monotonic(), throttle)
         else:
@@ -206,36 +186,31 @@ class Rover(CarPart, Robot):
         arm_when_ready(lambda: None, self._link, threading.Event(), self._log.event, [self._camera.latest])
 
     def _next_frame(self):
-        newest = self._camera.latest()
-        after = self._seen
+        newest, after = self._camera.latest(), self._seen
         if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody asked for a while
             after = max(after, newest.number)
-        frame = self._camera.wait(after, LATE_FRAME_S)
-        if frame is None:
-            raise CameraError(
-                f"{self.config.camera}: no new frame for {LATE_FRAME_S:g} s", remedy="is the camera plugged in?"
-            )
-        return frame
+        if frame := self._camera.wait(after, LATE_FRAME_S):
+            return frame
+        what = f"{self.config.camera}: no new frame for {LATE_FRAME_S:g} s"
+        raise CameraError(what, remedy="is the camera plugged in?")
 
     def _valid(self, action: dict[str, Any]) -> tuple[float, float]:
         """Return steering and throttle, checked and clipped as at the last boundary of `rover drive`."""
         action = unnamed(action)
-        if set(action) != set(ACTIONS):
-            raise PolicyError("an action of the rover is steering and throttle", found=sorted(map(str, action)))
         try:
-            values = np.array([[float(action[name]) for name in ACTIONS]])
-        except (TypeError, ValueError, OverflowError):
-            raise PolicyError("an action must be of numbers", found=repr(action)[:80]) from None
+            values = np.array([[float(action.pop(name)) for name in ACTIONS]])
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise PolicyError("an action needs numbers as steering and throttle", found=repr(action)[:80]) from None
+        if action:
+            raise PolicyError("an action of the rover is steering and throttle alone", found=sorted(map(str, action)))
         steering, throttle = Plan(0, 0.0, 0.0, values, self._link.car.limits).actions[0].tolist()
         return steering, throttle
 
     def _driven(self, steering: float, throttle: float) -> tuple[float, float]:
         """Drive by an action, and return what was sent: neutral if its picture was too old."""
-        if ride := self._ride:
-            self._unless_taken_over(lambda: ride.put(steering, throttle))
-            return (steering, throttle) if self._ride else NEUTRAL
-        if self._dagger:  # between a human's correction and the policy
-            self._wait_for_human()
+        if self._ride:
+            self._ride.put(steering, throttle)
+            return steering, throttle
         self._camera.latest()  # raises if it failed
         age_s = max(time.monotonic() - self._captured_s, boottime() - self._looked_s)
         if age_s > self.settings.stop_s:
@@ -248,21 +223,6 @@ class Rover(CarPart, Robot):
             self._end_ride()
             raise
         return steering, throttle
-
-    def _unless_taken_over(self, check: Callable[[], None]) -> None:
-        """Call check(), which may raise what ended the drive.
-
-        In DAgger a takeover ends only the drive if LeRobot records nothing but corrections: then the human has the car,
-        presses its keys for a pause and a correction, and drives on.
-        """
-        try:
-            check()
-        except TakenOver as error:
-            if self._dagger is None or self._dagger.record_autonomous:
-                raise
-            self._log.event(f"{error}; to record a correction, press LeRobot's keys for a pause and for a correction")
-            self._end_ride()
-            self._humans = True
 
     def _end_ride(self) -> None:
         ride, self._ride = self._ride, None

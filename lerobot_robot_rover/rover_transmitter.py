@@ -12,7 +12,6 @@ from lerobot_robot_rover.line import CarPart, line_to, named
 from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.service import CHECK_S
-from rover_lib.onboard.errors import ParamsError
 
 WITHHELD_S = 0.5  # far longer than until a status shows a moved stick
 
@@ -25,10 +24,6 @@ class RoverTransmitterConfig(TeleoperatorConfig):
     """port: of the Arduino, the same as the robot's."""
 
     port: str = "/dev/ttyUSB0"
-
-    def __post_init__(self) -> None:
-        if not self.port:
-            raise ParamsError("the transmitter needs a port, the robot's", found=repr(self.port))
 
 
 class RoverTransmitter(CarPart, Teleoperator):
@@ -86,10 +81,8 @@ class RoverTransmitter(CarPart, Teleoperator):
         sticks = _sticks(telemetry)
         actions = link.calibration.actions_from_pulses(*sticks) if sticks else None
         if telemetry is None or actions is None or actions.steering is None or actions.throttle is None:
-            raise LinkError(
-                f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that",
-                remedy=f"{link.remedy('s')} and record this episode again; those before it are kept",
-            )
+            what = f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that"
+            raise LinkError(what, remedy=f"{link.remedy('s')} and record this episode again; those before it are kept")
         self._check_passed_on(telemetry, link.calibration.throttle)
         self._line.humans_action = True
         return named(actions.steering, actions.throttle)
@@ -120,10 +113,8 @@ class RoverTransmitter(CarPart, Teleoperator):
             return
         self._withheld_s = telemetry.host_s if self._withheld_s is None else self._withheld_s
         if telemetry.host_s - self._withheld_s > WITHHELD_S:
-            raise LinkError(
-                f"{self.config.port}: the car does not get the stick's throttle, which was not at rest yet",
-                remedy=f"{MISSING['t']}, then drive",
-            )
+            what = f"{self.config.port}: the car does not get the stick's throttle, which was not at rest yet"
+            raise LinkError(what, remedy=f"{MISSING['t']}, then drive")
 
 
 def _sticks(telemetry: Telemetry | None) -> tuple[int, int, int, int] | None:

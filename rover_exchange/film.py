@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from rover_exchange.moments import PERIOD_MS, Moment, moments_of
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.drive.flight_log import Flight
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CameraError, RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.onboard.view.path_overlay import CarShape
 from rover_lib.workshop.progress import Progress, silent
@@ -47,7 +47,7 @@ def write_film(path: Path, flight: Flight, episode: Path | None = None, progress
     """Write a film of a drive at its own pace, and return how many pictures it has.
 
     path: .mp4 or .webp. episode: the one recorded with the drive; None takes the one that the log names. Raises
-    RoverError for another kind of file, or if every picture of the drive is damaged; LogError and EpisodeError as
+    RoverError for another kind of file, or if every picture of the drive is damaged; RoverError and EpisodeError as
     moments_of.
     """
     if path.suffix not in FORMATS:
@@ -82,7 +82,7 @@ def _pictures(flight: Flight, moments: list[Moment], form: Format, progress: Pro
         moment = moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
         try:
             frame = read_jpeg(moment.frame)
-        except (OSError, PictureError):
+        except (OSError, CameraError):
             continue
         picture = draw_moment(moment, frame, flight.car, step_s)
         height = height or round(form.width * picture.shape[0] / picture.shape[1] / 2) * 2

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from rover_exchange.moments import began_s, find_recording, pictures_of
-from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.drive.flight_log import Flight, Tick
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS, DRIVERS, json_controls, number_of
 from rover_lib.onboard.stage import atomic_path, plain
 
@@ -47,7 +47,7 @@ def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[
     """Write a drive as MCAP, in order of time, and return how many messages each topic has, without the empty ones.
 
     episode: the one that was recorded with the drive; None takes the one that the log names, if it is there. A picture
-    that is damaged is left out. Raises LogError if the log does not say when it began, and EpisodeError if the
+    that is damaged is left out. Raises RoverError if the log does not say when it began, and EpisodeError if the
     episode's list of pictures cannot be read.
     """
     from mcap.writer import Writer  # imported here, so that only this export needs it
@@ -112,7 +112,7 @@ def _image(at_ns: int, file: Path) -> dict[str, Any] | None:
     try:
         read_jpeg(file)
         data = file.read_bytes()
-    except (OSError, PictureError):
+    except (OSError, CameraError):
         return None
     return {"timestamp": _time(at_ns), "frame_id": "camera", "format": "jpeg", "data": base64.b64encode(data).decode()}
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.drive.flight_log import Flight, LogError, Tick
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.drive.flight_log import Flight, Tick
+from rover_lib.onboard.errors import EpisodeError, RoverError
 from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.onboard.stage import plain, read_plain
 
@@ -46,13 +46,13 @@ class Moment:
 def moments_of(flight: Flight, episode: Path | None = None) -> list[Moment]:
     """Return a moment for each picture of a drive, at least one, in order of time.
 
-    episode: the one recorded with the drive; None takes the one that the log names. Raises LogError if nothing was
+    episode: the one recorded with the drive; None takes the one that the log names. Raises RoverError if nothing was
     driven or the log's header is damaged, and EpisodeError if there are no pictures of this drive.
     """
     ticks = flight.ticks
     t_s, period_ms = ticks["t_s"], flight.period_ms or PERIOD_MS
     if not len(t_s):
-        raise LogError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
+        raise RoverError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
     begin_s = began_s(flight)
     gaps = np.rint(np.diff(t_s * 1000 - ticks["late_ms"]) / period_ms) - 1
     missed = np.concatenate([[0], np.cumsum(gaps.clip(0))])
@@ -89,11 +89,11 @@ def find_recording(flight: Flight) -> Path:
 
 
 def began_s(flight: Flight) -> float:
-    """Return when t_s was 0, in seconds by the system's clock. Raises LogError if the log's header is damaged."""
+    """Return when t_s was 0, in seconds by the system's clock. Raises RoverError if the log's header is damaged."""
     try:
         return datetime.fromisoformat(str(flight.header["start"])).timestamp()
     except (KeyError, ValueError):
-        raise LogError(f"{flight.path}: its start is not known, its header is damaged") from None
+        raise RoverError(f"{flight.path}: its start is not known, its header is damaged") from None
 
 
 def pictures_of(episode: Path) -> list[tuple[float, Path]]:

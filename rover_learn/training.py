@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
+from rover_lib.onboard.stage import private_lock
 from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY, save_torch
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
@@ -198,7 +199,7 @@ class Resumable:
     def __enter__(self) -> "Resumable":
         """Make the folder and lock it. Raises TrainingError if another process trains in it."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(self.folder / "lock", timeout=0)
+        self._lock = private_lock(self.folder / "lock")
         try:
             self._lock.acquire()
         except Timeout:

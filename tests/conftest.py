@@ -174,11 +174,8 @@ def artifacts(made_once, request) -> dict[str, Path]:
         thin, calibration = request.getfixturevalue("thin")
         samples = memory_samples(4, seed=1)
         export(ACT(thin.config, thin.weights), thin, folder / "policy_fp32.pt", samples=samples)
-        for scheme in (
-            Scheme("dynamic"),
-            Scheme("static"),
-            Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")),
-        ):
+        mixed = Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward"))
+        for scheme in (Scheme("dynamic"), Scheme("static"), mixed):
             path = folder / f"policy_{scheme.mode}.pt"
             export(quantize(thin, scheme, calibration), thin, path, samples=samples, calibration=calibration)
 

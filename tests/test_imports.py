@@ -19,21 +19,9 @@ ROOMS = {
     "rover_lib.workshop": ("recordings", "checkpoint", "judge", "int8", "plots", "run"),
 }
 MOST_FILES = 20  # directly in a folder: what has more is no room
-ONBOARD_NEEDS = {
-    "torch",
-    "onnxruntime",
-    "hailo_platform",  # one of Hailo's own packages, which a Pi with its card has
-    "numpy",
-    "cv2",
-    "simplejpeg",
-    "filelock",
-    "serial",
-    "yaml",
-    "systemd_watchdog",
-    "click",
-    "aiohttp",  # of the extra `view`; only view/server.py imports it
-    "rover_lib",
-}
+# hailo_platform is one of Hailo's own packages, which a Pi with its card has; aiohttp is of the extra `view`.
+ONBOARD_NEEDS = {"torch", "onnxruntime", "hailo_platform", "numpy", "cv2", "simplejpeg", "filelock", "serial", "yaml"}
+ONBOARD_NEEDS |= {"systemd_watchdog", "click", "aiohttp", "rover_lib"}
 
 
 @functools.cache

@@ -33,12 +33,9 @@ def rover(*words):
 def lerobot_train(dataset, out, *options, cache, timeout=1800):
     """Run LeRobot's own command offline, in a process of its own. Returns the folder of the last checkpoint."""
     offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
-    words = [
-        *("--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0"),
-        *("--dataset.repo_id=local/mine", f"--dataset.root={dataset}", "--dataset.video_backend=pyav"),
-        *(f"--output_dir={out}", *options),
-    ]
-    command = [BIN / "lerobot-train", *words]
+    words = ["--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0"]
+    words += ["--dataset.repo_id=local/mine", f"--dataset.root={dataset}", "--dataset.video_backend=pyav"]
+    command = [BIN / "lerobot-train", *words, f"--output_dir={out}", *options]
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, env={**os.environ, **offline})
     assert done.returncode == 0, done.stderr[-2000:]
     return out / "checkpoints/last"
@@ -70,10 +67,9 @@ def test_from_recordings_to_a_drive(tmp_path, monkeypatch):
 
 
 def start_of(checkpoint, dataset, folder):
-    """Save a LeRobot policy of the demo's shape, without a VAE, that has the demo's trained backbone and nothing else.
+    """Save a LeRobot policy of the demo's shape, without a VAE, with the demo's backbone, and its processors.
 
     An untrained backbone learns little while its batch norm is frozen, which is why LeRobot downloads a trained one.
-    The processors are saved too, because lerobot-train accepts no --policy.path without them. Returns the folder.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata

@@ -33,9 +33,8 @@ from rover_lib.onboard.artifact.manifest import Artifact, seen_size
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import frame
-from rover_lib.onboard.drive.service import NotArmed
 from rover_lib.onboard.drive.watch import stop_on_signals
-from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError, RoverError, TakenOver
+from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError, RoverError
 
 AT_MS = 3000  # of a fault, when the car has been at speed for a while
 END_MS, WIGGLE_MS, AGAIN_MS, STOP_MS = 5200, 5600, 7000, 8400  # the drive's end, and then another without the fault
@@ -324,7 +323,8 @@ def _exit_code(error: BaseException | None) -> int:
     """Return the exit code of `rover drive` for what ended it, as rover_lib/onboard/cli.py has it."""
     if error is None:
         return 0
-    for kind, code in ((Killed, -9), (NotArmed, 0), (DriveFault, 3), (TakenOver, 4), (RoverError, 1)):
-        if isinstance(error, kind):
-            return code
-    return 3
+    if isinstance(error, Killed):
+        return -9
+    if isinstance(error, RoverError) and not isinstance(error, DriveFault):
+        return 0 if error.kind == "not armed" else 1
+    return 4 if getattr(error, "kind", "") == "taken over" else 3

@@ -14,16 +14,16 @@ from rover_lib.onboard.command import VERSION, Rover
 
 ROVERS = onboard.main.commands
 # What most people need, by what they do; below it all others. inspect, drive, view and log can do more here than there.
-SECTIONS: dict[str, tuple[click.Command, ...]] = {
-    "Prepare a policy": (prepare.run, prepare.inspect, prepare.report, ROVERS["benchmark"], prepare.export),
-    "Drive": (ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive),
-    "Look": (),
-    "Teach": (),
-    "Recordings": (ROVERS["label"],),
-    "A rover's models, and arming it": (ROVERS["release"], ROVERS["arm-car"]),
+SECTIONS: dict[str, list[click.Command]] = {
+    "Prepare a policy": [prepare.run, prepare.inspect, prepare.report, ROVERS["benchmark"], prepare.export],
+    "Drive": [ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive],
+    "Look": [],
+    "Teach": [],
+    "Recordings": [ROVERS["label"]],
+    "A rover's models, and arming it": [ROVERS["release"], ROVERS["arm-car"]],
 }
-# Sections, by the group of entry points that adds to them.
-MORE = {"rover.teach": "Teach", "rover.look": "Look", "rover.recordings": "Recordings"}
+for title in ("Teach", "Look", "Recordings"):
+    SECTIONS[title] += [entry.load() for entry in entry_points(group=f"rover.{title.lower()}")]
 
 
 class Workstation(Rover):
@@ -31,15 +31,9 @@ class Workstation(Rover):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         width = formatter.width - 6 - max(map(len, self.commands))
-        for title, commands in sections().items():
+        for title, commands in SECTIONS.items():
             with formatter.section(title):
                 formatter.write_dl([(str(c.name), c.get_short_help_str(width)) for c in commands])
-
-
-def sections() -> dict[str, tuple[click.Command, ...]]:
-    """Return the commands of SECTIONS with those that entry points add."""
-    added = {MORE[group]: tuple(e.load() for e in entry_points(group=group)) for group in MORE}
-    return {title: (*commands, *added.get(title, ())) for title, commands in SECTIONS.items()}
 
 
 @click.group(
@@ -56,6 +50,5 @@ def main(debug: bool) -> None:
 
 
 cast(click.Group, ROVERS["release"]).add_command(prepare.wheelhouse)
-for commands in sections().values():
-    for command in commands:
-        main.add_command(command)
+for command in (command for commands in SECTIONS.values() for command in commands):
+    main.add_command(command)

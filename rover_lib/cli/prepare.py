@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.command import AS_JSON, FILE, show
+from rover_lib.onboard.command import AS_JSON, FILE, FROM_0, FROM_1, show
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
@@ -28,13 +28,12 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return int(sizes[2]), int(sizes[1])
 
 
+Turned = tuple[tuple[str, str], ...]
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
 ACTION_NAMES = click.option(
-    "--action-names", default="", help="Names of a LeRobotDataset's actions in order, if it has none."
+    "--action-names", default="", help="Of a LeRobotDataset's actions in order, if it has none."
 )
-CAMERA = click.option(
-    "--camera", default="", help="Which cameras of a LeRobotDataset the policy uses, separated by commas."
-)
+CAMERA = click.option("--camera", default="", help="A LeRobotDataset's cameras that the policy uses, with commas.")
 
 
 def with_source(command: Callable[..., None]) -> Callable[..., None]:
@@ -58,20 +57,12 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @CAMERA
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--samples", type=click.IntRange(min=1), help="Calibration samples [default: params.yml].")
-@click.option("--worlds", type=click.IntRange(min=0), default=0, show_default=True, help="Balloon worlds to drive in.")
-@click.option("--iterations", type=click.IntRange(min=1), help="Timed inferences per mode [default: params.yml].")
+@click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")
+@click.option("--worlds", type=FROM_0, default=0, show_default=True, help="Balloon worlds to drive in.")
+@click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].")
 @click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
 @click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
-def run(
-    checkpoint: Path | None,
-    episodes: Path | None,
-    name: str,
-    runs_dir: Path,
-    turned: tuple[tuple[str, str], ...],
-    only: str | None,
-    **options: Any,
-) -> None:
+def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
     EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; give a dataset on the
@@ -90,18 +81,16 @@ def run(
     from rover_lib.workshop.run.run_folder import run_folder
 
     given = _values_of(turned)
-    if only:
-        if checkpoint or episodes:
-            raise click.UsageError("--only works on a run that is there: give its --name, no CHECKPOINT and EPISODES")
-        folder = run_folder(runs_dir, name, RoverError)
+    if only and not (checkpoint or episodes):
+        folder = run_folder(options["runs_dir"], options["name"], RoverError)
         return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
-    if not (checkpoint and episodes):
+    if only or not (checkpoint and episodes):
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
     given = {k: v for k, v in options.items() if v is not None} | given
-    _judge(run_notebooks(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **given))
+    _judge(run_notebooks(checkpoint, episodes, progress=terminal_bar(), **given))
 
 
-def _values_of(turned: tuple[tuple[str, str], ...]) -> dict[str, Any]:
+def _values_of(turned: Turned) -> dict[str, Any]:
     import yaml
 
     try:
@@ -150,9 +139,7 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
-@click.option(
-    "--samples", type=click.IntRange(min=1), default=1024, show_default=True, help="Frames to calibrate the kit with."
-)
+@click.option("--samples", type=FROM_1, default=1024, show_default=True, help="Frames to calibrate the kit with.")
 def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int) -> None:
     """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 

@@ -21,10 +21,12 @@ from rover_lib.onboard.command import (
     AS_JSON,
     CAMERA,
     FILE,
+    FROM_0,
+    FROM_1,
     LOG_DRIVE,
     MOST_THREADS,
     PORT,
-    SECONDS,
+    POSITIVE,
     VERSION,
     Rover,
     show,
@@ -33,6 +35,8 @@ from rover_lib.onboard.command import (
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
+ALLOWED = click.Choice(["mode", "chunk", "camera", "aspect"])
+LOG = Output("flight log", appended=True)
 BUSY = 0.5  # load per core in the last minute; above it, times are only rough
 
 
@@ -43,11 +47,14 @@ def main(debug: bool) -> None:
     """Drive a car with a learned policy. These commands work on the rover; on a workstation, `rover` has more."""
 
 
-def _check_json_file(_: click.Context, __: click.Parameter, file: Any) -> Any:
-    """Return the file. Raises RoverError if another of the user's files would be lost by writing it."""
-    if file and file.name != "-":
-        check_output(Path(file.name), None, appended=True)
-    return file
+def notify(text: str) -> None:
+    """Tell the human something, on standard error."""
+    click.echo(text, err=True)
+
+
+def ask(text: str) -> None:
+    """Ask the human to do something, and wait until Enter says that it is done."""
+    click.prompt(text + " Enter", "", show_default=False, err=True)
 
 
 drive_options = with_options(  # on the rover and in the balloon world
@@ -58,35 +65,25 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--dry-run", is_flag=True, help="Use no Arduino; only log what would be sent."),
     click.option("--record", type=FILE, help="Write the drive as an episode into this folder."),
     click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
-    click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive."),
-    click.option("--ticks", type=click.IntRange(min=1), help="End after this number of commands."),
+    click.option("--max-seconds", type=POSITIVE, help="Longest duration of the drive."),
+    click.option("--ticks", type=FROM_1, help="End after this number of commands."),
     click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
     click.option(
-        "--blend-ticks",
-        type=click.IntRange(min=0),
-        help="Commands over which a new plan replaces the old one [default: params.yml].",
+        "--blend-ticks", type=FROM_0, help="Commands over which a plan replaces another [default: params.yml]."
     ),
     click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
+    click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option(
-        "--threads", type=click.IntRange(1, MOST_THREADS), help="Threads of the policy [default: all cores but one]."
-    ),
-    click.option(
-        "--log",
-        "log_file",
-        type=Output("flight log", appended=True),
-        help="Flight log [default: rover/flight.log in the user's state folder].",
+        "--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in the user's state folder]."
     ),
     click.option(
         "--json",
         "json_file",
-        type=click.File("w", lazy=True),
-        callback=_check_json_file,
+        type=Output(appended=True),
         help="Write a summary of the drive to this file; - prints it.",
     ),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
-    click.option(
-        "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
-    ),
+    click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
 
@@ -104,7 +101,7 @@ def drive(ctx: click.Context, **options: Any) -> None:
     ctx.exit(run_drive(**options))
 
 
-def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
+def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     """Drive by DriveOptions, print or write the summary, and return the exit code. car: see drive_car()."""
     from rover_lib.onboard.car.host import boottime
 
@@ -112,8 +109,7 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     from rover_lib.onboard.drive.drive import drive_car
     from rover_lib.onboard.drive.loop import Report
     from rover_lib.onboard.drive.opening import DriveOptions
-    from rover_lib.onboard.drive.service import NotArmed
-    from rover_lib.onboard.errors import DriveFault, TakenOver
+    from rover_lib.onboard.errors import DriveFault
 
     o = DriveOptions(**options, asked_s=asked_s)
     if o.service and o.dry_run:
@@ -123,20 +119,20 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
     report, code = Report(), 0
     try:
         drive_car(o, report, car)
-    except NotArmed as e:
-        click.echo(f"rover: {e}", err=True)
-    except (DriveFault, TakenOver) as e:
-        click.echo(f"rover: {e}", err=True)
-        code = 4 if isinstance(e, TakenOver) else 3
+    except RoverError as e:
+        if not (isinstance(e, DriveFault) or e.kind == "not armed" or report.ticks):
+            raise
+        notify(f"rover: {e}")
+        code = {"not armed": 0, "taken over": 4}.get(e.kind, 3)
     except Exception:  # whatever ended a drive, the summary of what was driven is still written
         if not report.ticks:
             raise
         traceback.print_exc()  # a defect of this program, which has stopped the car too
         code = 3
-    if json_file:
-        json_file.write(json.dumps(report.summary(), indent=2) + "\n")
+    if json_file and json_file != Path("-"):
+        json_file.write_text(json.dumps(report.summary(), indent=2) + "\n")
     else:
-        show(report.summary(), False)
+        show(report.summary(), bool(json_file))
     return code
 
 
@@ -145,15 +141,9 @@ def run_drive(json_file: Any, car: Any = None, **options: Any) -> int:
 @CAMERA
 @PORT
 @click.option("--hz", type=Number(5, 50), default=30.0, show_default=True, help="Controls and frames a second.")
-@click.option("--max-seconds", type=SECONDS, help="Longest duration of an episode.")
+@click.option("--max-seconds", type=POSITIVE, help="Longest duration of an episode.")
 @click.option("--label", default="", help='What the episodes show, such as "hit red balloon".')
-@click.option(
-    "--episodes",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="Episodes to record, one after another.",
-)
+@click.option("--episodes", type=FROM_1, default=1, show_default=True, help="How many, one after another.")
 @click.option("--finish", is_flag=True, help="Only make episodes of what killed recordings have left in OUT_DIR.")
 @click.pass_context
 def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **options: Any) -> None:
@@ -172,17 +162,14 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
                 click.echo(f"finished: {finish_killed(part) or 'nothing, it was killed before its first row'}")
             except RoverError as error:  # the others are finished all the same
                 failed = True
-                click.echo(f"rover: {error}", err=True)
+                notify(f"rover: {error}")
         if not parts:
             click.echo(f"{out_dir}: nothing to finish")
         ctx.exit(1 if failed else 0)
-    fault = None
-    for report in record_episodes(
-        folder=out_dir, rate_hz=hz, status=sys.stderr, notify=lambda text: click.echo(text, err=True), **options
-    ):
+    options |= {"rate_hz": hz, "status": sys.stderr, "notify": notify}
+    for report in record_episodes(folder=out_dir, **options):
         click.echo(str(report))
-        fault = report.fault
-    ctx.exit(1 if fault else 0)
+    ctx.exit(1 if report.fault else 0)
 
 
 @main.command("label", short_help="Note whether recorded drives hit or missed.")
@@ -206,7 +193,6 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 @PORT
 @click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Required frames per second.")
 @click.option("--receiver", is_flag=True, help="Only test the receiver, with a human at the transmitter.")
-@click.option("--recording", type=PathTo("recordings"), help="A recorded minute: does it steer as car.yml says?")
 @AS_JSON
 @click.pass_context
 def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
@@ -219,7 +205,7 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bo
     from rover_lib.onboard.care import doctor as checking
 
     if receiver:
-        found = checking.receiver(port, lambda text: click.prompt(text + " Enter", "", show_default=False, err=True))
+        found = checking.receiver(port, ask)
     else:
         found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
     checks = []
@@ -231,7 +217,7 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bo
     if as_json:
         show({"drives": not failed, "checks": [vars(c) for c in checks]}, as_json)
     elif failed:
-        click.echo(f"rover: this car would not drive: {', '.join(failed)}", err=True)
+        notify(f"rover: this car would not drive: {', '.join(failed)}")
     ctx.exit(1 if failed else 0)
 
 
@@ -239,14 +225,10 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bo
 @PORT
 @click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
 @click.option("--name", default="my car", show_default=True, help="What to call the car.")
-@click.option(
-    "--field-of-view-deg", type=float, help="The camera's horizontal field of view [default: the balloon world's]."
-)
+@click.option("--field-of-view-deg", type=float, help="The camera's, horizontally [default: the balloon world's].")
 @click.option("--wheelbase-m", type=float, help="Distance between the axles [default: the balloon world's].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-def calibrate(
-    port: str, output: Path | None, name: str, field_of_view_deg: float | None, wheelbase_m: float | None, force: bool
-) -> None:
+def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, force: bool, **more: Any) -> None:
     """Guide a human with the transmitter through both sticks, measure the pulses, and write them as car.yml.
 
     Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
@@ -260,27 +242,20 @@ def calibrate(
     path = output or default_place()
     refuse_existing(path, force)
     check_output(path, None)
-    more: dict[str, Any] = {"name": name}
+    more = {key: value for key, value in more.items() if value is not None}
     with contextlib.suppress(CarError):  # measured again, its actions must mean what they meant
         more["positive"] = read_car(path).positive
     if field_of_view_deg is not None:
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
-    if wheelbase_m is not None:
-        more["wheelbase_m"] = wheelbase_m
     with ServoLink(port, car=Car()) as link:
-        car = measure(
-            link,
-            lambda text: click.prompt(text + " Enter", "", show_default=False, err=True),
-            notify=lambda text: click.echo(text, err=True),
-            **more,
-        )
+        car = measure(link, ask, notify=notify, **more)
         # The Arduino still has the last one that was tried. It may refuse this one while the throttle's stick is off
         # that one's rest; the next command that opens the port tells it again.
         with contextlib.suppress(LinkError):
             link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
     write_car(car, path)
-    click.echo(f"rover: written to {path}", err=True)
+    notify(f"rover: written to {path}")
 
 
 @main.command(short_help="Say what an artifact is.")
@@ -302,23 +277,14 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 
 @main.command(short_help="Time artifacts on this machine.")
 @click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
-@click.option("--warmup", type=click.IntRange(min=0), default=10, show_default=True)
-@click.option("--iterations", type=click.IntRange(min=1), default=100, show_default=True)
+@click.option("--warmup", type=FROM_0, default=10, show_default=True)
+@click.option("--iterations", type=FROM_1, default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(0, MOST_THREADS), default=0, show_default=True, help="0: all cores.")
-@click.option("--duration", type=SECONDS, help="Soak for this many seconds instead, with a time series.")
+@click.option("--duration", "duration_s", type=POSITIVE, help="Soak for this many seconds instead, with a time series.")
 @click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
-def benchmark(
-    artifacts: tuple[Path, ...],
-    warmup: int,
-    iterations: int,
-    threads: int,
-    duration: float | None,
-    output: Path | None,
-    gates: bool,
-    as_json: bool,
-) -> None:
+def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_json: bool, **options: Any) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
 
     With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
@@ -333,11 +299,10 @@ def benchmark(
 
     files = distinct_names(artifacts)
     contents = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
-    options: dict[str, Any] = {"warmup": warmup, "iterations": iterations, "threads": threads, "duration_s": duration}
     busy = os.getloadavg()[0] / (os.cpu_count() or 1)
-    metrics = benchmark_artifacts(files, threads or usable_cores(), options)
+    metrics = benchmark_artifacts(files, options["threads"] or usable_cores(), options)
     if busy > BUSY:
-        click.echo(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough", err=True)
+        notify(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough")
     if output:
         write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
     if gates:
@@ -348,7 +313,7 @@ def benchmark(
     machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
     show({k: v for k, v in machine.items() if v is not None}, False)
     if gates and platform.machine() != "aarch64":
-        click.echo(f"These limits are a Pi's, and this is {platform.machine()}: torch's CUDA build alone takes 530 MB.")
+        click.echo("limits apply to a Raspberry Pi: torch's CUDA build alone takes 530 MB")
     for row in metrics.get("gates", []):
         passed = {True: "kept", False: "MISSED", None: "not measured"}[row["passed"]]
         found = row["found"] if isinstance(row["found"], str) else number(row["found"], ".4g")
@@ -357,22 +322,11 @@ def benchmark(
 
 @main.command("arm-car", short_help="Arm the car; its service then drives at once.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
-@click.option(
-    "--model", default="", help="Content hash that the loaded model must have; otherwise the car is not armed."
-)
-@click.option("--max-seconds", type=SECONDS, help="Longest duration of the drive [default: the service's].")
-@click.option("--heartbeat-s", type=SECONDS, help="End the drive when no --heartbeat comes for this long.")
-@click.option(
-    "--wait-s",
-    type=Number(min=0),
-    default=60,
-    show_default=True,
-    help="How long to wait for the human's part of arming.",
-)
+@click.option("--model", default="", help="Content hash of the loaded model, without which the car is not armed.")
+@click.option("--max-seconds", type=POSITIVE, help="Longest duration of the drive [default: the service's].")
+@click.option("--heartbeat-s", type=POSITIVE, help="End the drive when no --heartbeat comes for this long.")
 @click.option("--heartbeat", is_flag=True, help="Only tell the drive that its operator is still there.")
-def arm_car(
-    yes: bool, model: str, max_seconds: float | None, heartbeat_s: float | None, wait_s: float, heartbeat: bool
-) -> None:
+def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
     Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
@@ -385,28 +339,23 @@ def arm_car(
         return click.echo(ask_service(ask="heartbeat")["text"])
 
     def confirm(state: dict[str, Any]) -> None:
+        if yes:
+            return
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    request = Request(max_seconds, heartbeat_s)
-    ask = (lambda state: None) if yes else confirm
-    click.echo(arm(request, model=model, confirm=ask, notify=click.echo, wait_s=wait_s))
+    said = arm(Request(**limits), model=model, confirm=confirm, notify=click.echo)
+    click.echo(said)
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")
 @click.option("--models", type=FILE, default="/var/lib/rover/models", show_default=True, help="The rover's models.")
-@click.option("--chunk", type=click.IntRange(min=1), default=32, show_default=True, help="Actions in a plan.")
+@click.option("--chunk", type=FROM_1, default=32, show_default=True, help="Actions in a plan.")
 @click.option("--camera", default="cam_front", show_default=True, help="The policy's name for this rover's camera.")
-@click.option(
-    "--aspect",
-    type=Number(min=0, min_open=True),
-    default=1.78,
-    show_default=True,
-    help="Width of its pictures divided by their height.",
-)
+@click.option("--aspect", type=POSITIVE, default=1.78, show_default=True, help="Width of a picture by its height.")
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
-def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: float, sandboxed: bool) -> None:
+def release(ctx: click.Context, models: Path, sandboxed: bool, **expected: Any) -> None:
     """Manage the rover's models: stage them, verify them, use them. A switch happens completely or not at all.
 
     `ansible-playbook ansible/deploy.yml` does all of it over a network.
@@ -414,20 +363,14 @@ def release(ctx: click.Context, models: Path, chunk: int, camera: str, aspect: f
     from rover_lib.onboard.artifact.acceptance import Expected
     from rover_lib.onboard.care.release import Releases, check_in_sandbox
 
-    expected = Expected(chunk=chunk, camera=camera, aspect=aspect)
-    ctx.obj = Releases(models, check=check_in_sandbox if sandboxed else None, expected=expected)
+    ctx.obj = Releases(models, check=check_in_sandbox if sandboxed else None, expected=Expected(**expected))
 
 
 @release.command(short_help="Make a release of an artifact without using it.")
 @click.argument("source", type=ARTIFACT)
 @click.option("--sha256", help="The SHA-256 that the artifact must have.")
 @click.option("--origin", help="Where it came from, for `status` [default: this host and path].")
-@click.option(
-    "--allow",
-    multiple=True,
-    type=click.Choice(["mode", "chunk", "camera", "aspect"]),
-    help="Accept an artifact that differs in this.",
-)
+@click.option("--allow", multiple=True, type=ALLOWED, help="Accept an artifact that differs in this.")
 @click.pass_obj
 def stage(releases: Any, source: Path, **options: Any) -> None:
     """Make a release of the artifact SOURCE. The release in use stays in use."""
@@ -436,9 +379,7 @@ def stage(releases: Any, source: Path, **options: Any) -> None:
 
 @release.command(short_help="Verify that a release computes what it should.")
 @click.argument("name", default="current")
-@click.option(
-    "--confined", is_flag=True, help="First drop all rights that an inference does not need, as rover-check@ does."
-)
+@click.option("--confined", is_flag=True, help="First drop all rights that an inference does not need.")
 @click.pass_obj
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
@@ -450,7 +391,7 @@ def verify(releases: Any, name: str, confined: bool) -> None:
         with Artifact(path) as artifact:
             import_engine(artifact)
         if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
-            click.echo(f"rover: not confined: {unconfined}", err=True)
+            notify(f"rover: not confined: {unconfined}")
     releases.check(name)
     click.echo(f"{name}: verified")
 
@@ -471,7 +412,7 @@ def rollback(releases: Any) -> None:
 
 
 @release.command(short_help="Remove all but the latest releases.")
-@click.option("--keep", type=click.IntRange(min=1), default=3, show_default=True)
+@click.option("--keep", type=FROM_1, default=3, show_default=True)
 @click.pass_obj
 def prune(releases: Any, keep: int) -> None:
     """Remove all releases but those used last; never the one in use."""
@@ -489,11 +430,11 @@ def status(releases: Any, as_json: bool) -> None:
         import socket
 
         from rover_lib.onboard.car.host import Host, default_log
-        from rover_lib.onboard.drive.service import ServiceError, state_of
+        from rover_lib.onboard.drive.service import state_of
 
         try:
             report["service"] = state_of()
-        except ServiceError as e:
+        except RoverError as e:
             report["service"] = {"installed": False, "active": "unknown", "state": "", "text": str(e)}
         log = next((p for p in (Path("/var/lib/rover-drive/flight.log"), default_log()) if p.exists()), None)
         report |= {"rover": socket.gethostname(), **Host().reading(), "last_drive_s": log and log.stat().st_mtime}
@@ -507,14 +448,10 @@ def status(releases: Any, as_json: bool) -> None:
 
 view_options = with_options(  # on the rover and on a workstation
     click.option(
-        "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="Port of the page; 0: any."
+        "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any that is free."
     ),
-    click.option(
-        "--interface", default="", help="A network that may open the page too, such as wlan0 [default: none]."
-    ),
-    click.option(
-        "--token-file", type=FILE, help="File with the token that the URL must contain [default: a new token, printed]."
-    ),
+    click.option("--interface", default="", help="A network that may open it too, such as wlan0 [default: none]."),
+    click.option("--token-file", type=FILE, help="File with the token of the URL [default: a new token, printed]."),
     click.option("--feed", type=FILE, help="Socket to which drives connect [default: that of your `rover drive`]."),
     click.option("--drive-user", help="Another user whose drives are shown, besides yours."),
 )
@@ -546,11 +483,12 @@ def open_view(
     whose `ask` gets what is asked for on the page.
     """
     import asyncio
+    import secrets
 
     from rover_lib.onboard.car.host import default_view
-    from rover_lib.onboard.view.server import Address, View, new_token, read_token
+    from rover_lib.onboard.view.server import Address, View, read_token
 
-    token = read_token(token_file) if token_file else new_token()
+    token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
     address, ask = Address(web_port, interface), getattr(shown, "ask", None)
     view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)

@@ -24,7 +24,8 @@ PORT = click.option("--port", default="", help="The Arduino's serial port [defau
 LOG_DRIVE = click.option(
     "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
 )
-SECONDS = Number(min=0, min_open=True)
+POSITIVE = Number(min=0, min_open=True)
+FROM_0, FROM_1 = click.IntRange(min=0), click.IntRange(min=1)
 
 
 class Rover(click.Group):

@@ -9,16 +9,13 @@ needs a part of an error reads that field and never parses the text.
 import errno
 import os
 
+ELSEWHERE = "name another place, or let this user write there (ls -ld shows whose it is)"
 SYSTEM_REMEDIES = {  # what a user can do about an error of the system
     errno.ENOSPC: "make room on that disk (df -h shows it)",
-    errno.EDQUOT: "make room, your quota is used up",
-    errno.EACCES: "name another place, or let this user write there (ls -ld shows whose it is)",
-    errno.EPERM: "name another place, or let this user write there (ls -ld shows whose it is)",
+    errno.EACCES: ELSEWHERE,
+    errno.EPERM: ELSEWHERE,
     errno.EROFS: "name a place on another disk, this one is read-only",
     errno.ENOENT: "is its name right?",
-    errno.EISDIR: "name a file, this is a folder",
-    errno.ENOTDIR: "name a folder, this is a file",
-    errno.EMFILE: "end other programs, or raise `ulimit -n`",
 }
 
 
@@ -26,12 +23,13 @@ class RoverError(Exception):
     """Base of every error that is caused by the input and not by the program.
 
     what: what was wrong, a clause without a full stop. found: what was found instead of what was expected; None if
-    `what` already says it. remedy: what the user can do about it; "" if there is nothing to suggest.
+    `what` already says it. remedy: what the user can do about it; "" if there is nothing to suggest. kind: by which
+    code tells it from others of its class: "not armed", "taken over" (by the human) or "exists".
     """
 
-    def __init__(self, what: str, *, found: object = None, remedy: str = ""):
+    def __init__(self, what: str, *, found: object = None, remedy: str = "", kind: str = ""):
         super().__init__(what)
-        self.what, self.found, self.remedy = what, found, remedy
+        self.what, self.found, self.remedy, self.kind = what, found, remedy, kind
 
     def __str__(self) -> str:
         text = self.what if self.found is None else f"{self.what}, found {self.found}"
@@ -63,10 +61,6 @@ class EpisodeError(RoverError):
     """A recording, or a set of recordings, that cannot be used at all."""
 
 
-class PwmError(RoverError):
-    """A value that must not become a servo pulse."""
-
-
 class ArtifactError(RoverError):
     """A policy file that cannot be made, is damaged or of another format, or cannot run on this machine."""
 
@@ -80,7 +74,7 @@ class ParamsError(RoverError):
 
 
 class CarError(RoverError):
-    """A car.yml that does not describe a car, or describes one that must not be driven."""
+    """A car.yml or a gamepad that must not be driven with, or a value that must not become a servo pulse."""
 
 
 class TrainingError(RoverError):
@@ -88,12 +82,8 @@ class TrainingError(RoverError):
 
 
 class CameraError(RoverError):
-    """A camera that is missing, has stopped, or delivers something different than before."""
+    """A camera that is missing, has stopped, or delivers something different than before, or a damaged picture."""
 
 
 class DriveFault(RoverError):
-    """What stopped the car."""
-
-
-class TakenOver(RoverError):
-    """The human moved a stick."""
+    """What stopped the car: a fault, or the human, who moved a stick."""

@@ -10,17 +10,15 @@ unknown kind is not refused here; the command itself then reports what is wrong 
 import math
 import os
 import re
-import stat
 import zipfile
 from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, HEF, ONNX
-from rover_lib.onboard.errors import RoverError, printable
+from rover_lib.onboard.errors import RoverError
 
 CALLED = {
     "artifact": "an artifact",
@@ -33,44 +31,27 @@ CALLED = {
     "flight log": "a flight log",
     "calibration": "the calibration of a run",
     "stage": "the report of a run's stage",
-    "part": "a part of a LeRobot checkpoint or dataset",
-    "document": "a document",
-    "pointer": "a Git LFS pointer, not the file that it stands for",
-    "packed": "an archive",
 }
 WANTED = {  # what a command takes: the kinds, and how to get one
     "artifact": (("artifact",), "rover run CHECKPOINT EPISODES makes policy_<mode>.pt"),
     "checkpoint": (("checkpoint", "pretrained"), "the checkpoint comes first: best_model.pth, or LeRobot's folder"),
     "recordings": (("recordings", "dataset"), "give the folder that holds episode_*, or a LeRobotDataset's"),
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
-    "tub": (("tub",), "give the folder with manifest.json and the catalogs, or with record_<number>.json"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
-REMEDIES = {  # for what no command takes
-    "part": "give the folder that holds all of it",
-    "document": "give a file or folder that it describes",
-    "pointer": "git lfs pull, where it was cloned, or download the file itself",
-    "packed": "unpack it, and give the folder or the file in it",
-}
-MOST_INSIDE = 500  # paths that are looked at, of a level
 POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
-PACKED = (b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")  # how archives begin
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
-PACKED_NAMES = (*EPISODE_FILES, "config.json", "info.json", "model.safetensors", "best_model.pth", "manifest.json")
 POLICY_FILES = ("config.json", "adapter_config.json", "pretrained_model", "checkpoints", "last", "model.safetensors")
-DOCUMENTS = (".md", ".txt", ".html", ".ipynb", ".yml", ".yaml", ".py", ".pdf", ".csv")
-HEAD = 65536  # bytes that are read of a file
-PICKLE_HEAD = 4096  # bytes that are read of a torch file's pickle, which names its keys early
+HEAD = 4096  # bytes that are read of a file, and of a torch file's pickle, which names its keys early
 
 
 def kinds_of(path: Path | str) -> tuple[str, ...]:
     """Return the kinds of a path, as keys of CALLED; empty if the path does not exist or is of no known kind."""
     path = Path(path)
     try:
-        mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
+        if path.is_dir():
             return _of_folder(path)
-        return _of_file(path) if stat.S_ISREG(mode) else ()  # never read from a FIFO or a device
+        return _of_file(path) if path.is_file() else ()  # never read from a FIFO or a device
     except OSError:
         return ()
 
@@ -81,51 +62,34 @@ def check_kind(path: Path | str, wanted: str) -> None:
     takes, remedy = WANTED[wanted]
     if not found or set(found) & set(takes):
         return
-    refuse_part(path)
     if found[0] == "tub":
         remedy = "rover export-dataset TUB OUT makes a LeRobotDataset of it"
     raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 
-def refuse_part(path: Path | str) -> None:
-    """Raise RoverError for what no command takes: a part of a checkpoint or dataset, a document, an archive, a Git LFS
-    pointer.
-    """
-    kind = next(iter(kinds_of(path)), "")
-    if kind in REMEDIES:
-        raise RoverError(f"{path}: this is {CALLED[kind]}", remedy=REMEDIES[kind])
-
-
-def refuse_holder(folder: Path | str) -> None:
-    """Raise RoverError for a folder that is nothing itself, but holds what is: checkpoints, or a cache of the Hub."""
-    for level in ("*", "*/*", "*/*/*"):
-        found = sorted(islice(Path(folder).glob(level), MOST_INSIDE))
-        inside = [p for p in found if not set(kinds_of(p)) <= {"part", "document", "pointer", "stage"}]
-        if inside:
-            names = ", ".join(os.path.relpath(p, folder) for p in inside[:4]) + (" ..." if len(inside) > 4 else "")
-            what = f"{folder}: contains {CALLED[kinds_of(inside[0])[0]]} but is not one"
-            raise RoverError(what, found=printable(names), remedy=f"give one of them, as in {inside[0]}")
-
-
 def refuse_pointer(path: Path, error: type[RoverError]) -> None:
     """Raise `error` if Git LFS left a pointer in place of a file, as a clone without it does."""
-    if kinds_of(path) == ("pointer",):
-        raise error(f"{path}: {CALLED['pointer']}", remedy=REMEDIES["pointer"])
+    if path.is_file() and read_head(path, len(POINTER)) == POINTER:
+        raise error(f"{path}: a Git LFS pointer, not the file that it stands for", remedy="git lfs pull")
+
+
+def read_head(file: Path, size: int = HEAD) -> bytes:
+    """Return the first bytes of a file."""
+    with file.open("rb") as f:
+        return f.read(size)
 
 
 def check_output(path: Path, kind: str | None, *, appended: bool = False) -> None:
     """Raise RoverError for a file that a command must not write, see `Output`."""
     if path.is_dir():
         raise RoverError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
-    there = path.exists()
-    if found := set(kinds_of(path)) - {kind, "part", "document"}:  # a film may take the place of a film
+    if found := set(kinds_of(path)) - {kind}:
         raise RoverError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
-    if there and not path.is_file() and not appended:
-        raise RoverError(f"{path}: not a regular file, and would be replaced by one", remedy="give another name")
+    if path.exists() and appended:
+        return
     folder = next((p for p in path.absolute().parents if p.exists()), Path("/"))
-    if not (there and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
-        what = "cannot be written to" if folder.is_dir() else "this is a file, not a folder"
-        raise RoverError(f"{folder}: {what}", remedy="name a file elsewhere")
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise RoverError(f"{folder}: cannot be written to", remedy="name a file elsewhere")
 
 
 class Output(click.Path):
@@ -144,8 +108,7 @@ class Output(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = Path(str(super().convert(value, param, ctx)))
-        if not (ctx and ctx.resilient_parsing):
-            check_output(path, self.kind, appended=self.appended)
+        check_output(path, self.kind, appended=self.appended)
         return path
 
 
@@ -171,17 +134,12 @@ class PathTo(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         path = Path(str(super().convert(value, param, ctx)))
-        if not (ctx and ctx.resilient_parsing):
-            check_kind(path, self.wanted)
+        check_kind(path, self.wanted)
         return path
 
 
 def _of_folder(folder: Path) -> tuple[str, ...]:
     names = {p.name for p in folder.iterdir()}
-    if folder.name in ("meta", "data", "videos", "images") and (folder.parent / "meta" / "info.json").is_file():
-        return ("part",)
-    if "training_step.json" in names:
-        return ("part",)
     kinds = []
     artifacts = [n for n in names if n.startswith("policy_") and n.endswith((".pt", ".zip"))]  # not policy_...json
     if names & {"load.json", "run.json", "quantize.json"} or artifacts:
@@ -200,26 +158,14 @@ def _of_folder(folder: Path) -> tuple[str, ...]:
 
 
 def _of_file(file: Path) -> tuple[str, ...]:
-    with file.open("rb") as f:
-        head = f.read(HEAD)
-    if head.startswith(POINTER):
-        return ("pointer",)
-    if head.startswith(PACKED) or head[257:262] == b"ustar":
-        return ("packed",)
+    head = read_head(file)
     if head[:4] == b"PK\x03\x04":
         return _of_archive(file)
     if head.startswith(b"{") and b'"kind":"header"' in head.partition(b"\n")[0]:  # without spaces, as FlightLog writes
         return ("flight log",)
     if re.match(rb'\{\s*"schema": *\d+,\s*"stage": *"', head):  # the head is enough for a report of any size
         return ("stage",)
-    if file.name in EPISODE_FILES:
-        return ("recordings",)
-    of_policy = file.name in ("config.json", "train_config.json") or file.name.startswith(("policy_pre", "policy_post"))
-    if file.suffix in (".safetensors", ".parquet", ".mp4") or (file.suffix == ".json" and of_policy):
-        return ("part",)
-    if file.parent.name == "meta" and file.suffix in (".json", ".jsonl"):
-        return ("part",)
-    return ("document",) if file.suffix.lower() in DOCUMENTS else ()
+    return ("recordings",) if file.name in EPISODE_FILES else ()
 
 
 def _of_archive(file: Path) -> tuple[str, ...]:
@@ -230,13 +176,8 @@ def _of_archive(file: Path) -> tuple[str, ...]:
         directory = f.read()
         if any(name.encode() in directory for name in (ONNX, HEF, "/code/")):
             return ("artifact",)
-        with zipfile.ZipFile(file) as z:
-            names = z.namelist()
-            pickled = next((name for name in names if name.endswith("/data.pkl")), None)
-            if pickled is None:
-                return ("packed",) if any(Path(name).name in PACKED_NAMES for name in names) else ()
-            with z.open(pickled) as content:
-                keys = content.read(PICKLE_HEAD)
+        with zipfile.ZipFile(file) as z, z.open(next(n for n in z.namelist() if n.endswith("/data.pkl"))) as content:
+            keys = content.read(HEAD)
         if b"model_state_dict" in keys:
             return ("checkpoint",)
         return ("calibration",) if b"image_sizes" in keys and b"smooth" in keys else ()

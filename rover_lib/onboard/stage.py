@@ -23,6 +23,8 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
+
 from rover_lib.onboard.errors import RoverError
 
 SCHEMA = 1
@@ -79,6 +81,14 @@ def read_plain(path: Path | str, most_bytes: int = FILE_BYTES) -> bytes:
         return file.read(most_bytes)
 
 
+def private_lock(path: Path | str) -> FileLock:
+    """Return a lock that no other user can open, and so hold. Older versions left some that anybody could."""
+    with contextlib.suppress(FileNotFoundError):
+        if Path(path).stat().st_mode & 0o077:
+            Path(path).unlink()
+    return FileLock(path, timeout=0, mode=0o600, thread_local=False)
+
+
 def sha256_of(path: Path | str) -> str:
     """Return the hex SHA-256 of a file's bytes. Raises RoverError for what is no plain file."""
     with open_plain(path, RoverError(f"{path}: not a plain file")) as f:
@@ -99,13 +109,8 @@ def environment() -> dict[str, Any]:
     A value is None if it is unknown or not installed. `engine` is also None if this process has not loaded torch.
     """
     try:
-        git = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=5,
-        )
+        command = ["git", "rev-parse", "--short", "HEAD"]
+        git = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, timeout=5)
         commit = git.stdout.strip() or None
     except (OSError, subprocess.SubprocessError):
         commit = None
@@ -146,16 +151,8 @@ def write_stage(
     inputs: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """Write one stage's result atomically, and return it as it was written."""
-    content = plain(
-        {
-            "schema": SCHEMA,
-            "stage": stage,
-            "params": params,
-            "metrics": metrics,
-            "inputs": inputs or {},
-            "env": environment(),
-        }
-    )
+    parts = {"params": params, "metrics": metrics, "inputs": inputs or {}, "env": environment()}
+    content = plain({"schema": SCHEMA, "stage": stage, **parts})
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
     return content
@@ -173,13 +170,12 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
         raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
         raise RoverError(f"{path}: not readable as JSON ({e})", remedy="delete it and run its stage again") from None
-    found = (content.get("schema"), content.get("stage")) if isinstance(content, dict) else type(content).__name__
-    if not isinstance(content, dict) or found != (SCHEMA, stage or content.get("stage")):
-        of_stage = f" of stage '{stage}'" if stage else ""
-        raise RoverError(f"{path}: expected schema {SCHEMA}{of_stage}", found=found, remedy="run the stage again")
-    if lacking := [part for part in PARTS if not isinstance(content.get(part), dict)]:
-        raise RoverError(f"{path}: has no {', '.join(lacking)}", remedy="run the stage again")
-    return content
+    found = content if isinstance(content, dict) else {}
+    whole = all(isinstance(found.get(part), dict) for part in PARTS)
+    if not whole or (found.get("schema"), found.get("stage")) != (SCHEMA, stage or found.get("stage")):
+        what = f"{path}: not schema {SCHEMA} of stage '{stage or 'any'}' with {', '.join(PARTS)}"
+        raise RoverError(what, found=sorted(found), remedy="run the stage again")
+    return found
 
 
 def find_stage(path: Path | str, stage: str, *, params: Mapping[str, Any], inputs: Mapping[str, str]) -> Any:

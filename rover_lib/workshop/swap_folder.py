@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.stage import private_lock
 
 ASKED = ".asked"  # a file in a folder that is being filled, if that can be resumed: all that decides its content
 GOES = ".goes"  # a file in a complete folder: names of the old files without a successor, one per line
@@ -93,7 +94,7 @@ def _filled(folder: Path, asked: str) -> Iterator[None]:
 def _locked(folder: Path) -> Iterator[None]:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(f"{folder}.lock", timeout=0)
+        lock = private_lock(f"{folder}.lock")
         lock.acquire()
     except Timeout:
         remedy = "wait for it, or give another name"

@@ -1,13 +1,14 @@
 """The two wheels where nothing else of the project is: the rover's in its runtime alone, the workstation's anywhere."""
 
+import contextlib
 import importlib.metadata
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import venv
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,9 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 
-def borrow(packages: Path, engine: str = "torch") -> None:
-    """What a Pi with that engine has, of this environment, linked: installing torch takes minutes."""
-    for name in re.findall(r"^([\w.-]+)==", REQUIREMENTS[engine].read_text(), re.MULTILINE):
+def borrow(packages: Path, names: list[str]) -> None:
+    """Link packages of this environment: installing torch takes minutes."""
+    for name in names:
         try:
             files = importlib.metadata.distribution(name).files or []
         except importlib.metadata.PackageNotFoundError:  # only another Python needs it
@@ -33,68 +34,74 @@ def borrow(packages: Path, engine: str = "torch") -> None:
                 here.symlink_to(there)
 
 
-class Installed:
-    """A virtual environment with one wheel of ours, and of others those that a Pi with that engine has."""
+def required(engine: str) -> list[str]:
+    """The names of what a Pi with that engine has."""
+    return re.findall(r"^([\w.-]+)==", REQUIREMENTS[engine].read_text(), re.MULTILINE)
 
-    def __init__(self, folder: Path, wheel: Path, engine: str = "torch"):
-        self.folder = folder
+
+def with_needs(names: list[str]) -> list[str]:
+    """Add what pip would install with these packages."""
+    for name in names:  # it grows
+        for need in importlib.metadata.requires(name) or []:
+            needed = re.match(r"[\w.-]+", need)[0]
+            if "extra ==" not in need and needed not in names:
+                with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # only elsewhere
+                    names += [importlib.metadata.distribution(needed).name]
+    return names
+
+
+class Installed:
+    """A virtual environment with one wheel of ours, and of others those that are named."""
+
+    def __init__(self, folder: Path, wheel: Path, names: list[str]):
+        self.folder, self.bin = folder, folder / "venv" / "bin"
         venv.create(folder / "venv", with_pip=False, symlinks=True)
-        self.bin = folder / "venv" / "bin"
         self.packages = next((folder / "venv" / "lib").glob("python3*/site-packages"))
-        borrow(self.packages, engine)
+        borrow(self.packages, names)
         pip = [sys.executable, "-m", "pip", "--python", self.bin / "python", "install", "--no-deps", "--no-index"]
         subprocess.run([*pip, "--quiet", "--disable-pip-version-check", wheel], check=True)
 
-    def run(self, *command: object) -> subprocess.CompletedProcess:
+    def start(self, *command: object) -> subprocess.Popen:
         # Neither this checkout nor this environment is to be seen.
         env = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
         words = [str(self.bin / str(command[0])), *map(str, command[1:])]
-        return subprocess.run(words, capture_output=True, text=True, cwd=self.folder, env=env)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(words, cwd=self.folder, env=env, **pipes)
+
+    def run(self, *command: object) -> subprocess.CompletedProcess:
+        process = self.start(*command)
+        stdout, stderr = process.communicate()
+        return subprocess.CompletedProcess(command, process.returncode, stdout, stderr)
 
 
 @pytest.fixture(scope="module")
 def rover(tmp_path_factory) -> Installed:
     folder = tmp_path_factory.mktemp("rover")
-    return Installed(folder, make(folder / "wheels", only_rover=True).wheel)
+    return Installed(folder, make(folder / "wheels", only_rover=True).wheel, required("torch"))
 
 
 @pytest.fixture(scope="module")
 def rover_without_torch(tmp_path_factory) -> Installed:
     folder = tmp_path_factory.mktemp("onnxruntime")
-    return Installed(folder, make(folder / "wheels", only_rover=True).wheel, "onnxruntime")
+    return Installed(folder, make(folder / "wheels", only_rover=True).wheel, required("onnxruntime"))
 
 
-def test_onboard_alone_is_there(rover):
+def test_onboard_alone_is_there_with_the_rovers_commands_and_params(rover):
     ours = rover.packages / "rover_lib"
     assert {p.name for p in ours.iterdir()} - {"__pycache__"} == {"__init__.py", "LICENSE", "onboard"}
-    assert rover.run("python", "-c", "import rover_lib.workshop").returncode != 0
-
-
-def test_help_lists_the_rovers_commands_alone(rover):
     done = rover.run("rover", "--help")
     assert done.returncode == 0, done.stderr
     commands = re.findall(r"^  ([a-z-]+) ", done.stdout.partition("Commands:")[2], re.MULTILINE)
     assert commands == sorted(onboard.main.commands) and "drive" in commands
-    for name in commands:
-        assert rover.run("rover", name, "--help").returncode == 0
     assert rover.run("rover", "world", "--help").returncode == 2  # a workstation's
+    script = "import json; from rover_lib.onboard.params import params; print(json.dumps(params()))"
+    assert set(json.loads(rover.run("python", "-c", script).stdout)) == {"drive", "flight_log", "gates", "view"}
 
 
-def test_inspects_an_artifact(rover, artifacts):
-    done = rover.run("rover", "inspect", artifacts["static"], "--json")
-    assert done.returncode == 0 and json.loads(done.stdout)["artifact"]["mode"] == "static", done.stderr
-
-
-@pytest.mark.parametrize(
-    ("which", "others"),
-    [
-        ("rover", {"onnx_engine", "hailo_engine", "server"}),
-        ("rover_without_torch", {"torch_engine", "hailo_engine", "server"}),
-    ],
-)
-def test_all_of_it_can_be_imported_but_the_engines_that_it_lacks(which, others, request):
+@pytest.mark.parametrize(("which", "lacks"), [("rover", "onnx_engine"), ("rover_without_torch", "torch_engine")])
+def test_all_of_it_can_be_imported_but_the_engine_that_it_lacks(which, lacks, request):
     installed = request.getfixturevalue(which)
-    top = installed.packages
+    top, others = installed.packages, {lacks, "hailo_engine", "server"}
     files = [p.relative_to(top) for p in (top / "rover_lib" / "onboard").rglob("*.py") if p.stem not in others]
     names = [".".join(p.with_suffix("").parts).removesuffix(".__init__") for p in files]
     done = installed.run("python", "-c", f"import importlib; [importlib.import_module(name) for name in {names}]")
@@ -104,7 +111,6 @@ def test_all_of_it_can_be_imported_but_the_engines_that_it_lacks(which, others, 
 def test_a_rover_without_torch_runs_what_onnx_runtime_runs_and_says_what_it_lacks(
     rover_without_torch, onnx_static, artifacts, tmp_path
 ):
-    assert rover_without_torch.run("python", "-c", "import torch").returncode != 0
     timed, left = ("rover", "benchmark", "--warmup", "1", "--iterations", "2"), tmp_path / "benchmark.json"
     done = rover_without_torch.run(*timed, "--output", left, onnx_static)  # loaded, so its parity vectors are right
     assert done.returncode == 0, done.stderr
@@ -112,6 +118,10 @@ def test_a_rover_without_torch_runs_what_onnx_runtime_runs_and_says_what_it_lack
     assert where["torch"] is None and where["onnxruntime"]
     done = rover_without_torch.run(*timed, artifacts["static"])
     assert done.returncode == 1 and "needs torch" in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+    lines = rover_without_torch.run("rover", "--version").stdout.splitlines()
+    assert re.fullmatch(r"rover \d+\.\d+\.\d+\+[0-9a-f]{12}", lines[0]) and lines[1].startswith("Python 3.")
+    assert lines[2] == "engine qnnpack: torch is not installed"
+    assert re.fullmatch(r"engine onnxruntime: onnxruntime \d+\.\d+\.\d+", lines[3])
 
 
 def test_bad_input_is_one_sentence(rover, tiny_file):
@@ -121,53 +131,42 @@ def test_bad_input_is_one_sentence(rover, tiny_file):
         assert done.stderr.startswith("rover: ") and len(done.stderr.splitlines()) == 1, done.stderr
 
 
-def test_the_rovers_params_are_what_the_rover_reads(rover):
-    script = "import json; from rover_lib.onboard.params import params; print(json.dumps(params()))"
-    assert set(json.loads(rover.run("python", "-c", script).stdout)) == {"drive", "flight_log", "gates", "view"}
+def lines_of(name: str) -> list[str]:
+    """The lines between <!-- name --> and <!-- end --> in docs/install.md."""
+    page = (ROOT / "docs" / "install.md").read_text()
+    blocks = re.findall(rf"<!-- {name} -->\n(.*?)<!-- end -->", page, re.S)
+    return [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
 
 
-def test_a_workstations_wheel_finds_its_params_out_of_a_checkout(tmp_path):
+def test_the_small_way(tmp_path, onnx_static):
+    """docs/install.md's lines: what they install of others is linked, and our wheel is built as pip would."""
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", tmp_path]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as z:
-        z.extractall(tmp_path / "installed")
-    assert not (tmp_path / "installed" / "lab").exists() and not (tmp_path / "installed" / "tests").exists()
-    script = """
-import json, sys
-sys.path.insert(0, sys.argv[1])
-import rover_lib.cli
-from rover_lib.onboard.params import params
-print(json.dumps([rover_lib.cli.__file__, params()]))
-"""
-    command = [sys.executable, "-I", "-c", script, tmp_path / "installed"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
-    file, params = json.loads(done.stdout)
-    assert Path(file).is_relative_to(tmp_path)
-    assert {"calibration", "quantization", "benchmark", "drive", "flight_log"} <= set(params)
-    assert {"steering_mae_pct", "original"} <= set(params["gates"])
-
-
-def test_says_its_version_pythons_and_the_engines(rover, rover_without_torch):
-    lines = rover.run("rover", "--version").stdout.splitlines()
-    assert re.fullmatch(r"rover \d+\.\d+\.\d+\+[0-9a-f]{12}", lines[0]) and lines[1].startswith("Python 3.")
-    assert re.fullmatch(r"engine qnnpack: torch 2\.8\.0.*", lines[2])
-    lines = rover_without_torch.run("rover", "--version").stdout.splitlines()
-    assert lines[2] == "engine qnnpack: torch is not installed"
-    assert re.fullmatch(r"engine onnxruntime: onnxruntime \d+\.\d+\.\d+", lines[3])
+    made, others, own, view = lines_of("look")
+    assert made == "python3 -m venv look" and own == "look/bin/pip install --no-deps ."
+    names = with_needs(others.removeprefix("look/bin/pip install ").split())
+    look = Installed(tmp_path, next(tmp_path.glob("*.whl")), names)
+    assert not [name for name in ("lab", "tests") if (look.packages / name).exists()]
+    assert look.run("python", "-m", "rover_lib.cli", "--help").returncode == 0
+    script = "import json; from rover_lib.onboard.params import params; print(json.dumps(params()))"
+    assert {"calibration", "drive"} <= set(json.loads(look.run("python", "-c", script).stdout))
+    shutil.copy(onnx_static, tmp_path / "policy_static.onnx.zip")
+    process = look.start("rover", *view.removeprefix("look/bin/rover ").split(), "--web-port", 0)
+    try:
+        assert process.stdout.readline().startswith("http://127.0.0.1:"), process.stderr.read()
+    finally:
+        process.terminate()
+        process.communicate()
 
 
 def test_the_way_by_hand(tmp_path, artifacts):
     """docs/install.md's lines as they stand there, but for what needs root, a car, another machine or minutes."""
-    page = (ROOT / "docs" / "install.md").read_text()
-    blocks = re.findall(r"<!-- by hand: \w+ -->\n(.*?)<!-- end -->", page, re.S)
-    lines = [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
-    assert len(lines) <= 10
     env = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "COV"))}
     env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
     (tmp_path / ".venv").symlink_to(sys.prefix)
     (tmp_path / "policy_static.pt").symlink_to(artifacts["static"])
     outputs = {}
-    for line in lines:
+    for line in lines_of(r"by hand: \w+"):
         if line.startswith("sudo ") or " drive " in line:  # there may be an Arduino on this machine
             continue
         if line.startswith("scp "):
@@ -175,7 +174,7 @@ def test_the_way_by_hand(tmp_path, artifacts):
                 path.rename(tmp_path / path.name)
         elif "--require-hashes" in line:
             assert line.endswith(f"-r {REQUIREMENTS['torch'].name}")
-            borrow(next((tmp_path / "rover" / "lib").glob("python3*/site-packages")))
+            borrow(next((tmp_path / "rover" / "lib").glob("python3*/site-packages")), required("torch"))
         else:
             own = {"PYTHONPATH": str(ROOT)} if "wheelhouse" in line else {}
             done = subprocess.run(line, shell=True, cwd=tmp_path, env=env | own, capture_output=True, text=True)
@@ -184,4 +183,3 @@ def test_the_way_by_hand(tmp_path, artifacts):
     assert not [done.stderr for done in made if done.returncode]
     assert version.stdout.startswith("rover ") and version.returncode == 0
     assert re.search(r"^ok +artifact ", doctor.stdout, re.M), doctor.stdout
-    assert re.fullmatch(r"rover/bin/rover drive policy_static\.pt .*", lines[-1])

@@ -20,30 +20,25 @@ def test_writes_plain_json(tmp_path):
     assert written["metrics"] == {"a_ms": 1.5, "b": [0, 1], "c": 3, "nan": None, "p": str(path)}
     assert set(written) == {"schema", "stage", "params", "metrics", "inputs", "env"}
     assert {"host", "machine", "torch", "commit"} <= set(written["env"])
+    with pytest.raises(RoverError):
+        read_stage(path, "calibrate")
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [(None, "not found"), ("{", "JSON"), ("[]", "found list"), ('{"schema": 2, "stage": "load"}', "schema 1")],
-)
-def test_refuses_what_is_no_stage(tmp_path, content, says):
+@pytest.mark.parametrize("content", [None, "{", "[]", '{"schema": 2, "stage": "load"}'])
+def test_refuses_what_is_no_stage(tmp_path, content):
     path = tmp_path / "load.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(RoverError, match=says):
+    with pytest.raises(RoverError, match=str(path)):
         read_stage(path, "load")
 
 
-@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+@pytest.mark.parametrize("umask", [0o022, 0o077])
 def test_a_file_has_the_mode_that_the_umask_says_and_the_umask_is_left_alone(tmp_path, monkeypatch, umask):
     """Whoever sets the umask, even to what it was, sets it for other threads that write a file just then."""
     set_umask = os.umask
     before = set_umask(umask)
-
-    def refuse(mask):
-        raise AssertionError(f"the umask was set to {mask:o}")
-
-    monkeypatch.setattr(os, "umask", refuse)
+    monkeypatch.setattr(os, "umask", lambda mask: pytest.fail(f"the umask was set to {mask:o}"))
     try:
         with atomic_path(tmp_path / "x") as temporary:
             temporary.write_text("whole")

@@ -1,6 +1,9 @@
 """A rover for LeRobot without a car: a camera of noise, and a stand-in for the Arduino."""
 
 import contextlib
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
@@ -15,31 +18,34 @@ def noise():
     return pictures(PLAIN)
 
 
+@dataclass
+class Bench:
+    """A robot that is not connected yet, the camera that it will see by, and its Arduino. log: the drive's."""
+
+    robot: object
+    feed: CameraFeed
+    board: object
+    folder: Path
+
+    @property
+    def log(self):
+        return self.folder / "flight.log"
+
+
 @pytest.fixture
-def make_rover(tmp_path, noise):
-    """make_rover(port, **options): a robot, not connected, and the camera that it will see by."""
+def bench(tmp_path, noise):
+    """bench(board=None, **options of RoverConfig): a context with a Bench, each time with everything of its own."""
     from lerobot_robot_rover import Rover, RoverConfig
 
-    with contextlib.ExitStack() as stack:
-        feed = stack.enter_context(CameraFeed(tmp_path / "camera", *noise))
+    @contextlib.contextmanager
+    def make(board=None, **options):
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        with CameraFeed(folder / "camera", *noise) as feed, contextlib.ExitStack() as stack:
+            board = board or stack.enter_context(StandIn())
+            given = {"film": True, "width": 96, "height": 48, "log": folder / "flight.log", "port": board.port}
+            given |= {"camera": str(folder / "camera"), "calibration_dir": folder} | options
+            robot = Rover(RoverConfig(**given))
+            stack.callback(lambda: robot.is_connected and robot.disconnect())
+            yield Bench(robot, feed, board, folder)
 
-        made = []
-
-        def make(port, **options):
-            for earlier in made:  # of an attempt that was spoilt: it holds the log
-                if earlier.is_connected:
-                    earlier.disconnect()
-            given = {"film": True, "width": 96, "height": 48, "log": tmp_path / "flight.log"} | options
-            camera = given.pop("camera", str(tmp_path / "camera"))
-            rover = Rover(RoverConfig(port=port, camera=camera, calibration_dir=tmp_path, **given))
-            made.append(rover)
-            stack.callback(lambda: rover.is_connected and rover.disconnect())
-            return rover, feed
-
-        yield make
-
-
-@pytest.fixture
-def standin():
-    with StandIn() as board:
-        yield board
+    return make

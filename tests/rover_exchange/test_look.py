@@ -20,8 +20,8 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_log
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
+from rover_lib.onboard.errors import EpisodeError, RoverError
 from rover_lib.onboard.recording.episode import CONTROL_FIELDS
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +104,7 @@ def test_pictures_of_another_drive_or_a_damaged_list_are_refused(tmp_path):
     with pytest.raises(EpisodeError, match="cannot be read"):
         moments_of(flight)
     flight.header.clear()
-    with pytest.raises(LogError, match="damaged"):
+    with pytest.raises(RoverError, match="damaged"):
         moments_of(flight)
 
 

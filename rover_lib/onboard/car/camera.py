@@ -24,15 +24,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.csi import is_csi, read_csi
-from rover_lib.onboard.car.picture import (
-    LEAST,
-    MOST_BYTES,
-    PictureError,
-    block_sums,
-    brightness,
-    decode_jpeg,
-    is_squeezed,
-)
+from rover_lib.onboard.car.picture import LEAST, MOST_BYTES, block_sums, brightness, decode_jpeg, is_squeezed
 from rover_lib.onboard.errors import CameraError
 
 FIRST_FRAME_S = 5.0
@@ -120,7 +112,7 @@ class Camera:
         self._stamps = _Stamps(clock, wall_clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' block_sums(), one row each
         self._remembered = 0  # how many pictures have been stored there in all
-        self._refusal: PictureError | None = None
+        self._refusal: CameraError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
         self._held = held
         if not held:
@@ -221,7 +213,7 @@ class Camera:
                     try:
                         captured_s = self._stamps.captured_s(stamp_s)
                         image = decode_jpeg(picture) if isinstance(picture, bytes) else picture
-                    except PictureError as error:
+                    except CameraError as error:
                         self._refusal, refused = error, refused + 1
                         if self._frame and refused >= REFUSED_MOST:
                             what = f"{self.source}: {refused} pictures in a row were no frames: {error.what}"
@@ -291,7 +283,7 @@ class _Stamps:
 
         A frame without a time stamp counts as captured when it arrived.
 
-        Raises PictureError for a stamp that cannot be right.
+        Raises CameraError for a stamp that cannot be right.
         """
         now_s = self._clock()
         if stamp_s is None or self.kind == NO_CLOCK:
@@ -325,9 +317,9 @@ class _Stamps:
         return NO_CLOCK
 
 
-def _bad_stamp(stands: bool, age_s: float) -> PictureError:
+def _bad_stamp(stands: bool, age_s: float) -> CameraError:
     found = "the same again" if stands else f"one of {abs(age_s):.2f} s {'ago' if age_s > 0 else 'ahead'}"
-    return PictureError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
+    return CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
 
 
 def path_of(source: str, dev: Path = Path("/dev")) -> Path:

@@ -21,7 +21,7 @@ import numpy as np
 
 from rover_lib.onboard.car.pwm import Channel, PwmCalibration
 from rover_lib.onboard.checked import Rule, broken_rule, is_number, one_of, whole
-from rover_lib.onboard.errors import CarError, ParamsError, PwmError
+from rover_lib.onboard.errors import CarError, ParamsError
 
 FILE_VARIABLE = "ROVER_CAR"  # environment variable that names another file; inherited by started programs
 PLACES = (  # where car.yml may be; the first one that exists is used
@@ -212,7 +212,7 @@ class Car:
                 throttle=_channel("throttle", throttle["period_us"], pulses_us),
             )
             car = cls(pwm=pwm, positive=positive, **given)
-        except (CarError, PwmError) as error:
+        except CarError as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
         if car.steering_us == _DEFAULT_CAR.steering_us and (
             {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}

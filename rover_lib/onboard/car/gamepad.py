@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CarError
 
 EVENT = struct.Struct("llHHi")  # struct input_event: seconds, microseconds, type, code, value
 SYN, KEY, ABS, DROPPED, BTN_L1 = 0x00, 0x01, 0x03, 3, 0x136
@@ -32,10 +32,6 @@ ALIVE_S = 0.1  # with nothing from the gamepad for longer, or with older events,
 OPEN_S = 1.0  # for its first events
 
 _log = logging.getLogger(__name__)
-
-
-class GamepadError(RoverError):
-    """There is no gamepad that can be used, or it is not clear which."""
 
 
 ReadStick = Callable[[int, int], tuple[int, int, int]]  # of a file descriptor and an axis: its value, least and most
@@ -164,7 +160,7 @@ class Found:
         return f"{self.name} ({self.pad.name}{'' if self.motion else ', without motion sensors: cannot be used'})"
 
     def open(self) -> Gamepad:
-        """Open it. Raises GamepadError."""
+        """Open it. Raises CarError."""
         fds: list[int] = []
         try:
             for path in (self.pad, self.motion or self.pad):
@@ -174,7 +170,7 @@ class Found:
         except OSError as error:
             for fd in fds:
                 os.close(fd)
-            raise GamepadError(
+            raise CarError(
                 f"the gamepad {self} cannot be read ({error.strerror})",
                 remedy="is this user in group input? sudo usermod -aG input $USER, and log in again",
             ) from error
@@ -209,14 +205,14 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
 def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: Gamepad | None = None) -> Gamepad:
     """Open the only gamepad that can be used, and wait up to OPEN_S for its first event.
 
-    again: one that is gone; only the same one is opened, and nothing is waited for. GamepadError says why there is
+    again: one that is gone; only the same one is opened, and nothing is waited for. CarError says why there is
     none, or why it cannot be read.
     """
     found = (list_them or list_gamepads)()
     usable = [pad for pad in found if pad.motion and (not again or pad.identity == again.identity)]
     if len(usable) != 1:
         connect = f"{again.name} again" if again else "a DualShock 4, DualSense or Switch Pro Controller"
-        raise GamepadError(
+        raise CarError(
             "which gamepad is the human's?" if usable else "no gamepad that can be used is connected",
             found=", ".join(map(str, found)) or "none in /dev/input",
             remedy="connect only one" if usable else f"connect {connect}",
@@ -226,7 +222,7 @@ def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: G
     while not again and gamepad.silent_s > ALIVE_S:
         if time.monotonic() > end_s:
             gamepad.close()
-            raise GamepadError(f"the gamepad {usable[0]} sends nothing", remedy="switch it on, or plug it in again")
+            raise CarError(f"the gamepad {usable[0]} sends nothing", remedy="switch it on, or plug it in again")
         time.sleep(0.02)
         gamepad.sticks()
     return gamepad

@@ -1,6 +1,6 @@
 """Check a picture from an untrusted source: the cost of decoding it, whether it is complete, and what it shows.
 
-    image = decode_jpeg(data)                  # PictureError: cut short, damaged, not a JPEG, or too large
+    image = decode_jpeg(data)                  # CameraError: cut short, damaged, not a JPEG, or too large
     mean, contrast = brightness(image)
     same = (block_sums(image) == block_sums(before)).mean()
 
@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import simplejpeg
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.stage import open_plain
 
 MOST_BYTES = 8_000_000  # of a JPEG
@@ -34,30 +34,26 @@ ROWS, COLUMNS = 9, 16  # of blocks
 SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead of 640x360 is 0.013
 
 
-class PictureError(RoverError):
-    """Bytes that are not a complete picture, or a picture that was captured at the wrong time."""
-
-
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """Decode to (h, w, 3) uint8 BGR. Raises PictureError if it is not a complete JPEG, or larger than any camera's.
+    """Decode to (h, w, 3) uint8 BGR. Raises CameraError if it is not a complete JPEG, or larger than any camera's.
 
     The size is checked before anything is decoded. The orientation that the JPEG may contain is ignored.
     """
     if len(data) > MOST_BYTES:
-        raise PictureError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
+        raise CameraError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
     try:
         height, width = simplejpeg.decode_jpeg_header(data)[:2]
         scans = data.count(b"\xff\xda")
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
             found = f"{width}x{height} pixels in {scans} scans"
-            raise PictureError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
+            raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
         try:
             return simplejpeg.decode_jpeg(data, "BGR")
         except ValueError as error:
             _check_only_filler(data, error)
             return simplejpeg.decode_jpeg(data, "BGR", strict=False)
     except ValueError as error:
-        raise PictureError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
+        raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
 
 
 def _check_only_filler(data: bytes, warning: ValueError) -> None:
@@ -115,8 +111,8 @@ def _segments(data: bytes) -> tuple[list[bytes], int]:
 
 
 def read_jpeg(path: Path | str) -> np.ndarray:
-    """Decode a file as decode_jpeg() does. Raises PictureError, and OSError if the file cannot be read."""
-    with open_plain(path, PictureError(f"{path}: no plain file", remedy="remove it")) as file:
+    """Decode a file as decode_jpeg() does. Raises CameraError, and OSError if the file cannot be read."""
+    with open_plain(path, CameraError(f"{path}: no plain file", remedy="remove it")) as file:
         return decode_jpeg(file.read(MOST_BYTES + 1))
 
 

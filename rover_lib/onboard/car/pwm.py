@@ -9,16 +9,16 @@ import math
 import numbers
 from dataclasses import dataclass, field
 
-from rover_lib.onboard.errors import PwmError
+from rover_lib.onboard.errors import CarError
 
 ARDUINO_STEP_US = 4  # resolution of micros() on a 16 MHz Arduino: no pulse is known better than this
 NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 
 def _finite(value: object, what: str) -> float:
-    """Return `value` as a float. Raises PwmError for None, strings, booleans, NaN and infinities."""
+    """Return `value` as a float. Raises CarError for None, strings, booleans, NaN and infinities."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise PwmError(
+        raise CarError(
             f"{what} must be a number", found=f"{type(value).__name__} {value!r}", remedy="send neutral instead"
         )
     try:
@@ -26,13 +26,13 @@ def _finite(value: object, what: str) -> float:
     except OverflowError:
         found = math.inf
     if not math.isfinite(found):
-        raise PwmError(f"{what} must be finite", found=found, remedy="send neutral and look at what computed it")
+        raise CarError(f"{what} must be finite", found=found, remedy="send neutral and look at what computed it")
     return found
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One servo signal. Every Channel is valid: values that make no servo channel raise PwmError.
+    """One servo signal. Every Channel is valid: values that make no servo channel raise CarError.
 
     period_us: nominal period. neutral_pct: duty of action 0, in percent. span_pct: duty per unit of action, in
     percent; negative if the signal is inverted. low, high: range of the action, which includes 0.
@@ -56,14 +56,14 @@ class Channel:
             _finite(self.below_pct, f"{self.name} below_pct")
         below = self._span_pct(-1.0)
         if self.period_us <= 0 or self.span_pct * below <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
-            raise PwmError(
+            raise CarError(
                 f"{self.name}: period {self.period_us} us, span {self.span_pct} and {below} %, range "
                 f"{self.low} to {self.high} is no servo channel",
                 remedy="the period must be above 0, and both spans other than 0 and of one sign",
             )
         ends = sorted(self._duty_pct(action) for action in (self.low, self.high))
         if ends[0] <= 0 or ends[1] >= 100:
-            raise PwmError(
+            raise CarError(
                 f"{self.name}: its ends must be inside a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} % of it"
             )
 
@@ -90,10 +90,10 @@ class Channel:
         return self.pulse_us(0.0)
 
     def pulse_us(self, action: float) -> int:
-        """Return the pulse for an action, in whole microseconds. Raises PwmError for NaN and outside [low, high]."""
+        """Return the pulse for an action, in whole microseconds. Raises CarError for NaN and outside [low, high]."""
         action = _finite(action, self.name)
         if not self.low <= action <= self.high:
-            raise PwmError(
+            raise CarError(
                 f"{self.name} must be in [{self.low:g}, {self.high:g}]",
                 found=f"{action:g}",
                 remedy="clip the plan first",
@@ -104,7 +104,7 @@ class Channel:
         """Return whether the firmware measured a pulse.
 
         If it did, the pulse is longer than 0 and shorter than its period, and the period is within 25 % of the nominal
-        one: neither 0 nor two periods taken for one. Raises PwmError for what is not a finite number.
+        one: neither 0 nor two periods taken for one. Raises CarError for what is not a finite number.
         """
         pulse_us, period_us = (_finite(pulse_us, f"{self.name} pulse"), _finite(period_us, f"{self.name} period"))
         return 0 < pulse_us < period_us and 0.75 * self.period_us < period_us < 1.25 * self.period_us
@@ -113,7 +113,7 @@ class Channel:
         """Return the action that a pulse stands for, in [low, high], or None (not 0) if no pulse was measured.
 
         period_us: the measured period; None: the nominal one. An action beyond an end is clipped to it, as the
-        firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises PwmError for a pulse that is None, and
+        firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises CarError for a pulse that is None, and
         for strings, NaN and infinities.
         """
         period_us = self.period_us if period_us is None else period_us
@@ -165,9 +165,9 @@ class PwmCalibration:
     throttle: Channel = field(default=Channel("throttle", 1016, 11.81, 58.19, 0.0, 1.0))
 
     def channel(self, action_name: str) -> Channel:
-        """Return the channel of "steering" or "throttle". Raises PwmError for other names."""
+        """Return the channel of "steering" or "throttle". Raises CarError for other names."""
         if action_name not in ("steering", "throttle"):
-            raise PwmError(
+            raise CarError(
                 f"no servo channel for action {action_name!r}", remedy="this rover has steering and throttle"
             )
         return getattr(self, action_name)
@@ -175,7 +175,7 @@ class PwmCalibration:
     def pulses(self, steering: float, throttle: float) -> Pulses:
         """Return the pulses for steering in [-1, 1] and throttle in [0, 1], or from -1 on a car with reverse.
 
-        Raises PwmError for anything else.
+        Raises CarError for anything else.
         """
         return Pulses(self.steering.pulse_us(steering), self.throttle.pulse_us(throttle))
 
@@ -193,7 +193,7 @@ class PwmCalibration:
         """Return the actions that two measured pulses stand for. A period that is None stands for the nominal one.
 
         The action is None, not 0, for a channel without a measured pulse (see Channel.measured()).
-        Raises PwmError for pulses that are None, and for strings, NaN and infinities.
+        Raises CarError for pulses that are None, and for strings, NaN and infinities.
         """
         return Actions(
             self.steering.action(steering_us, steering_period_us), self.throttle.action(throttle_us, throttle_period_us)

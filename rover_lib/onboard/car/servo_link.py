@@ -21,7 +21,7 @@ from numbers import Integral
 import serial
 
 from rover_lib.onboard.car.car import PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
-from rover_lib.onboard.car.gamepad import Gamepad, GamepadError, open_gamepad
+from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
 from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.protocol import (
     LINE_MAX,
@@ -37,7 +37,7 @@ from rover_lib.onboard.car.protocol import (
     parse,
 )
 from rover_lib.onboard.car.pwm import Channel
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import CarError, RoverError
 
 FIRMWARE_VERSION = "4.1.1"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
@@ -138,7 +138,7 @@ class ServoLink:
         The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. It is
         told of every car but the default one, and of that too if it now drives its pins for another.
         Raises LinkError if the port cannot be opened or is in use, if nothing there says hello within `boot_s` seconds,
-        if the firmware is another one than this program knows, or if it refuses this car. Raises GamepadError as
+        if the firmware is another one than this program knows, or if it refuses this car. Raises CarError as
         open_gamepad() does.
         """
         if self._serial:
@@ -312,7 +312,7 @@ class ServoLink:
             self._gamepad.close()
             try:
                 self._gamepad = open_gamepad(again=self._gamepad)
-            except GamepadError as error:
+            except CarError as error:
                 return str(error)
         return "hold L1 of the gamepad"
 
@@ -385,7 +385,7 @@ class ServoLink:
     def send_action(self, steering: float, throttle: float) -> int:
         """Send steering in [-1, 1] and throttle in [0, 1] (from -1 with reverse) as pulses, like send().
 
-        Raises PwmError for other values, and LinkError like send().
+        Raises CarError for other values, and LinkError like send().
         """
         pulses = self.calibration.pulses(steering, throttle)
         return self.send(pulses.steering_us, pulses.throttle_us)

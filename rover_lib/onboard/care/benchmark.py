@@ -7,13 +7,10 @@ machine that heats up or is shared slows all of them alike. A value that the hos
 vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
-import contextlib
 import itertools
 import math
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +27,7 @@ from rover_lib.onboard.policy.confined import load_confined, run_confined
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
 MOST = 10**9  # rounds, threads or seconds: a limit that nobody meets
-THROTTLED_S = 1.0  # between two readings of the firmware's throttling
+NOTED = ("latency_p50_ms", "latency_p95_ms", "latency_max_ms", "n")  # of a point in the time series
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
 
@@ -57,55 +54,23 @@ def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mappin
     """Time artifacts from anywhere, on the frames of the first one's parity vectors, as benchmark() does.
 
     Nothing of them runs in this process. paths: by name. threads: of the engines. options: of BenchmarkOptions. Each
-    artifact's memory is measured too. Raises PolicyError for an artifact that does not load.
+    artifact's memory is measured too. What the firmware throttled is read once, at the end. Raises PolicyError for an
+    artifact that does not load.
     """
-    host = Host()
-    with tempfile.TemporaryDirectory() as folder, _keep_throttled(Path(folder) / "throttled", host) as told:
-        metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options, throttled=told)
+    metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
+    metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
     metrics["throttled_means"] = throttled_means(metrics["throttled"])
     _add_memory(metrics, paths, threads)
     return metrics
 
 
-@contextlib.contextmanager
-def _keep_throttled(path: Path, host: Host) -> Iterator[Path]:
-    """Keep what the firmware throttles in a file, for a confined process, which can start no program to ask."""
-    ended = threading.Event()
-
-    def keep() -> None:
-        while True:
-            path.write_text(host.throttled() or "")
-            if ended.wait(THROTTLED_S):
-                return
-
-    thread = threading.Thread(target=keep)
-    path.touch()
-    thread.start()
-    try:
-        yield path
-    finally:
-        ended.set()
-        thread.join()
-
-
-@dataclass(frozen=True)
-class _ToldHost(Host):
-    """A host whose throttling another process keeps in the file `told`."""
-
-    told: Path = Path()
-
-    def throttled(self) -> str | None:
-        return self.told.read_text() or None
-
-
-def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any], throttled: str) -> dict[str, Any]:
+def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]) -> dict[str, Any]:
     policies, artifacts = load_confined(paths, threads=threads)
-    first, vectors = next(iter(policies.values())), next(iter(artifacts.values())).parity
-    frames = [
-        {c: vectors[f"frame_{c}"][i][:, :, ::-1] for c in first.cameras} for i in range(len(vectors["state"]))
-    ]  # stored as RGB; a camera gives BGR
-    host = _ToldHost(told=Path(throttled))
-    return benchmark(policies, frames, vectors["state"][0], BenchmarkOptions(**options), host=host)
+    cameras, vectors = next(iter(policies.values())).cameras, next(iter(artifacts.values())).parity
+    frames = []
+    for i in range(len(vectors["state"])):  # stored as RGB; a camera gives BGR
+        frames.append({camera: vectors[f"frame_{camera}"][i][:, :, ::-1] for camera in cameras})
+    return benchmark(policies, frames, vectors["state"][0], BenchmarkOptions(**options))
 
 
 def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
@@ -230,10 +195,10 @@ def benchmark(
         _set_threads(policies, threads_before)
 
     artifacts = {name: run.metrics_of(name, cores) for name in names}
+    top = dict(artifacts[main])
     if reference is not None:
         for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
-    top = {k: v for k, v in artifacts[main].items() if not k.startswith("speedup")}
     process_mb = host.process_peak_memory_mb()
     metrics = {
         **top,
@@ -284,34 +249,30 @@ class _Run:
 
     def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
         """Time `iterations` rounds, or as many as begin within duration_s, and fill the lists."""
-        duration_s = options.duration_s
+        duration_s, names = options.duration_s, list(self.policies)
         if duration_s is None:
             rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
         else:
             rounds = progress(itertools.count(), desc=f"soaking for {duration_s:g} s", total=None)
         # at most 300 points: enough to see a machine throttle, few enough to plot and to keep
         every_s = max(1.0, (duration_s or 0) / 300)
-        names = list(self.policies)
         self.readings.append(self.host.reading())
         before = self.host.core_ticks()
         cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
-        tick_s, seen = start_s + every_s, dict.fromkeys(names, 0)
+        ends = (duration_s or math.inf, 1), (options.at_most_s or math.inf, LEAST_ROUNDS)
+        tick_s, seen = every_s, dict.fromkeys(names, 0)
         for i in rounds:
-            if duration_s is not None and self.clocks.wall() - start_s >= duration_s and i > 0:
+            passed_s = self.clocks.wall() - start_s
+            if any(i >= least and passed_s >= end_s for end_s, least in ends):
                 break
-            if options.at_most_s and i >= LEAST_ROUNDS and self.clocks.wall() - start_s >= options.at_most_s:
-                break
+            if duration_s and passed_s >= tick_s:
+                self._note(passed_s, seen)
+                tick_s = passed_s + every_s
             for k in range(len(names)):
                 self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
-            if duration_s is not None and (now_s := self.clocks.wall()) >= tick_s:
-                self._note(now_s - start_s, seen)
-                tick_s = now_s + every_s
         self.wall_s, self.process_s = self.clocks.wall() - start_s, self.clocks.cpu() - cpu_start_s
         after = self.host.core_ticks()
-        if duration_s is not None and any(len(self.latencies_ms[n]) > seen[n] for n in names):
-            self._note(self.wall_s, seen)
-        else:
-            self.readings.append(self.host.reading())
+        self._note(self.wall_s, seen)
         if before and after and len(before) == len(after):
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
@@ -365,20 +326,11 @@ class _Run:
         """Add one point to the time series: the latencies since the last point, and the host's state."""
         reading = self.host.reading()
         self.readings.append(reading)
-        point: dict[str, Any] = {
-            "t_s": t_s,
-            **reading,
-            "memory_mb": self.host.process_peak_memory_mb(),
-            "artifacts": {},
-        }
+        artifacts = {}
         for name, times_ms in self.latencies_ms.items():
-            recent = times_ms[seen[name] :]
-            seen[name] = len(times_ms)
+            recent, seen[name] = times_ms[seen[name] :], len(times_ms)
             if recent:
-                point["artifacts"][name] = {
-                    "latency_p50_ms": float(np.percentile(recent, 50)),
-                    "latency_p95_ms": float(np.percentile(recent, 95)),
-                    "latency_max_ms": float(max(recent)),
-                    "n": len(recent),
-                }
-        self.series.append(point)
+                all_of = latency_metrics(recent)
+                artifacts[name] = {key: all_of[key] for key in NOTED}
+        memory_mb = self.host.process_peak_memory_mb()
+        self.series.append({"t_s": t_s, **reading, "memory_mb": memory_mb, "artifacts": artifacts})

@@ -9,12 +9,10 @@ checks are independent: one that breaks counts as failed, and the others go on.
 
 import contextlib
 import getpass
-import grp
+import importlib
 import os
-import re
 import shutil
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest, seen_size
-from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
+from rover_lib.onboard.car.camera import Camera, Frame, check_shape, path_of, size_like
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.csi import is_csi
 from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
@@ -37,7 +35,6 @@ from rover_lib.onboard.drive.pilot import blank, frozen
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.recording.turning import measure_recorded
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the requested frame rate must be reached
@@ -51,10 +48,6 @@ REST_US = 32  # the firmware arms only with the throttle stick this near to neut
 HOT_C = 75.0  # a Pi 5 slows down from 80 C
 MEMORY_MB = 700  # the real policy needs 358 MB while predicting and 424 while loading, the loop's process 100
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
-EARLIEST_S = 1_735_689_600  # 2025: a Pi without a network starts in its past
-
-LIST_S = 5.0  # for v4l2-ctl
-MOST_FORMATS = 8  # named in a check's line; the kernel's test driver has 66
 
 Verdict = Literal["ok", "warning", "fail"]
 
@@ -85,7 +78,6 @@ def examine(
     port: str = "",
     rate_hz: float = 30.0,
     log_folder: Path | None = None,
-    recording: Path | None = None,
     host: Host | None = None,
     dev: Path = Path("/dev"),
     boot_s: float = BOOT_S,
@@ -93,21 +85,20 @@ def examine(
     """Run all checks, and yield each result as soon as it is known. Takes a few seconds in all. Raises nothing.
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go; None means the
-    current folder. recording: what was just recorded, to see which way it steers. host, dev and boot_s are for tests.
+    current folder. host, dev and boot_s are for tests.
     """
     host = host or Host()
     device = path_of(str(camera), dev)
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(dev):  # otherwise it is a file or a pipe, and no camera needs to be there
-        checks["group video"] = lambda: access("group video", device, "video")
+        checks["group video"] = lambda: access("group video", device)
         checks["cameras"] = lambda: cameras(dev)
     checks |= {
         "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
-        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev)), "dialout"),
-        "Arduino": lambda: arduino(port or find_port(dev), dev=dev, boot_s=boot_s),
+        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev / "none"))),
+        "Arduino": lambda: arduino(port or find_port(dev), boot_s=boot_s),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
-        "side": lambda: side(recording) if recording else (),
         "engines": lambda: engines_here(),
         "artifact": lambda: policy(artifact),
         "temperature": lambda: temperature(host),
@@ -115,7 +106,6 @@ def examine(
         "governor": lambda: governor(host.sys_root),
         "disk": lambda: disk(log_folder or Path.cwd(), Path.cwd()),
         "memory": lambda: memory(host.proc_root),
-        "clock": lambda: clock(),
     }
     for name, check in checks.items():
         try:
@@ -131,64 +121,24 @@ def _found(error: RoverError) -> str:
     return error.what if error.found is None else f"{error.what}, found {error.found}"
 
 
-def access(name: str, device: Path, group: str) -> Iterator[Check]:
-    """Check whether this user may use the device. group: the usual one; the device's own counts if it is there."""
-    user = getpass.getuser()
-    if device.exists():
-        usable = os.access(device, os.R_OK | os.W_OK)
-        with contextlib.suppress(KeyError):
-            group = device.group()
-    else:
-        names = {g.gr_name for g in grp.getgrall() if g.gr_gid in (*os.getgroups(), os.getegid())}
-        usable = os.geteuid() == 0 or group in names
-    if usable:
-        yield Check(name, "ok", f"{user} may use {device}")
+def access(name: str, device: Path) -> Iterator[Check]:
+    """Check whether this user may use the device, if it is there; another check reports a missing one."""
+    if not device.exists():
         return
-    verdict: Verdict = "fail" if device.exists() else "warning"  # another check reports the missing device as a fail
+    user, group = getpass.getuser(), device.group()
     remedy = f"sudo usermod -aG {group} {user}, then log in again (or restart the service)"
-    yield Check(name, verdict, f"{user} may not use {device}, which belongs to group {group}", remedy)
+    if os.access(device, os.R_OK | os.W_OK):
+        yield Check(name, "ok", f"{user} may use {device}")
+    else:
+        yield Check(name, "fail", f"{user} may not use {device}, which belongs to group {group}", remedy)
 
 
-def cameras(dev: Path = Path("/dev"), program: str = "v4l2-ctl") -> Iterator[Check]:
-    """Report each V4L2 node that delivers pictures, with its driver, formats and sizes, as v4l2-ctl lists them."""
-    nodes = sorted((n for n in dev.glob("video*") if n.name[5:].isdecimal()), key=lambda n: int(n.name[5:]))
-    seen = 0
-    for node in nodes:
-        command = [program, "--device", str(node), "--info", "--list-formats-ext"]
-        try:
-            done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LIST_S)
-        except FileNotFoundError:
-            yield Check("cameras", "warning", f"no {program}, which lists them", "sudo apt-get install v4l-utils")
-            return
-        except (OSError, subprocess.TimeoutExpired) as error:
-            done = subprocess.CompletedProcess(command, 1, "", str(error))
-        if done.returncode:
-            seen += 1
-            said = " ".join((done.stderr + done.stdout).split())[:160]
-            yield Check("cameras", "warning", f"{node}: {said}", "see group video above, or plug it in again")
-        elif found := _describe_node(done.stdout):
-            seen += 1
-            yield Check("cameras", "ok", f"{node}: {found}")
-    if not seen:
-        there = f"none of {len(nodes)} video nodes gives pictures" if nodes else f"no {dev / 'video*'}"
-        yield Check("cameras", "fail", there, "plug the camera in; dmesg | tail says whether the kernel saw it")
-
-
-def _describe_node(listed: str) -> str | None:
-    """Describe what v4l2-ctl listed: driver, card, formats, sizes. None if it gives no pictures (metadata, ...)."""
-    capabilities = re.search(r"Device Caps\b.*?\n((?:\t\t.*\n)*)", listed)
-    if not capabilities or "Video Capture" not in capabilities[1]:
-        return None
-    driver, card = (re.search(rf"{name}\s*: (.*)", listed) for name in ("Driver name", "Card type"))
-    formats: list[str] = []
-    for name, size in re.findall(r"\[\d+\]: '(.*?)'|Size: \w+ (.*)", listed):
-        if name:
-            formats.append(name.strip())
-        elif formats:
-            formats[-1] += f" {size.partition(' with')[0].replace(' - ', ' to ')}"
-    if len(formats) > MOST_FORMATS:
-        formats[MOST_FORMATS:] = [f"{len(formats) - MOST_FORMATS} more"]
-    return f"{driver and driver[1]}, {card and card[1]}: {'; '.join(formats) or 'no formats'}"
+def cameras(dev: Path = Path("/dev")) -> Iterator[Check]:
+    """Name each USB camera and the node that gives its pictures, as udev does."""
+    links = sorted((dev / "v4l" / "by-id").glob("*-video-index0"))
+    found = "; ".join(f"{link.resolve()}: {link.name.removesuffix('-video-index0')}" for link in links)
+    remedy = "plug it in; dmesg | tail says whether the kernel saw it"
+    yield warn_unless(bool(links), "cameras", found or "no USB camera", remedy)
 
 
 def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
@@ -207,26 +157,18 @@ def camera_rate(
 ) -> Iterator[Check]:
     """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen.
 
-    seen: (width, height) of the pictures that the policy was made with. The camera is asked for that shape.
+    seen: (width, height) of the pictures that the policy was made with. The camera is asked for that shape. Raises
+    CameraError for one that cannot be opened, or gives another shape.
     """
     if not is_csi(str(source)) and not Path(source).exists():
         yield Check("camera", "fail", f"no {source}", "plug it in, or name another with --camera")
         return
-    try:
-        with open_camera(source, rate_hz=rate_hz, **({"size": size_like(*seen)} if seen else {})) as camera:
-            end = time.monotonic() + SETTLE_S
-            first = camera.latest()
-            while (left := end - time.monotonic()) > 0 and (frame := camera.wait(first.number, left)):
-                first = frame
-            end, last = time.monotonic() + MEASURE_S, first
-            while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
-                last = frame
-            clock = camera.time_stamps
-            if seen:
-                check_shape(str(source), last.image, seen)
-    except RoverError as error:
-        yield Check("camera", "fail", _found(error), error.remedy)
-        return
+    with open_camera(source, rate_hz=rate_hz, **({"size": size_like(*seen)} if seen else {})) as camera:
+        first = _newest_after(camera, SETTLE_S)
+        last = _newest_after(camera, MEASURE_S)
+        clock = camera.time_stamps
+        if seen:
+            check_shape(str(source), last.image, seen)
     number = last.number - first.number
     measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
     height, width = last.image.shape[:2]
@@ -237,21 +179,22 @@ def camera_rate(
     elif measured_hz < RATE_SHARE * rate_hz:
         light = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
         yield Check("camera", "warning", f"{found}, wanted {rate_hz:g}", light)
-    elif fault := frozen(last, settings):
+    elif fault := frozen(last, settings) or blank(last, settings):
         yield Check("camera", "fail", f"{found}, but {fault.what}", fault.remedy)
     else:
-        fault = blank(last, settings)
-        remedy = fault.remedy if fault else ""
-        yield warn_unless(not fault, "camera", f"{found}, but {fault.what}" if fault else found, remedy)
+        yield Check("camera", "ok", found)
 
 
-def arduino(port: str, *, dev: Path = Path("/dev"), boot_s: float = BOOT_S) -> Iterator[Check]:
-    """Check that the port is there and free, what answers on it and how fast, and whether the transmitter is on."""
-    if not Path(port).exists():
-        others = sorted(str(p) for pattern in ("ttyUSB*", "ttyACM*") for p in dev.glob(pattern))
-        remedy = f"--port {others[0]}" if others else "plug it in; dmesg | tail says whether the kernel saw it"
-        yield Check("Arduino", "fail", f"no {port}; there is {', '.join(others) or 'no other serial port'}", remedy)
-        return
+def _newest_after(camera: Any, seconds: float) -> Frame:
+    """Watch a camera for a while, and return its last frame."""
+    end, last = time.monotonic() + seconds, camera.latest()
+    while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
+        last = frame
+    return last
+
+
+def arduino(port: str, *, boot_s: float = BOOT_S) -> Iterator[Check]:
+    """Check that the port is free, what answers on it and how fast, and the transmitter. Raises LinkError."""
     with ServoLink(port, boot_s=boot_s) as link:
         firmware = link.hello.firmware if link.hello else "unknown"
         yield Check("Arduino", "ok", f"{port}: firmware {firmware}, protocol {PROTOCOL_VERSION}")
@@ -266,24 +209,18 @@ def arduino(port: str, *, dev: Path = Path("/dev"), boot_s: float = BOOT_S) -> I
 
 
 def _transmitter(link: ServoLink) -> Check:
-    end, silent = time.monotonic() + SIGNAL_S, ["steering", "throttle"]
-    pulses: dict[str, int | None] = {}
-    while time.monotonic() < end and silent:
-        if telemetry := link.latest():
-            pulses = {"steering": telemetry.receiver_steering_us, "throttle": telemetry.receiver_throttle_us}
-            silent = [name for name, pulse_us in pulses.items() if pulse_us is None]
-        time.sleep(0.02)
-    if silent and link.car.human == "gamepad":
-        return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
-    if silent:
-        found = f"no signal on {' and '.join(silent)}: arming will be refused"
-        remedy = "switch it on, then look at the receiver's wires (firmware/README.md)"
-        return Check("transmitter", "fail", found, remedy)
-    found, throttle_us = f"steering {pulses['steering']} us, throttle {pulses['throttle']} us", pulses["throttle"]
-    rests = throttle_us is not None and abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
-    return warn_unless(
-        rests, "transmitter", found if rests else f"{found}: arming will be refused", "let go of the throttle stick"
-    )
+    steering_us, throttle_us = _pulses(_soon(link, lambda status: None not in _pulses(status), SIGNAL_S))
+    if steering_us is None or throttle_us is None:
+        if link.car.human == "gamepad":
+            return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
+        channels = " and ".join(n for n, us in (("steering", steering_us), ("throttle", throttle_us)) if us is None)
+        calibrate = "" if car_file() else "if it has pulses of its own, rover calibrate; "
+        remedy = f"switch it on; {calibrate}then look at the receiver's wires (firmware/README.md)"
+        return Check("transmitter", "fail", f"no signal on {channels}: arming will be refused", remedy)
+    found = f"steering {steering_us} us, throttle {throttle_us} us"
+    rests = abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
+    found += "" if rests else ": arming will be refused"
+    return warn_unless(rests, "transmitter", found, "let go of the throttle stick")
 
 
 def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S) -> Iterator[Check]:
@@ -299,7 +236,8 @@ def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S)
         if check.verdict != "ok":
             return
         ask("Move the steering stick far to both sides, and let go of it.")
-        if (seen := _soon(link, lambda status: status.missing == "-", RITUAL_S)).missing != "-":
+        seen = _soon(link, lambda status: status.missing == "-", RITUAL_S)
+        if seen.missing != "-":
             remedy = f"{link.remedy(seen.missing)}, and try again"
             yield Check("arming", "fail", "the receiver's pulses did not show it", remedy)
             return
@@ -342,7 +280,7 @@ def _failsafe(before: tuple[int | None, ...], after: tuple[int | None, ...], res
 def car(artifact: Path | str | None = None) -> Iterator[Check]:
     """Say which car this is, and warn if the artifact was calibrated for another. If its human has a gamepad, open it.
 
-    Raises CarError for a bad car.yml, and GamepadError.
+    Raises CarError for a bad car.yml or gamepad.
     """
     this, path = this_car(), car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
@@ -357,48 +295,24 @@ def car(artifact: Path | str | None = None) -> Iterator[Check]:
                 yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
 
 
-def side(recording: Path) -> Iterator[Check]:
-    """Hold what a recorded drive's pictures show of its steering against car.yml. Raises EpisodeError for no drive."""
-    found, said = measure_recorded(recording), this_car().positive
-    if found.side is None:
-        remedy = "record a minute in which the car turns to both sides: rover record --max-seconds 60 episodes"
-        yield Check("side", "warning", found.words(), remedy)
-    elif found.side != said:
-        remedy = f"is the camera's picture mirrored? If not, steering: positive: {found.side} belongs into car.yml"
-        yield Check("side", "fail", f"{found.words()}, and this car's file says {said}", remedy)
-    else:
-        yield Check("side", "ok", found.words())
-
-
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     """Check whether ModemManager runs, because it writes to every new serial port."""
+    runs = False
     for process in proc_root.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has just ended
-            if (process / "comm").read_text().strip() == "ModemManager":
-                remedy = "sudo systemctl disable --now ModemManager"
-                yield Check("ModemManager", "warning", "runs: it writes to serial ports that appear", remedy)
-                return
-    yield Check("ModemManager", "ok", "does not run")
+            runs |= (process / "comm").read_text().strip() == "ModemManager"
+    found = "runs: it writes to serial ports that appear" if runs else "does not run"
+    yield warn_unless(not runs, "ModemManager", found, "sudo systemctl disable --now ModemManager")
 
 
 def engines_here() -> Iterator[Check]:
-    """Report the installed engines: torch with its quantization engines, and ONNX Runtime. One of them is enough."""
+    """Report the installed engines, torch and ONNX Runtime. One of them is enough."""
     missing = []
-    try:
-        import torch
-
-        engines = ", ".join(torch.backends.quantized.supported_engines)
-        found = f"{torch.__version__}, engines {engines}, {torch.get_num_threads()} threads"
-        remedy = "INT8 artifacts need qnnpack: install PyPI's build of torch"
-        yield Check("torch", "ok", found) if "qnnpack" in engines else Check("torch", "fail", found, remedy)
-    except ImportError as error:
-        missing.append(f"torch ({error})")
-    try:
-        import onnxruntime
-
-        yield Check("onnxruntime", "ok", onnxruntime.__version__)
-    except ImportError as error:
-        missing.append(f"onnxruntime ({error})")
+    for name in ("torch", "onnxruntime"):
+        try:
+            yield Check(name, "ok", importlib.import_module(name).__version__)
+        except ImportError as error:
+            missing.append(f"{name} ({error})")
     if len(missing) == 2:
         found = f"none can be imported: {', '.join(missing)}"
         yield Check("engines", "fail", found, "pip install -r requirements_pi.txt")
@@ -463,19 +377,19 @@ def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
     yield warn_unless(fine, "governor", ", ".join(found) or "not reported", remedy)
 
 
-def disk(log_folder: Path, recordings: Path, usage: Callable[[Path], Any] = shutil.disk_usage) -> Iterator[Check]:
+def disk(log_folder: Path, recordings: Path) -> Iterator[Check]:
     """Check that there is room for flight logs and recordings, and that their folders can be written."""
     max_bytes, keep = log_limits()
     log_mb = max_bytes / 1e6 * (keep + 1)
     for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
         there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-        free_mb = usage(there).free / 1e6
-        if not os.access(there, os.W_OK | os.X_OK):
+        free_mb = shutil.disk_usage(there).free / 1e6
+        if os.access(there, os.W_OK | os.X_OK):
+            found = f"{free_mb:.0f} MB free for {what} in {folder}, {need_mb:.0f} are wanted"
+            yield warn_unless(free_mb >= need_mb, "disk", found, "delete what is old")
+        else:
             remedy = f"sudo chown {getpass.getuser()} {there}"
             yield Check("disk", "warning", f"{folder}: not writable, for {what}", remedy)
-            continue
-        found = f"{free_mb:.0f} MB free for {what} in {folder}, {need_mb:.0f} are wanted"
-        yield warn_unless(free_mb >= need_mb, "disk", found, "delete what is old")
 
 
 def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
@@ -484,13 +398,3 @@ def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     free_mb = int(rows["MemAvailable"].split()[0]) * 1024 / 1e6
     remedy = "end other programs (a desktop needs 500 MB: sudo systemctl set-default multi-user.target)"
     yield warn_unless(free_mb >= MEMORY_MB, "memory", f"{free_mb:.0f} MB free, {MEMORY_MB} are wanted", remedy)
-
-
-def clock(now_s: float | None = None, built_s: float | None = None) -> Iterator[Check]:
-    """Check that the date can be right, because recordings are named after it and flight logs contain it."""
-    now_s = time.time() if now_s is None else now_s
-    built_s = Path(__file__).stat().st_mtime if built_s is None else built_s
-    fine = now_s >= max(EARLIEST_S, built_s) - 86_400
-    found = time.strftime("%Y-%m-%d %H:%M", time.localtime(now_s))
-    remedy = "connect it to a network (timedatectl shows the rest), or sudo date -s '...'"
-    yield warn_unless(fine, "clock", found if fine else f"{found}, before this program was installed", remedy)

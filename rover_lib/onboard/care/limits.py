@@ -15,34 +15,31 @@ GATE_KEYS = {"memory_mb": "peak_memory_mb", "model_size_mb": "size_mb"}  # gates
 
 
 def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Hold measured figures against gates: one {gate, limit, found, passed} each; passed is None if not
-    measured.
+    """Hold measured figures against gates: one {gate, limit, found, passed} each; passed is None if not measured.
 
-    A gate is a number or a [low, high] range that was promised. Doing better than promised passes: a latency
-    need only not be above its range, a rate not below it. A single number must be stayed under (rates:
-    reached). A text, such as throttled "0x0", must be equal. Raises ParamsError for a gate that is none of
-    these.
+    A gate is a number or a [low, high] range that was promised. Doing better than promised passes: a latency need only
+    not be above its range, a rate not below it. A single number must be stayed under (rates: reached). A text, such as
+    throttled "0x0", must be equal. Raises ParamsError for a gate that is none of these.
     """
     rows = []
     for gate, limit in gates.items():
-        value = metrics.get(gate)
-        if value is None:
-            value = metrics.get(GATE_KEYS.get(gate, gate))
-        if isinstance(limit, str):
-            passed = None if value is None else value == limit
-            rows.append({"gate": gate, "limit": limit, "found": value, "passed": passed})
-            continue
-        is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
-        ends = list(limit) if is_range else [limit]
-        if not all(map(is_number, ends)) or ends != sorted(ends):
-            raise ParamsError(
-                f"gate {gate} must be a number, [low, high] or a text", found=repr(limit), remedy="see params.yml"
-            )
-        if value is None or isinstance(value, str) or math.isnan(value):
-            value, passed = None, None
-        elif gate in HIGHER_IS_BETTER:
-            passed = bool(value >= ends[0])
-        else:
-            passed = bool(value <= ends[1] if is_range else value < ends[0])
-        rows.append({"gate": gate, "limit": limit, "found": value, "passed": passed})
+        value = metrics.get(gate, metrics.get(GATE_KEYS.get(gate, gate)))
+        if isinstance(value, float) and math.isnan(value):
+            value = None
+        rows.append({"gate": gate, "limit": limit, "found": value, "passed": _passes(gate, value, limit)})
     return rows
+
+
+def _passes(gate: str, value: Any, limit: Any) -> bool | None:
+    if isinstance(limit, str):
+        return None if value is None else bool(value == limit)
+    is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
+    ends = list(limit) if is_range else [limit]
+    if not all(map(is_number, ends)) or ends != sorted(ends):
+        what = f"gate {gate} must be a number, [low, high] or a text"
+        raise ParamsError(what, found=repr(limit), remedy="see params.yml")
+    if value is None:
+        return None
+    if gate in HIGHER_IS_BETTER:
+        return bool(value >= ends[0])
+    return bool(value <= ends[1] if is_range else value < ends[0])

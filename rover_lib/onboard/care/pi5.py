@@ -11,7 +11,7 @@ know them. docs/clock.md shows those.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,6 @@ from rover_lib.onboard.errors import ParamsError
 
 FITTED = Path(__file__).with_name("pi5.json")  # its program: lab/a76/clock.py at commit 545214c
 CORES = 4
-OVERLAP = 2  # of what a core does and what the memory does: 1 if they took turns, more the more they overlap
 DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view
 
 
@@ -64,14 +63,10 @@ class Work:
 
 @cache
 def fitted() -> dict[str, Any]:
-    """Return the fit: `ns` of each term, `off` by threads (see `spread`), and `gmac_per_s` (see `estimate_ms`)."""
+    """Return the fit: `ns` of each term, `off` by threads (the largest natural logarithm of a ratio of two times), and
+    `gmac_per_s` (see `estimate_ms`).
+    """
     return json.loads(FITTED.read_text())
-
-
-def time_ms(terms: Sequence[float], ns: Sequence[float], overlap: int = OVERLAP) -> float:
-    """Return the time of one inference from the terms of its work, in 10**9, and what one of each takes."""
-    own, shared = terms[0] * ns[0] + terms[1] * ns[1], terms[2] * ns[2]
-    return 1e3 * (own**overlap + shared**overlap) ** (1 / overlap)
 
 
 def predict_ms(work: Work, threads: int = DRIVING, fit: Mapping[str, Any] | None = None) -> Span:
@@ -80,11 +75,9 @@ def predict_ms(work: Work, threads: int = DRIVING, fit: Mapping[str, Any] | None
     Raises ParamsError for threads that a Pi 5 does not have.
     """
     fit = fit or fitted()
-    return spread(time_ms(work.terms(threads), fit["ns"]), fit["off"]["1" if threads == 1 else "4"])
-
-
-def spread(ms: float, off: float) -> Span:
-    """Return a time with its ends. off: the largest natural logarithm of a ratio of two times."""
+    (cycles, near, far), ns = work.terms(threads), fit["ns"]
+    ms = 1e3 * ((cycles * ns[0] + near * ns[1]) ** 2 + (far * ns[2]) ** 2) ** 0.5
+    off = fit["off"]["1" if threads == 1 else "4"]
     return Span(ms * math.exp(-off), ms, ms * math.exp(off))
 
 

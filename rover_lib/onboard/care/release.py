@@ -27,11 +27,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from rover_lib.onboard.artifact.acceptance import THIS_CAR, Expected, inspect_artifact
 from rover_lib.onboard.errors import RoverError, printable
-from rover_lib.onboard.stage import sha256_of
+from rover_lib.onboard.stage import private_lock, sha256_of
 
 MODELS = Path("/var/lib/rover/models")
 POLICY, ORIGIN = "policy.pt", "release.json"
@@ -41,10 +41,6 @@ HISTORY = 100
 SANDBOX = "rover-check@{}.service"
 
 Check = Callable[[str], None]  # takes a release's name or "current"; raises RoverError
-
-
-class ReleaseError(RoverError):
-    """A deployment that failed. The release in use stays in use, unless the error says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,8 @@ class Releases:
     """The models of a rover.
 
     check: checks that a release computes correctly; None: by running its parity vectors. Every method that changes
-    something holds the lock, and raises ReleaseError if another process holds it.
+    something holds the lock, and raises RoverError if another process holds it. After an error the release in use
+    stays in use, unless the error says otherwise.
     """
 
     def __init__(self, models: Path | str = MODELS, *, check: Check | None = None, expected: Expected = THIS_CAR):
@@ -82,23 +79,17 @@ class Releases:
         return name if NAME.fullmatch(name) else target
 
     def path_of(self, name: str) -> Path:
-        """Return the path of the policy of a release, or of "current". Raises ReleaseError for an invalid name."""
+        """Return the path of the policy of a release, or of "current". Raises RoverError for an invalid name."""
         if name == "current":
             return self.current_link / POLICY
         if not NAME.fullmatch(name):
             what = "a release is named by 64 hexadecimal digits or 'current'"
-            raise ReleaseError(what, found=f"'{name}'", remedy="see status")
+            raise RoverError(what, found=f"'{name}'", remedy="see status")
         return self.releases / name / POLICY
 
     def wrong_with(self, name: str) -> str:
         """Return what is wrong with the bytes of a release, "" if nothing. Needs no torch."""
-        folder = self.releases / name
-        try:
-            about = json.loads((folder / ORIGIN).read_text())
-            whole = about["sha256"] == sha256_of(folder / POLICY) and about["name"] == name
-        except (OSError, ValueError, KeyError, TypeError, RoverError) as e:
-            return f"not readable ({type(e).__name__}: {e})"
-        return "" if whole else f"{POLICY} is not what {ORIGIN} says"
+        return self._look_at(name)["wrong"]
 
     def all(self) -> list[dict[str, Any]]:
         """Return all releases: the one in use, then those used before, the latest first, then those never used.
@@ -108,13 +99,18 @@ class Releases:
         return [self._look_at(name) for name in self._by_use()]
 
     def _look_at(self, name: str) -> dict[str, Any]:
-        about, size = {}, 0
-        with contextlib.suppress(OSError, ValueError):
-            about = json.loads((self.releases / name / ORIGIN).read_text())
-            size = self.path_of(name).stat().st_size
-        told = {key: str(about.get(key, "?")) for key in ("mode", "origin", "sha256")}
-        told["wrong"] = self.wrong_with(name)
-        return {"name": name, "current": name == self.current, "megabytes": round(size / 1e6, 1), **told}
+        policy, about, megabytes, wrong = self.releases / name / POLICY, {}, 0.0, ""
+        try:
+            megabytes = round(policy.stat().st_size / 1e6, 1)
+            about = json.loads(policy.with_name(ORIGIN).read_text())
+            if about["name"] != name or about["sha256"] != sha256_of(policy):
+                wrong = f"{POLICY} is not what {ORIGIN} says"
+        except (OSError, ValueError, KeyError, TypeError, RoverError) as e:
+            wrong = f"not readable ({type(e).__name__}: {e})"
+        told = dict.fromkeys(("mode", "origin", "sha256"), "?")
+        if isinstance(about, dict):
+            told |= {key: str(about[key]) for key in told if key in about}
+        return {"name": name, "current": name == self.current, "megabytes": megabytes, "wrong": wrong, **told}
 
     def status(self) -> dict[str, Any]:
         """Return the present state: current, mode, since, healthy, trouble, releases, disk_free_mb.
@@ -123,12 +119,9 @@ class Releases:
         are intact; if not, trouble says why. disk_free_mb: free space where the models are.
         """
         releases, current, since = self.all(), self.current, None
-        in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": ""})
-        trouble = in_use["wrong"]
-        if current is None:
-            trouble = "no model: deploy one"
-        elif "name" not in in_use:
-            trouble = f"current points to {current}, which is no release: deploy or roll back"
+        in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": "no model: deploy one"})
+        if current and "name" not in in_use:
+            in_use["wrong"] = f"current points to {current}, which is no release: deploy or roll back"
         with contextlib.suppress(OSError):
             since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.current_link.lstat().st_mtime))
         nearest = next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
@@ -136,8 +129,8 @@ class Releases:
             "current": current,
             "mode": in_use["mode"],
             "since": since,
-            "healthy": not trouble,
-            "trouble": trouble,
+            "healthy": not in_use["wrong"],
+            "trouble": in_use["wrong"],
             "releases": releases,
             "disk_free_mb": round(shutil.disk_usage(nearest).free / 1e6),
         }
@@ -145,15 +138,15 @@ class Releases:
     def verify(self, name: str = "current") -> None:
         """Check that a release's bytes are intact, and that it computes correctly here (parity vectors).
 
-        Raises ReleaseError or ArtifactError.
+        Raises RoverError.
         """
         path = self.path_of(name)
         if not path.exists():
-            raise ReleaseError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
+            raise RoverError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
         from rover_lib.onboard.policy.load import load_policy
 
         if wrong := self.wrong_with(path.parent.resolve().name):
-            raise ReleaseError(f"{path}: {wrong}", remedy="deploy it again")
+            raise RoverError(f"{path}: {wrong}", remedy="deploy it again")
         load_policy(path)
 
     # Changes
@@ -165,20 +158,23 @@ class Releases:
 
         sha256: what the file's must be, if it is known. origin: where the artifact came from; this host and its path if
         None. A release that exists and is intact stays as it is. The files of a damaged one are replaced, even while
-        it is in use: each file is the old or the new one at any moment. Raises ReleaseError, ArtifactError.
+        it is in use: each file is the old or the new one at any moment. Raises RoverError.
         """
         source = Path(source)
         with self._lock():
             if not source.is_file():
-                raise ReleaseError(f"{source}: not a file", remedy="stage takes an artifact")
-            self._check_free_space(source.stat().st_size)
+                raise RoverError(f"{source}: not a file", remedy="stage takes an artifact")
+            free_mb = shutil.disk_usage(self.models).free / 1e6
+            if free_mb < (wanted_mb := (source.stat().st_size + SPARE_BYTES) / 1e6):
+                what = f"{self.models}: {free_mb:.0f} MB free, {wanted_mb:.0f} are needed"
+                raise RoverError(what, remedy="prune releases")
             new = self.releases / ".new"
             new.mkdir()
             shutil.copyfile(source, new / POLICY)
             arrived = sha256_of(new / POLICY)
             if sha256 and arrived != sha256:
                 what = f"{source}: arrived damaged (sha256 {arrived[:12]}, not {sha256[:12]})"
-                raise ReleaseError(what, remedy="send it again")
+                raise RoverError(what, remedy="send it again")
             try:
                 artifact = inspect_artifact(new / POLICY, self.expected, allow)
             except RoverError as e:
@@ -203,13 +199,12 @@ class Releases:
     def switch(self, name: str) -> bool:
         """Check a release, switch to it, and check it again through `current`; switch back if that fails.
 
-        Returns whether anything changed. Raises ReleaseError, whose text says which release is in use now.
+        Returns whether anything changed. Raises RoverError, whose text says which release is in use now.
         """
         with self._lock():
             before = self.current
             if name == "current":
-                raise ReleaseError("'current' is in use already", remedy="name the release to switch to")
-            self.path_of(name)
+                raise RoverError("'current' is in use already", remedy="name the release to switch to")
             self.check(name)
             if before == name:
                 return False
@@ -220,13 +215,13 @@ class Releases:
                 self._point_current_at(before)
                 now = f"{before[:12]} is in use again" if before else "no model is in use, as before"
                 if isinstance(error, RoverError):
-                    raise ReleaseError(f"{name[:12]} failed after the switch, {now}: {error}") from error
+                    raise RoverError(f"{name[:12]} failed after the switch, {now}: {error}") from error
                 raise
             self._write_history([*self._history(), name])
             return True
 
     def rollback(self) -> str:
-        """Switch to the newest earlier release that passes its checks. Returns its name. Raises ReleaseError."""
+        """Switch to the newest earlier release that passes its checks. Returns its name. Raises RoverError."""
         with self._lock():
             refused = []
             for name in self._used_before():
@@ -241,15 +236,13 @@ class Releases:
                 return name
             why = f" ({'; '.join(refused)})" if refused else ""
             now = f"{self.current[:12]} stays in use" if self.current else "no model is in use"
-            raise ReleaseError(f"there is no release to roll back to{why}; {now}", remedy="deploy one instead")
+            raise RoverError(f"there is no release to roll back to{why}; {now}", remedy="deploy one instead")
 
     def prune(self, keep: int = 3) -> list[str]:
-        """Remove all but the `keep` releases used last, but never the one in use. Returns the removed names.
+        """Remove all but the `keep` (from 1) releases used last, but never the one in use. Returns the removed names.
 
         A release that was never in use counts as older than any that was. Damaged releases are removed.
         """
-        if keep < 1:
-            raise ReleaseError("at least 1 release is kept", found=keep)
         with self._lock():
             names = self._by_use()
             kept = [name for name in names if not self.wrong_with(name)][:keep]
@@ -270,9 +263,9 @@ class Releases:
         """Hold the lock, and remove what an interrupted command left behind."""
         self.releases.mkdir(parents=True, exist_ok=True)
         try:
-            lock = FileLock(self.models / ".lock", timeout=0, mode=0o600).acquire()  # nobody else may hold it
+            lock = private_lock(self.models / ".lock").acquire()
         except Timeout:
-            raise ReleaseError(f"{self.models}: another deployment is at work", remedy="wait for it") from None
+            raise RoverError(f"{self.models}: another deployment is at work", remedy="wait for it") from None
         with lock:
             self._tidy()
             try:
@@ -288,12 +281,6 @@ class Releases:
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
             self._write_history([*history, current])  # a switch was interrupted before the history was written
-
-    def _check_free_space(self, needed: int) -> None:
-        free_mb, wanted_mb = shutil.disk_usage(self.models).free / 1e6, (needed + SPARE_BYTES) / 1e6
-        if free_mb < wanted_mb:
-            what = f"{self.models}: {free_mb:.0f} MB free, {wanted_mb:.0f} are needed"
-            raise ReleaseError(what, remedy="prune releases")
 
     def _point_current_at(self, name: str | None) -> None:
         """Switch `current` to a release, atomically and synced; remove it for None."""
@@ -319,7 +306,8 @@ class Releases:
         """
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
-            _save(new, names[-HISTORY:])
+            new.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")
+            _sync(new)
             new.replace(self.models / "history.json")
             _sync(self.models)
 
@@ -337,14 +325,14 @@ class Releases:
 def check_in_sandbox(name: str) -> None:
     """Check a release by `rover release verify NAME` in the service's sandbox, with the unit of provision.yml.
 
-    Raises ReleaseError, with the check's own sentence, if it does not pass.
+    Raises RoverError, with the check's own sentence, if it does not pass.
     """
     unit = SANDBOX.format(name)
     started = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
     if started.returncode:
         ask = ["journalctl", "--unit", unit, "--output=cat", "--grep=^rover: ", "--lines=1"]
         said = subprocess.run(ask, capture_output=True, text=True).stdout.strip().removeprefix("rover: ")
-        raise ReleaseError(f"{unit}: {said or started.stderr.strip() or f'exit code {started.returncode}'}")
+        raise RoverError(f"{unit}: {said or started.stderr.strip() or f'exit code {started.returncode}'}")
 
 
 def _let_service_read(folder: Path) -> None:
@@ -359,12 +347,6 @@ def _let_service_read(folder: Path) -> None:
 def _up_to_last(history: list[str], name: str | None) -> list[str]:
     """Return the history up to the last time that a release was in use; all of it if it never was."""
     return history[: len(history) - history[::-1].index(name)] if name in history else history
-
-
-def _save(path: Path, content: Any) -> None:
-    """Write a synced JSON file."""
-    path.write_text(json.dumps(content, indent=1) + "\n")
-    _sync(path)
 
 
 def _sync(path: Path) -> None:

@@ -12,13 +12,14 @@ from functools import partial
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive.loop import Arm
-from rover_lib.onboard.drive.service import CHECK_S, NotArmed, Service, check_age
+from rover_lib.onboard.drive.service import CHECK_S, Service, check_age
+from rover_lib.onboard.errors import RoverError
 
 WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduino refuses an arming after 31
 
 
 def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
-    """Return a check for a car that was asked for at asked_s: it raises NotArmed once that is more than WAIT_S ago."""
+    """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
     return lambda: check_age(clock() - asked_s, WAIT_S)
 
 
@@ -57,8 +58,8 @@ def arm_when_ready(
 ) -> Telemetry | None:
     """Arm for a human in a terminal: say what is missing, wait for it, and then arm.
 
-    checks: called while waiting; each raises if its device fails. still_wanted: raises NotArmed when the human asked
-    too long ago; None: they ask now. Raises NotArmed too when told to stop, what a check raises, and what arm() raises.
+    checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked
+    too long ago; None: they ask now. Raises RoverError when told to stop, and what checks and arm() raise.
     """
     still_wanted = still_wanted or wanted_since(boottime())
     link.request()
@@ -71,7 +72,7 @@ def arm_when_ready(
         for check in checks:
             check()
         if stop.wait(CHECK_S):
-            raise NotArmed("told to stop before a human armed the car")
+            raise RoverError("told to stop before a human armed the car", kind="not armed")
     still_wanted()
     return arm()
 

@@ -16,7 +16,6 @@ stream may be a terminal that somebody stopped.
 
 import contextlib
 import errno
-import fcntl
 import glob
 import json
 import logging
@@ -35,6 +34,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from filelock import BaseFileLock, Timeout
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import THROTTLED_VALUE, Host, throttled_means
@@ -42,7 +42,7 @@ from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import FILE_BYTES, plain, read_plain
+from rover_lib.onboard.stage import FILE_BYTES, plain, private_lock, read_plain
 
 SCHEMA = 2
 QUEUE_ROWS = 2048  # the disk may stall for a minute at 30 Hz; 1 MB
@@ -57,10 +57,6 @@ NAME_A_LOG = "name a file that rover drive wrote"
 MISSING = "ticks are missing before this one"
 
 _log = logging.getLogger("rover")
-
-
-class LogError(RoverError):
-    """The flight log is missing, or nothing in it can be read."""
 
 
 class Tick(NamedTuple):
@@ -115,7 +111,7 @@ class FlightLog:
 
     path: the file, to which the drive is appended; None only passes events on to logging. header: what the drive was
     started with; the figure of a log looks for hz, fade_s and stop_s in it. max_bytes: a file of this size is renamed
-    to path.1, path.1 to path.2 and so on, and only `keep` older files stay. Raises LogError on entering if another
+    to path.1, path.1 to path.2 and so on, and only `keep` older files stay. Raises RoverError on entering if another
     drive writes the file, and nothing later: if the disk is full or gone, this is logged once, and tried again every
     second. Ticks must come from one thread; events may come from any, and from the handlers of signals.
     """
@@ -140,7 +136,7 @@ class FlightLog:
         self._rows: deque[Tick | Event] = deque(maxlen=QUEUE_ROWS if self.path else 0)
         self._dropped = 0  # ticks for which the queue had no room
         self._messages: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()  # None: the end
-        self._locked: FileIO | None = None
+        self._locked: BaseFileLock | None = None
         self._closing = threading.Event()
         self._teller = threading.Thread(target=self._tell, name="flight log events", daemon=True)
         self._writer = threading.Thread(target=self._write, name="flight log", daemon=True)
@@ -179,17 +175,17 @@ class FlightLog:
         self._messages.put(None)
         self._teller.join(max(0.0, end - time.monotonic()))
         if self._locked:
-            self._locked.close()
+            self._locked.release()
 
     def _lock(self, path: Path) -> None:
-        """Keep other drives from the file, also while it is renamed. Raises LogError if one writes it now."""
+        """Keep other drives from the file, also while it is renamed. Raises RoverError if one writes it now."""
         with contextlib.suppress(OSError):  # where nothing can be locked, such as beside /dev/null
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._locked = FileIO(path.with_name(f".{path.name}.lock"), "a")
+            self._locked = private_lock(path.with_name(f".{path.name}.lock"))
             try:
-                fcntl.flock(self._locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise LogError(f"{path}: another drive writes this log", remedy="name another by --log") from None
+                self._locked.acquire()
+            except Timeout:
+                raise RoverError(f"{path}: another drive writes this log", remedy="name another by --log") from None
 
     def _pass_on(self, level: int, message: object) -> None:
         if self._messages.qsize() < QUEUE_EVENTS:
@@ -379,19 +375,19 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
 
     drive: index of the drive in these files: 0 is the first, -1 the last. A service's log has a drive for each arming.
-    Raises LogError if the file is missing or not a regular file, holds no line of a flight log, has no such drive, or
+    Raises RoverError if the file is missing or not a regular file, holds no line of a flight log, has no such drive, or
     was written in another version of the format.
     """
     path = Path(path)
     drives, damaged = _read_drives(path)
     if not drives:
-        raise LogError(f"{path}: no line of a flight log in it, {damaged} of something else", remedy=NAME_A_LOG)
+        raise RoverError(f"{path}: no line of a flight log in it, {damaged} of something else", remedy=NAME_A_LOG)
     if not -len(drives) <= drive < len(drives):
         remedy = f"choose from 0 to {len(drives) - 1}, or -1"
-        raise LogError(f"{path}: no drive {drive}, it has {len(drives)}", remedy=remedy)
+        raise RoverError(f"{path}: no drive {drive}, it has {len(drives)}", remedy=remedy)
     chosen = drives[drive]
     if (schema := chosen.header.get("schema", SCHEMA)) != SCHEMA:
-        raise LogError(f"{path}: of version {schema}, this program reads {SCHEMA}", remedy="use the other version's")
+        raise RoverError(f"{path}: of version {schema}, this program reads {SCHEMA}", remedy="use the other version's")
     columns = zip(*chosen.ticks, strict=True) if chosen.ticks else [()] * len(Tick._fields)
     times_s, temperatures_c, throttled = zip(*chosen.machine, strict=True) if chosen.machine else ((), (), ())
     return Flight(
@@ -411,13 +407,13 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
 
 
 def _read_drives(path: Path) -> tuple[list[_Drive], int]:
-    """Return the drives of a log and its older files, and how many lines were damaged. Raises LogError."""
+    """Return the drives of a log and its older files, and how many lines were damaged. Raises RoverError."""
     older = [p for p in path.parent.glob(f"{glob.escape(path.name)}.*") if p.suffix[1:].isdecimal()]
     files = [*sorted(older, key=lambda p: -int(p.suffix[1:])), path]
     try:
         lines = [line for file in files for line in read_plain(file).split(b"\n") if line]
     except OSError as error:
-        raise LogError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
+        raise RoverError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
     drives: list[_Drive] = []
     damaged = 0
     for row in map(_row, lines):

@@ -23,7 +23,7 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.drive.flight_log import ARMED, Tick
 from rover_lib.onboard.drive.pilot import Order, Pilot
-from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, TakenOver, sentence_of
+from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
 
 RATES_HZ = (10.0, 100.0)
 KEEP_S = 0.034  # longest time between commands, even if ticks are rarer: to the Arduino, 100 ms without one is a pause
@@ -141,7 +141,7 @@ def drive(
 
     link: None: no motor is driven. rate_hz: commands per second, within RATES_HZ. until: None: the drive ends when the
     pilot has no more orders. report: is filled during the drive, so that it is there after a fault too.
-    Raises RoverError if the drive cannot begin, DriveFault if a fault stopped the car, TakenOver if the human did. From
+    Raises RoverError if the drive cannot begin, DriveFault if a fault or the human stopped the car. From
     arming on, neutral is sent before anything is raised.
     """
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
@@ -160,7 +160,7 @@ def drive(
         stopped = loop.neutral()  # before anything else, which may take long
         report.ended = sentence_of(error)
         log.event(report.ended, level=logging.ERROR)
-        if isinstance(error, RoverError) and not isinstance(error, (DriveFault, TakenOver)) and loop.armed:
+        if isinstance(error, RoverError) and not isinstance(error, DriveFault) and loop.armed:
             raise DriveFault(error.what, found=error.found, remedy=error.remedy) from error
         raise
     else:
@@ -279,7 +279,7 @@ class _Loop:
     def _telemetry(self) -> Telemetry | None:
         """Return the Arduino's newest status; None without a link.
 
-        Raises DriveFault or TakenOver if that status does not let the host drive, LinkError if the link failed.
+        Raises DriveFault if that status does not let the host drive, LinkError if the link failed.
         """
         if not self.link:
             return None
@@ -294,7 +294,7 @@ class _Loop:
             why = hello.reset if hello and hello.boot == telemetry.boot else "unknown reason"
             raise DriveFault(f"the Arduino was reset ({why}); it is in manual now")
         if telemetry.state is State.MANUAL:
-            raise TakenOver("the human took over with the transmitter")
+            raise DriveFault("the human took over with the transmitter", kind="taken over")
         if telemetry.state is not State.AUTONOMOUS:
             raise DriveFault(f"the Arduino stopped the car: {telemetry.why}")
         if (age_s := self.link.unacknowledged_s(self.clock())) > LATE_S:

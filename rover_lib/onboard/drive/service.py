@@ -55,14 +55,6 @@ DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
 WAITING = "waiting for a human to arm it"
 
 
-class NotArmed(RoverError):
-    """The car was not armed: the request was refused, or the service was told to stop."""
-
-
-class ServiceError(RoverError):
-    """The service cannot be reached, or does not do what was asked."""
-
-
 @dataclass(frozen=True)
 class Request:
     """Limits that an operator sets for a drive.
@@ -79,11 +71,13 @@ class Request:
 
 
 def check_age(age_s: float, most_s: float | None = None) -> None:
-    """Raise NotArmed for a request to arm that is too old: whoever sent it may no longer be watching the car."""
+    """Raise RoverError for a request to arm that is too old: whoever sent it may no longer be watching the car."""
     most_s = REQUEST_S if most_s is None else most_s
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
-        raise NotArmed(
-            f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may", remedy="ask again"
+        raise RoverError(
+            f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may",
+            remedy="ask again",
+            kind="not armed",
         )
 
 
@@ -92,7 +86,7 @@ class Service:
 
     report: the drive's report, whose ticks feed the watchdog. stop: ends the waiting. model: content hash of the model
     that drives. Without systemd (no NOTIFY_SOCKET) no notifications are sent, and everything else is the same. The
-    operators' socket is in $RUNTIME_DIRECTORY. Raises ServiceError if it cannot be made there.
+    operators' socket is in $RUNTIME_DIRECTORY. Raises RoverError if it cannot be made there.
     """
 
     def __init__(
@@ -127,7 +121,7 @@ class Service:
     def __enter__(self) -> "Service":
         path = _socket_path()
         if is_listened_at(path):  # if we took its socket, nobody could arm its car or send it heartbeats
-            raise ServiceError(f"{path}: another service listens there", remedy="end that one first")
+            raise RoverError(f"{path}: another service listens there", remedy="end that one first")
         self._operators = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             path.unlink(missing_ok=True)
@@ -135,7 +129,7 @@ class Service:
             path.chmod(0o600)
         except OSError as error:
             self._operators.close()
-            raise ServiceError(f"{path}: no operator could arm the car ({error})", remedy="use systemd") from None
+            raise RoverError(f"{path}: no operator could arm the car ({error})", remedy="use systemd") from None
         self._operators.listen()
         self._operators.settimeout(FEED_S)
         for thread in self._threads:
@@ -164,7 +158,7 @@ class Service:
 
         arm: must call check_request() just before the Arduino is told. checks: called again and again while waiting;
         each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing; requests
-        are refused with this text. said: how the previous drive ended. Raises NotArmed when told to stop, and whatever
+        are refused with this text. said: how the previous drive ended. Raises RoverError when told to stop, and what
         a check raises.
         """
         checks = tuple(checks)
@@ -186,7 +180,7 @@ class Service:
                     continue
             try:
                 if refusal := missing():
-                    raise NotArmed(refusal)
+                    raise RoverError(refusal, kind="not armed")
                 telemetry = arm()
             except RoverError as error:  # if something is really broken, the next check finds it
                 said = f"not armed: {error}"
@@ -201,13 +195,13 @@ class Service:
             self._tell(f"{DRIVING}: armed by a human")
             self._reply(armed=True, text=self._text)
             return telemetry
-        raise NotArmed("told to stop before a human armed the car")
+        raise RoverError("told to stop before a human armed the car", kind="not armed")
 
     def check_request(self) -> None:
-        """Call this just before the Arduino is told. Raises NotArmed if the operator asked too long ago, or is gone."""
+        """Call this just before the Arduino is told. Raises if the operator asked too long ago or is gone."""
         check_age(self._clock() - self._asked_s)
         if self._hung_up():
-            raise NotArmed("whoever asked for the car is gone", remedy="ask again")
+            raise RoverError("whoever asked for the car is gone", remedy="ask again", kind="not armed")
 
     def alive(self) -> None:
         """Tell the watchdog that the work after a drive goes on. Call it again and again during that work."""
@@ -323,7 +317,7 @@ def _is_closed(connection: socket.socket) -> bool:
 def state_of(unit: str = UNIT) -> dict[str, Any]:
     """Return what systemd knows about the service.
 
-    Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises ServiceError
+    Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises RoverError
     if there is no systemd.
     """
     names = "LoadState,ActiveState,StatusText,ActiveEnterTimestamp,NRestarts,Result,UnitFileState"
@@ -331,7 +325,7 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError) as error:
-        raise ServiceError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
+        raise RoverError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
     properties = dict(line.partition("=")[::2] for line in result.stdout.splitlines())
     text = properties.get("StatusText", "")
     return {
@@ -347,16 +341,16 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
 
 
 def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
-    """Send a question to the service and return its answer. Raises ServiceError if it is not reached or is silent."""
+    """Send a question to the service and return its answer. Raises RoverError if it is not reached or is silent."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ARMED_S)
         try:
             connection.connect(str(_socket_path()))
         except PermissionError as error:
-            raise ServiceError(f"{unit} cannot be asked ({error})", remedy="use sudo") from None
+            raise RoverError(f"{unit} cannot be asked ({error})", remedy="use sudo") from None
         except OSError:
             state = state_of(unit)
-            raise ServiceError(
+            raise RoverError(
                 f"{unit} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})",
                 remedy=f"sudo systemctl start {unit}",
             ) from None
@@ -364,7 +358,7 @@ def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
             connection.send(json.dumps(question).encode())
             return json.loads(connection.recv(QUESTION_BYTES))
         except (OSError, ValueError) as error:
-            raise ServiceError(f"{unit} gave no answer ({error})", remedy="use sudo") from None
+            raise RoverError(f"{unit} gave no answer ({error})", remedy="use sudo") from None
 
 
 def arm_car(
@@ -376,7 +370,7 @@ def arm_car(
     notify: Callable[[str], None] = lambda text: None,
     wait_s: float = 0.0,
 ) -> str:
-    """Arm the car whose service waits for it; return what the service then says. Raises ServiceError if it refuses.
+    """Arm the car whose service waits for it; return what the service then says. Raises RoverError if it refuses.
 
     model: content hash of the model that is meant; "": whichever the service has loaded. confirm: called with the
     service's state (model, text) before arming; may raise. wait_s: how long to wait for what is missing, such as the
@@ -384,7 +378,7 @@ def arm_car(
     """
     state = ask_service(unit, ask="state")
     if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
-        raise ServiceError(
+        raise RoverError(
             f"{unit} has loaded another model than {model[:12]}",
             found=state["model"][:12],
             remedy="did somebody else deploy meanwhile?",
@@ -399,7 +393,7 @@ def arm_car(
     asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": boottime()}
     answer = ask_service(unit, ask="arm", **asked, **vars(request))
     if not answer["armed"]:
-        raise ServiceError(f"{unit} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
+        raise RoverError(f"{unit} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
     return answer["text"]
 
 

@@ -28,10 +28,10 @@ from rover_lib.onboard.drive.loop import Hooks, Report, Until, Warnings, drive
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
-from rover_lib.onboard.drive.service import NotArmed, Service
+from rover_lib.onboard.drive.service import Service
 from rover_lib.onboard.drive.takeover import TakeoverRecorder
 from rover_lib.onboard.drive.watch import HealthWatch, boost_priority
-from rover_lib.onboard.errors import DriveFault, TakenOver, sentence_of
+from rover_lib.onboard.errors import DriveFault, RoverError, sentence_of
 from rover_lib.onboard.recording.episode import About
 from rover_lib.onboard.recording.recorder import Recorder, room_for
 
@@ -82,8 +82,8 @@ class Session:
             try:
                 drive(pilot, self.link, self.log, rate_hz=options.hz, until=until, hooks=hooks, report=self.report,
                       clock=self.clock, sleep=self.sleep)  # fmt: skip
-            except (DriveFault, TakenOver) as error:
-                if isinstance(error, TakenOver):
+            except DriveFault as error:
+                if error.kind == "taken over":
                     arming.record_human(stop, self._human_over)
                 if not self.service:
                     raise
@@ -119,7 +119,7 @@ class Session:
         return (self.service.over() if self.service else None) or self.feed.over()
 
     def check_wanted(self) -> None:
-        """Raise NotArmed if whoever asked for the car did so too long ago, or is gone."""
+        """Raise RoverError if whoever asked for the car did so too long ago, or is gone."""
         (self.service.check_request if self.service else wanted_since(self.options.asked_s, self.now))()
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
@@ -137,7 +137,7 @@ class Session:
         asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
         self.feed.show(WAITING, said, self.report, self.camera, self.link)
         if asked and not self.service:
-            raise NotArmed(asked)
+            raise RoverError(asked, kind="not armed")
 
     def _human_over(self) -> str | None:
         if self.service:

@@ -2,7 +2,7 @@
 
     recorder = TakeoverRecorder(Recorder(...), mode="static")
     hooks = Hooks(record=recorder.command)
-    ...                                              # the loop ends with TakenOver, and the car is disarmed
+    ...                                              # the loop ends with DriveFault, and the car is disarmed
     takeover = recorder.human(link, armed, rate_hz=30, stop=stop)
 
 After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,

@@ -16,8 +16,9 @@ from pathlib import Path
 from types import FrameType
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
-from rover_lib.onboard.drive.flight_log import FlightLog, LogError
+from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.stage import open_plain
 
@@ -120,10 +121,10 @@ def find_unfinished_drive(log: Path | str) -> str | None:
     A process that was killed, or lost its power, could not log its own end.
     """
     try:
-        with open_plain(log, LogError(f"{log}: not a regular file")) as file:  # opening a FIFO would wait
+        with open_plain(log, RoverError(f"{log}: not a regular file")) as file:  # opening a FIFO would wait
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
             lines = file.read().splitlines()
-    except (OSError, LogError):
+    except (OSError, RoverError):
         return None
     for line in reversed(lines):  # back to where the last drive began
         if b'"event":"neutral' in line or b'"kind":"header"' in line:

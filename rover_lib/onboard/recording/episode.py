@@ -53,10 +53,6 @@ BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter tha
 SIMULATED = "playground"  # the port of the balloon world's Arduino
 
 
-class EpisodeExists(EpisodeError):
-    """A folder of this name exists, or is being recorded."""
-
-
 @dataclass(frozen=True)
 class About:
     """The description of a recording.
@@ -124,7 +120,7 @@ class EpisodeWriter:
             self.discard()
 
     def open(self) -> None:
-        """Begin the episode. Raises EpisodeExists if the folder exists or another program is recording it."""
+        """Begin the episode. Raises EpisodeError if the folder exists or another program is recording it."""
         self._refuse_existing()
         # beside the target, so that the rename stays within one filesystem; hidden from loaders
         temporary = self.folder.with_name(f".{self.folder.name}.part")
@@ -133,9 +129,10 @@ class EpisodeWriter:
             try:
                 temporary.mkdir()
             except FileExistsError:
-                raise EpisodeExists(
+                raise EpisodeError(
                     f"{self.folder}: is being recorded, or was when its program was killed",
                     remedy=f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded",
+                    kind="exists",
                 ) from None
         self._temporary = temporary
         try:
@@ -294,7 +291,9 @@ class EpisodeWriter:
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeExists(f"{self.folder}: exists already", remedy="name another folder, or move it away first")
+            raise EpisodeError(
+                f"{self.folder}: exists already", remedy="name another folder, or move it away first", kind="exists"
+            )
 
     def _write(self, temporary: Path) -> None:
         """Write the three files in the hidden folder."""
@@ -374,7 +373,7 @@ def finish_killed(part: Path) -> Path | None:
     """
     folder = part.with_name(part.name.removeprefix(".").removesuffix(".part"))
     if _is_recording(part):
-        raise EpisodeExists(f"{folder}: is being recorded", remedy="wait until it is")
+        raise EpisodeError(f"{folder}: is being recorded", remedy="wait until it is", kind="exists")
     rows = {kind: part / f"{kind}.rows" for kind in ("control", "frame")}
     try:
         told = json.loads(_data_of(part / ABOUT))

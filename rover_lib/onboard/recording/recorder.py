@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording.episode import About, EpisodeExists, EpisodeWriter, find_killed
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, find_killed
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
@@ -233,7 +233,9 @@ def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
         try:
             writer.open()
             return writer
-        except EpisodeExists:
+        except EpisodeError as error:
+            if error.kind != "exists":
+                raise
             start_s += 1
 
 

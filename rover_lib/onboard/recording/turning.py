@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.picture import PictureError, read_jpeg
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.car.picture import read_jpeg
+from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.recording.episode import json_controls, no_pulse, number_of
 
 WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
@@ -52,7 +52,7 @@ class _File:
     def frame_bgr(self) -> np.ndarray:
         try:
             return read_jpeg(self.path)
-        except (OSError, PictureError) as e:
+        except (OSError, CameraError) as e:
             raise EpisodeError(f"{self.path}: cannot be read ({e})") from None
 
 

@@ -6,7 +6,7 @@ ahead. The drawing is only for people to look at: no command depends on it.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from rover_lib.onboard.car.car import WIDTH_PX, Car, this_car
@@ -37,9 +37,9 @@ class CarShape:
     left: int = 1
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "left" and (not is_number(value) or value <= 0):
-                raise ParamsError(f"view: {name} must be a number above 0", found=repr(value), remedy="see params.yml")
+        wrong = {k: v for k, v in vars(self).items() if k != "left" and not is_number(v, math.ulp(0.0))}
+        if wrong:
+            raise ParamsError("view: each must be a number above 0", found=wrong, remedy="see params.yml")
 
     @classmethod
     def of(cls, car: Car | None = None) -> "CarShape":
@@ -47,18 +47,15 @@ class CarShape:
 
         Raises ParamsError for values that no car can have, CarError as this_car().
         """
-        car = car or this_car()
-        section: dict[str, Any] = params()["view"]
+        car, section = car or this_car(), params()["view"]
         measured: dict[str, Any] = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX, "left": car.left}
-        if (names := {f.name for f in fields(cls)} - measured.keys()) != set(section):
-            odd = sorted(names ^ set(section))
-            raise ParamsError(f"view: {odd} must be there once", found=sorted(section), remedy="see params.yml")
-        return cls(**section, **measured)
+        try:
+            return cls(**section, **measured)
+        except TypeError as error:  # a name too many or too few
+            raise ParamsError(f"view: {error}", found=sorted(section), remedy="see params.yml") from None
 
     def track(self, actions: Iterable[Sequence[float]], step_s: float) -> list[tuple[float, float, float]]:
-        """The car's path from here on as (ahead, left, heading) in metres and radians.
-
-        It has one point before each action and one at the end.
+        """The car's path as (ahead, left, heading) in metres and radians: before each action, and at the end.
 
         actions: [steering, throttle] each, for step_s seconds.
         """

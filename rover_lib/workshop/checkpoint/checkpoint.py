@@ -17,7 +17,6 @@ from torch import Tensor
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.kinds import refuse_holder, refuse_part
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
@@ -181,11 +180,8 @@ def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
     whose config and weights do not agree, and for a policy that this project cannot run.
     """
     path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
-    refuse_part(path)
     if path.is_dir():
-        if (found_at := lerobot_folder(path)) is None:
-            refuse_holder(path)
-        path, notes = found_at or (path, [])
+        path, notes = lerobot_folder(path) or (path, [])
         found = _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path))
         return replace(found, report=found.report | {"notes": notes + found.report["notes"]})
     if not path.is_file():

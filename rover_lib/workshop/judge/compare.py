@@ -24,7 +24,7 @@ import torch
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.errors import PolicyError, PwmError
+from rover_lib.onboard.errors import CarError, PolicyError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import Affine, lerobot_act
@@ -113,7 +113,7 @@ class Fidelity:
         """Microseconds of the car's pulse per unit of an action; NaN for an action that is no servo's."""
         try:
             return self.car.pwm.us_per_unit(action)
-        except PwmError:
+        except CarError:
             return math.nan
 
     def warnings(self) -> list[str]:

@@ -46,7 +46,6 @@ import simplejpeg
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
-from rover_lib.onboard.kinds import refuse_holder
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
     DATA_BYTES,
@@ -138,7 +137,6 @@ def load_recordings(
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
-        refuse_holder(root)
         remedy = finish if killed else "give the folder that holds episode_YYYYMMDD_HHMMSS"
         raise EpisodeError(
             f"{root}: no episode folders in it", found=f"{len(killed)} killed ones" if killed else None, remedy=remedy
@@ -152,8 +150,6 @@ def load_recordings(
     )
     episodes = tuple(episode for episode in read if episode)
     if not episodes:
-        if {fault.kind for fault in faults.listed()} == {"no_data"}:
-            refuse_holder(root)
         raise nothing_usable(
             f"{root}: no usable sample in {len(folders)} episode folder(s)",
             faults.listed(),

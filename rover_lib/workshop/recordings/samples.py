@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.picture import PictureError, read_jpeg
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.car.picture import read_jpeg
+from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.recordings.formula import Formula
@@ -153,7 +153,7 @@ class Sample:
             return self.turned(read_jpeg(self.frame_path))
         except OSError as e:
             what, found, remedy = f"cannot be read ({e.strerror})", None, "restore it or load again"
-        except PictureError as e:
+        except CameraError as e:
             what, found, remedy = e.what, e.found, "delete it or record the episode again"
         raise EpisodeError(f"{self.frame_path}: {what}", found=found, remedy=remedy)
 

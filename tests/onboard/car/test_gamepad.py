@@ -19,9 +19,9 @@ from rover_lib.onboard.car.gamepad import (
     STEERING,
     SYN,
     THROTTLE,
+    CarError,
     Found,
     Gamepad,
-    GamepadError,
 )
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, frame, parse
 
@@ -186,7 +186,7 @@ def kernel(root, *nodes):
     ],
 )  # fmt: skip
 def test_one_sentence_says_what_is_there(tmp_path, nodes, sentence):
-    with pytest.raises(GamepadError) as error:
+    with pytest.raises(CarError) as error:
         gamepads.open_gamepad(kernel(tmp_path, *nodes))
     assert sentence in str(error.value) and error.value.remedy
 

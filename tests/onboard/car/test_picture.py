@@ -13,7 +13,8 @@ from hostile import HOSTILE, WHOLE, jpeg, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard.car.picture import PictureError, block_sums, brightness, decode_jpeg, read_jpeg
+from rover_lib.onboard.car.picture import block_sums, brightness, decode_jpeg, read_jpeg
+from rover_lib.onboard.errors import CameraError
 
 MOST_MB, MOST_S = 300, 5
 
@@ -25,7 +26,7 @@ def test_what_is_not_all_of_a_cameras_picture_is_refused_cheaply(tmp_path):
     code = f"""
 import resource, sys, time
 from pathlib import Path
-from rover_lib.onboard.car.picture import PictureError, read_jpeg
+from rover_lib.onboard.car.picture import read_jpeg
 def most_mb(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 before = most_mb()
 taken = int(Path("/proc/self/statm").read_text().split()[0]) * 4096
@@ -34,7 +35,7 @@ worst_s = 0
 for path in sorted(Path(sys.argv[1]).iterdir()):
     begin = time.process_time()
     try: read_jpeg(path); sys.exit(f"{{path}} was taken")
-    except PictureError: worst_s = max(worst_s, time.process_time() - begin)
+    except CameraError: worst_s = max(worst_s, time.process_time() - begin)
 print(most_mb() - before, worst_s)
 """
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
@@ -73,19 +74,19 @@ def test_what_is_torn_after_filler_is_torn(from_end, missing):
 def is_taken(data):
     try:
         return decode_jpeg(data) is not None
-    except PictureError:
+    except CameraError:
         return False
 
 
 def test_a_file_that_is_none(tmp_path):
     os.mkfifo(tmp_path / "fifo")
-    with pytest.raises(PictureError, match="no plain file"):
+    with pytest.raises(CameraError, match="no plain file"):
         read_jpeg(tmp_path / "fifo")
     with pytest.raises(OSError):
         read_jpeg(tmp_path / "nothing")
     with (tmp_path / "large").open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(PictureError, match=r"too large, found 8\.0 MB"):
+    with pytest.raises(CameraError, match=r"too large, found 8\.0 MB"):
         read_jpeg(tmp_path / "large")
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recorded import real_episode
 
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, NEUTRAL, Channel, Pulses, PwmCalibration
-from rover_lib.onboard.errors import PwmError
+from rover_lib.onboard.errors import CarError
 
 PWM = PwmCalibration()
 
@@ -76,14 +76,14 @@ BAD = [math.nan, -math.inf, None, "0.1", True, 10**400, np.array(0.1)]
 
 @pytest.mark.parametrize("bad", BAD, ids=lambda b: f"{type(b).__name__} {b!r}"[:24])
 def test_what_is_no_number_never_becomes_a_pulse(pwm, bad):
-    with pytest.raises(PwmError):
+    with pytest.raises(CarError):
         pwm.pulses(bad, 0.0)
-    with pytest.raises(PwmError):
+    with pytest.raises(CarError):
         pwm.pulses(0.0, bad)
-    with pytest.raises(PwmError):
+    with pytest.raises(CarError):
         pwm.actions_from_pulses(bad, 120)
     if bad is not None:  # None means the nominal period
-        with pytest.raises(PwmError):
+        with pytest.raises(CarError):
             pwm.actions_from_pulses(1456, 120, bad, 1016)
 
 
@@ -91,7 +91,7 @@ def test_what_is_no_number_never_becomes_a_pulse(pwm, bad):
 def test_a_pulse_is_within_the_servos_range_or_refused(steering, throttle):
     try:
         pulses = PWM.pulses(steering, throttle)
-    except PwmError:
+    except CarError:
         assert not (-1 <= steering <= 1 and 0 <= throttle <= 1)
     else:
         assert 900 <= pulses.steering_us <= 2012
@@ -113,7 +113,7 @@ def test_microseconds_per_unit(pwm):
     assert pwm.us_per_unit("throttle") == pytest.approx(591.2, abs=0.1)
     span_us = pwm.pulses(1, 1).steering_us - pwm.pulses(-1, 1).steering_us
     assert 2 * pwm.us_per_unit("steering") == pytest.approx(span_us, abs=1)
-    with pytest.raises(PwmError, match="gripper"):
+    with pytest.raises(CarError, match="gripper"):
         pwm.us_per_unit("gripper")
 
 
@@ -134,5 +134,5 @@ def test_a_calibration_that_exists_is_valid(bad):
         "name": "steering", "period_us": 21316, "neutral_pct": 6.83, "span_pct": 2.607, "low": -1, "high": 1,
     }  # fmt: skip
     Channel(**good)
-    with pytest.raises(PwmError):
+    with pytest.raises(CarError):
         Channel(**{**good, **bad})

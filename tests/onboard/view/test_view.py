@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import errno
-import gc
 import inspect
 import json
 import os
@@ -71,9 +70,8 @@ class Bench:
         self.stack.callback(drive.wire.close)
         return drive
 
-    async def page(self, token=TOKEN, **headers):
-        headers = {"Origin": self.base, **headers}
-        return await self.browser.ws_connect(f"{self.base}/ws?token={token}", headers=headers)
+    async def page(self):
+        return await self.browser.ws_connect(f"{self.base}/ws?token={TOKEN}")
 
 
 def on_a_bench(test):
@@ -124,44 +122,26 @@ async def test_a_page_shows_what_the_drive_says(bench):
     assert head["throttled"] == "under-voltage since the start, throttled since the start"
     assert len(head["ribbon"]) > 10 and not head["stopped"]
     assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
-    drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None})
-    head, _ = await message(page)
+    drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None, "shape": [30, 40, 3]}, bytes(30 * 40 * 3))
+    head, picture = await message(page)
+    assert picture[:2] == b"\xff\xd8" and picture[-2:] == b"\xff\xd9"  # of a camera of raw pictures
     assert head["stopped"] and head["ribbon"] == [] and head["delay_ms"] is not None
 
 
-@pytest.mark.parametrize(
-    ("path", "headers"),
-    [
-        ("/", {}),
-        (f"/?token={TOKEN}x", {}),
-        (f"/?token={TOKEN}", {"Host": "127.0.0.1.evil.example:80"}),
-        (f"/?token={TOKEN}", {"Host": "a b"}),
-        (f"/ws?token={TOKEN}", {}),
-        (f"/ws?token={TOKEN}", {"Origin": "http://127.0.0.1:1"}),  # another program's page on this machine
-        ("/ws?token=wrong", {"Origin": "the right one"}),
-    ],
-)
+@pytest.mark.parametrize("path", ["/", f"/?token={TOKEN}x", "/ws", "/ws?token=wrong"])
 @on_a_bench
-async def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(bench, path, headers):
+async def test_who_may_not_look_gets_a_sentence_and_reaches_no_drive(bench, path):
     drive = bench.drive()
     drive.send()
-    if headers.get("Origin") == "the right one":
-        headers["Origin"] = bench.base
     upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
     upgrade |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="} if path.startswith("/ws") else {}
-    async with bench.browser.get(bench.base + path, headers=upgrade | headers) as answer:
+    async with bench.browser.get(bench.base + path, headers=upgrade) as answer:
         assert answer.status == 403
         text = await answer.text()
         assert len(text.splitlines()) == 1 and TOKEN not in text and "policy.pt" not in text
-    assert drive.asked_nothing()
-
-
-@on_a_bench
-async def test_there_is_nothing_else(bench):
-    drive = bench.drive()
-    for method, path in (("GET", "/arm"), ("POST", "/stop"), ("GET", "/static/../../etc/passwd"), ("PUT", "/")):
-        async with bench.browser.request(method, f"{bench.base}{path}?token={TOKEN}") as answer:
-            assert answer.status in (404, 405), (method, path)
+    for method, other in (("GET", "/arm"), ("POST", "/stop"), ("GET", "/static/../../etc/passwd"), ("PUT", "/")):
+        async with bench.browser.request(method, f"{bench.base}{other}?token={TOKEN}") as answer:
+            assert answer.status in (404, 405), (method, other)
     assert drive.asked_nothing()
 
 
@@ -197,22 +177,16 @@ async def test_a_stop_from_each_page_reaches_each_drive_and_the_newest_is_shown(
 @on_a_bench
 async def test_a_page_can_say_nothing_else(bench):
     drive, page = bench.drive(), await bench.page()
-    for said in ("arm", "STOP", "stop ", "shown -1", "shown 99999999", '{"ask": "arm"}'):
+    for said in ("arm", "STOP", "stop ", "shown -1", '{"ask": "arm"}'):
         drive.send()
         await driving(page)
         await page.send_str(said)
         drive.send()
         await message(page)  # it goes on
         assert drive.asked_nothing(), said
-
-
-@pytest.mark.parametrize("said", [b"stop", "stop" * 100])
-@on_a_bench
-async def test_a_page_that_says_what_no_page_says_is_closed(bench, said):
-    drive, page = bench.drive(), await bench.page()
-    await message(page)
-    await (page.send_bytes(said) if isinstance(said, bytes) else page.send_str(said))
-    got = await asyncio.wait_for(page.receive(), 5)
+    await page.send_bytes(b"stop")  # no page of ours says this
+    while (got := await asyncio.wait_for(page.receive(), 5)).type == aiohttp.WSMsgType.BINARY:
+        pass
     assert got.type in (aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.CLOSED)
     assert drive.asked_nothing()
 
@@ -265,16 +239,11 @@ async def test_a_second_click_hides_no_end(bench):
 
 
 NONSENSE = [b"\n", b"[]\n", b"no json\n" + JPEG, b'{"phase": "driving", "plan": 3}\n', b"[" * 100_000 + b"\n",
-            b'{"phase": "driving", "shape": [9, 9, 3]}\nshort',
-            b'{"phase": "driving", "machine": {"throttled": "x"}}\n',
-            b'{"phase": "driving", "size": [640, 0], "sent_s": 0, "plan": {"captured_s": 0, "rate_hz": 30, '
-            b'"actions": [[0, 1]]}}\n']  # fmt: skip
+            b'{"phase": "driving", "shape": [9, 9, 3]}\nshort']  # fmt: skip
 
 
 @on_a_bench
 async def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(bench):
-    unforeseen = []
-    asyncio.get_running_loop().set_exception_handler(lambda loop, context: unforeseen.append(context))
     for number, said in enumerate(NONSENSE):
         bench.drive().wire.send(said)
         page, drive = await bench.page(), bench.drive()
@@ -286,25 +255,26 @@ async def test_a_drive_that_talks_nonsense_ends_nothing_but_its_own_line(bench):
             raise AssertionError(f"the drive after {said[:30]!r} is not shown")
         await page.send_str("stop")
         assert await drive.asked() == b"stop 127.0.0.1"
-    gc.collect()  # a task that failed is told of when it goes
-    assert not unforeseen
 
 
 def test_a_view_without_a_file_left_takes_drives_again_later(tmp_path, monkeypatch):
     monkeypatch.setattr(v, "ACCEPT_AGAIN_S", 0.01)
 
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:  # by a view that was killed
+        left.bind(str(tmp_path / "view"))
+
     async def scene():
         loop = asyncio.get_running_loop()
-        accept, refused = loop.sock_accept, [OSError(errno.EMFILE, "Too many open files")] * 3
+        refused = [OSError(errno.EMFILE, "Too many open files")] * 3
+        accept = loop.sock_accept
+        monkeypatch.setattr(loop, "sock_accept", lambda wire: refuse() if refused else accept(wire))
 
-        async def accept_later(wire):
-            if refused:
-                raise refused.pop()
-            return await accept(wire)
+        async def refuse():
+            raise refused.pop()
 
-        monkeypatch.setattr(loop, "sock_accept", accept_later)
         async with Bench(tmp_path) as bench:
             bench.drive().send(HEAD)
+            assert (bench.place.stat().st_mode & 0o777) == 0o600
             await driving(await bench.page())
 
     asyncio.run(scene())
@@ -321,14 +291,6 @@ throttle: {period_us: 20000, neutral_us: 1500, forward_us: 2000, reverse_us: 100
     for throttle_us, stands in ((1560, False), (1500, True), (1440, False), (1503, True)):
         view.show(HEAD | {"pins": [1500, throttle_us]}, b"")
         assert view._head["stopped"] is stands
-
-
-@on_a_bench
-async def test_a_camera_of_raw_pictures_is_shown_as_jpeg(bench):
-    page, drive = await bench.page(), bench.drive()
-    drive.send(HEAD | {"shape": [30, 40, 3]}, bytes(30 * 40 * 3))
-    _, picture = await driving(page)
-    assert picture[:2] == b"\xff\xd8" and picture[-2:] == b"\xff\xd9"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be somebody else")
@@ -349,25 +311,6 @@ def test_another_user_feeds_nothing():
         asyncio.run(scene())
 
 
-@pytest.mark.parametrize(
-    ("interface", "host", "ours"),
-    [
-        ("", "127.0.0.1:8470", True),
-        ("", "localhost:1", True),  # the end of an ssh tunnel
-        ("", "[::1]:8470", True),
-        ("", "192.168.1.7:8470", False),
-        ("", "", False),
-        ("wlan0", "192.168.1.7:8470", True),
-        ("wlan0", f"{socket.gethostname()}.local:8470", True),
-        ("wlan0", f"{socket.gethostname()}.evil.example", False),
-        ("wlan0", "127.0.0.1@evil.example", False),
-        ("wlan0", "[1", False),
-    ],
-)
-def test_hosts_that_are_ours(interface, host, ours):
-    assert v.Address(interface=interface).is_ours(host) is ours
-
-
 def test_what_cannot_be_opened(tmp_path):
     async def both():
         async with Bench(tmp_path) as bench:
@@ -379,7 +322,6 @@ def test_what_cannot_be_opened(tmp_path):
                 v.Address(port).open()
 
     asyncio.run(both())
-    assert not (tmp_path / "view").exists()
     with pytest.raises(v.RoverError, match="nosuch0"):
         v.Address(0, "nosuch0").open()
     (tmp_path / "view").write_text("a user's")
@@ -387,32 +329,13 @@ def test_what_cannot_be_opened(tmp_path):
         asyncio.run(both())
     assert (tmp_path / "view").read_text() == "a user's"
     with pytest.raises(v.RoverError, match="nobody-of-that-name"):
-        v.View(v.Address(0), TOKEN, tmp_path / "view", drive_user="nobody-of-that-name")
+        v.View(v.Address(0), TOKEN, drive_user="nobody-of-that-name")
 
 
-def test_a_socket_that_a_killed_view_has_left_is_taken(tmp_path):
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
-        left.bind(str(tmp_path / "view"))
-
-    async def scene():
-        async with Bench(tmp_path) as bench:
-            bench.drive().send()
-            assert (bench.place.stat().st_mode & 0o777) == 0o600
-            await driving(await bench.page())
-
-    asyncio.run(scene())
-
-
-@pytest.mark.parametrize("content", ["short", "with a blank in the middle", "ä" * 20])
-def test_a_token_that_could_be_guessed_is_refused(tmp_path, content):
-    (tmp_path / "token").write_text(content)
-    with pytest.raises(v.RoverError, match="16 letters"):
-        v.read_token(tmp_path / "token")
-
-
-def test_tokens(tmp_path):
+def test_a_token_is_kept_and_one_that_could_be_guessed_is_refused(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
     assert v.read_token(tmp_path / "token") == TOKEN
-    assert len(v.new_token()) >= 20 and v.new_token() != v.new_token()
-    with pytest.raises(v.RoverError, match="the token cannot be read"):
-        v.read_token(tmp_path / "none")
+    for content in ("short", "with a blank in the middle", "ä" * 20):
+        (tmp_path / "token").write_text(content)
+        with pytest.raises(v.RoverError, match="16 letters"):
+            v.read_token(tmp_path / "token")
