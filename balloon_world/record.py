@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import sys
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,6 +17,7 @@ from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, exper
 from rover_lib.onboard.car import pwm as pwm_module
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.recording import episode as recording
 from rover_lib.onboard.recording.episode import SIMULATED, About, EpisodeWriter
@@ -61,13 +61,9 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
             f"{out_dir}: exists and is not this recording", remedy="name another folder, or move it away first"
         )
     made = cache_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
-    out_dir.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out_dir.parent, prefix=f".{out_dir.name}.") as temporary:
+    with build_folder(out_dir) as new:
         # Copied and not linked: somebody who damages an episode to see what happens must not damage the cache.
-        copy = shutil.copytree(made, Path(temporary) / "episodes")
-        if out_dir.is_dir():
-            out_dir.rmdir()
-        copy.rename(out_dir)
+        shutil.copytree(made, new, dirs_exist_ok=True)
     return out_dir
 
 

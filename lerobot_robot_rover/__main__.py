@@ -11,6 +11,7 @@ import click
 from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
 from lerobot_robot_rover.modeling_rover_artifact import RoverArtifactPolicy
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
 
 
@@ -22,11 +23,11 @@ def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_AC
     """
     config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
     policy = RoverArtifactPolicy(config)
-    Path(folder).mkdir(parents=True)
-    policy.save_pretrained(folder)
-    for pipeline in make_rover_artifact_pre_post_processors(config):
-        pipeline.save_pretrained(folder)
-    return Path(folder)
+    with build_folder(folder) as new:
+        policy.save_pretrained(new)
+        for pipeline in make_rover_artifact_pre_post_processors(config):
+            pipeline.save_pretrained(new)
+    return folder
 
 
 @click.command()

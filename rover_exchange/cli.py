@@ -150,4 +150,4 @@ def export_kit(run_dir: Path, out: Path, samples: int) -> None:
     from rover_lib.workshop.run.session import open_run
 
     write_kit(open_run(run_dir, terminal_bar()), run_dir, out, samples=samples, progress=terminal_bar())
-    click.echo(f"{out}: KIT.md says what is in it; next, where Hailo's compiler is: python3 compile.py hailo8 backbone")
+    click.echo(f"{out}: KIT.md says what is in it; next, where Hailo's compiler is: python3 compile.py hailo8")

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -56,7 +57,6 @@ from rover_lib.workshop.recordings.samples import (
     is_another_rate,
 )
 from rover_lib.workshop.recordings.turning import measure_sides
-from rover_lib.workshop.swap_folder import lock_folder
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 REWARD, DONE = "next.reward", "next.done"
@@ -98,11 +98,13 @@ def export_dataset(
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = usual_rate_hz(recordings)
     car = car_of(recordings.samples)
-    with lock_folder(out.with_name(f".{out.name}.new")) as beside:
-        new = beside / out.name
-        report = _write(recordings, new, rate_hz, video, size, progress) | {CAR: car.description()}
+    with build_folder(out) as new:
+        made = new / "dataset"  # LeRobot makes its folder itself
+        report = _write(recordings, made, rate_hz, video, size, progress) | {CAR: car.description()}
+        for path in made.iterdir():
+            path.rename(new / path.name)
+        made.rmdir()
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
-        new.rename(out)
     return report
 
 

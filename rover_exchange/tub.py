@@ -2,10 +2,10 @@
 
     recordings = read_tub("data/tub_1", this_car())
 
-A tub of donkeycar 4 on is manifest.json, catalogs with a line of JSON for each picture, and images/. An older one has a
-record_<number>.json for each picture. Its angle is positive to the right; the car says to which side our steering is,
-and whether it drives backwards: if not, negative throttle is "stopped". Some cars drive forward by negative throttle;
-that a tub is of such a one must be said.
+A tub of donkeycar 4 on is manifest.json, catalogs with a line of JSON for each picture, and images/; donkeycar converts
+older ones. Its angle is positive to the right; the car says to which side our steering is, and whether it drives
+backwards: if not, negative throttle is "stopped". Some cars drive forward by negative throttle; that a tub is of such a
+one must be said.
 
 Records that the manifest calls deleted, or at which a pilot drove, are left out. An episode ends where records are
 missing, where another session begins, and at a hole in time. Only a session's first record has a state that is known
@@ -14,9 +14,7 @@ without another one, neutral; the first record of any other episode gives the ne
 
 import json
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,6 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import DATA_BYTES
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture, nothing_usable
@@ -42,6 +39,9 @@ from rover_lib.workshop.recordings.samples import (
 from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
+MOST_BYTES = 10_000_000  # of a manifest or a catalog; JSON takes 25 times its size, and a thousand records 200 kB
+MOST_INDEX, MOST_MS = 10**9, 10**14
+OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
 
 
@@ -124,7 +124,7 @@ def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults:
 
 def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faults) -> tuple[Sample, ...]:
     """begins: whether the run begins its session, so that the car stood before it."""
-    images = tub / "images" if (tub / "images").is_dir() else tub
+    images = tub / "images"
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
@@ -151,54 +151,32 @@ def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faul
 
 
 def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
-    """Yield the records that count, of either format."""
-    manifest, deleted = tub / "manifest.json", set[int]()
-    if manifest.is_file():
-        paths, deleted = _read_manifest(manifest)
-        texts = _of_catalogs(tub, paths, faults)
-    else:
-        texts = _of_files(tub)
-    for where, index, text in texts:
-        try:
-            record = _parse(text, index)
-        except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-            faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")
-            continue
-        if record.index in deleted:
-            faults.add(tub, "deleted_record", f"{where}: its manifest calls record {record.index} deleted")
-        elif record.driver != "user":
-            faults.add(tub, "a_pilot_drove", f"{where}: {quote(record.driver)}")
-        else:
-            yield record
-
-
-def _of_catalogs(tub: Path, paths: list[str], faults: Faults) -> Iterator[tuple[str, int | None, str]]:
-    """Yield each record of a tub of today: where it stands, None, as its number is in it, and its text."""
-    for name in dict.fromkeys(paths):  # each once
+    """Yield the records that count."""
+    names, deleted = _read_manifest(tub / "manifest.json")
+    for name in dict.fromkeys(names):  # each once
         if Path(name).name != name or not (tub / name).is_file():
             faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
             continue
         for number, line in enumerate(_read(tub / name).splitlines(), 1):
-            yield f"{name}, line {number}", None, line
-
-
-def _of_files(tub: Path) -> Iterator[tuple[str, int | None, str]]:
-    """Yield each record of an older tub: its file's name, its number and its text."""
-    files = [p for p in tub.glob("record_*.json") if p.stem.removeprefix("record_").isdecimal()]
-    if not files:
-        raise EpisodeError(
-            f"{tub}: no donkeycar tub, neither manifest.json nor record_<number>.json is in it",
-            remedy="give the folder that holds them, such as data or tub_1",
-        )
-    for path in sorted(files):
-        yield path.name, int(path.stem.removeprefix("record_")), _read(path)
+            where = f"{name}, line {number}"
+            try:
+                record = _parse(line)
+            except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
+                faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")
+                continue
+            if record.index in deleted:
+                faults.add(tub, "deleted_record", f"{where}: its manifest calls record {record.index} deleted")
+            elif record.driver != "user":
+                faults.add(tub, "a_pilot_drove", f"{where}: {quote(record.driver)}")
+            else:
+                yield record
 
 
 def _read(path: Path) -> str:
     try:
-        return read_plain(path, DATA_BYTES).decode("utf-8-sig", errors="replace")
+        return read_plain(path, MOST_BYTES).decode("utf-8-sig", errors="replace")
     except OSError as e:
-        raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy="copy it again") from None
+        raise EpisodeError(f"{path}: cannot be read ({e.strerror})", remedy=OLDER) from None
 
 
 def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
@@ -206,29 +184,17 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
     try:
         last = json.loads(_read(path).splitlines()[-1])
         return list(map(str, last["paths"])), set(map(int, last.get("deleted_indexes") or []))
-    except (ValueError, RecursionError, TypeError, LookupError, AttributeError):
-        raise EpisodeError(
-            f"{path}: does not say which catalogs there are, or which records are deleted",
-            remedy="is it a tub of donkeycar 4 or later?",
-        ) from None
+    except (ValueError, RecursionError, TypeError, LookupError, AttributeError, OverflowError):
+        raise EpisodeError(f"{path}: lists no catalogs or no deleted records", remedy=OLDER) from None
 
 
-def _parse(text: str, index: int | None) -> _Record:
-    """Return the record in a text. index: its number; None: it has its own. Raises ValueError, also of other kinds."""
+def _parse(text: str) -> _Record:
+    """Return the record in a line. Raises ValueError, also of other kinds."""
     row = json.loads(text)
-    number = row["_index"] if index is None else index
-    ms = row.get("_timestamp_ms", row.get("milliseconds", _as_ms(row.get("timestamp"))))
-    values = row[ANGLE], row[THROTTLE]
+    number, ms, values = row["_index"], row.get("_timestamp_ms"), (row[ANGLE], row[THROTTLE])
     if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
         raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")
-    if not is_whole(number) or not (ms is None or is_number(ms)):
+    if not is_whole(number, 0, MOST_INDEX) or not (ms is None or is_number(ms, 0, MOST_MS)):
         raise ValueError(f"number {quote(number)}, time {quote(ms)}")
     time_s = number / RATE_HZ if ms is None else ms / 1000
     return _Record(number, str(row.get("_session_id", "")), time_s, row[PICTURE], *values, row.get(MODE, "user"))
-
-
-def _as_ms(date: Any) -> float | None:
-    """Return a record's date as milliseconds; None for what is none, as a tub without times can be read too."""
-    with suppress(ValueError, TypeError):
-        return datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp() * 1000
-    return None

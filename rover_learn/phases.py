@@ -23,6 +23,7 @@ from rover_learn.lessons import Batch, BatchedPolicy, Pool
 from rover_learn.student import gmac
 from rover_learn.training import Phase, Resumable, threads
 from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -31,7 +32,6 @@ from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
-from rover_lib.workshop.swap_folder import build_beside
 from rover_lib.workshop.untrusted import quote
 
 # Least and most of a recipe's numbers. Of the others, steps may be 0, whole numbers are at least 1, and rates above 0.
@@ -184,6 +184,6 @@ def free_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Pat
 @contextmanager
 def make_run(folder: Path, config: ActConfig, error: type[RoverError]) -> Iterator[Path]:
     """Build a run's folder beside it, with as many threads as a policy of that config gains from."""
-    with build_beside(folder) as new, threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
+    with build_folder(folder) as new, threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
         yield new
         free_folder(folder.parent, folder.name, error)  # another command may have made it meanwhile

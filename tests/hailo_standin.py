@@ -2,13 +2,12 @@
 
 `hailo_sdk_client` is the compiler: its ClientRunner writes an ONNX file and the normalisation of its inputs into a
 "HEF". `hailo_platform` belongs to the driver: it runs such a HEF in ONNX Runtime, behind the interface of hailort v4.23
-and v5.2 (hailo_platform/pyhailort/pyhailort.py), with channels last and with the same checks of buffers. Nothing is
-quantized, so that any difference from the policy is an error of the kit or of the runner.
+and v5.2 (hailo_platform/pyhailort/pyhailort.py), with channels last. Nothing is quantized, so that any difference from
+the policy is an error of the kit or of the runner.
 """
 
 import json
 import re
-import struct
 import sys
 import types
 from enum import Enum
@@ -20,10 +19,7 @@ import onnx
 import onnxruntime
 
 MAGIC = b"stand-in HEF"
-COMMAND = (
-    r"(\w+ = )?(normalization|model_optimization_config|model_optimization_flavor|quantization_param"
-    r"|pre_quantization_optimization)\(.*\)"
-)
+NORMALIZATION = r"normalization\d+ = normalization\((\[[^]]*\]), (\[[^]]*\])\)"
 
 
 class HailoRTException(Exception):
@@ -52,20 +48,20 @@ class Stream:
 
 
 class InferModel:
-    """A network on the chip: also what configure() and create_bindings() return of it."""
+    """A network of one input on the chip: also what configure() and create_bindings() return of it, and its HEF."""
+
+    fails = False  # True: the chip no longer answers
 
     def __init__(self, hef: bytes):
         if not hef.startswith(MAGIC):
             raise HailoRTException("Invalid HEF. See hailort.log for more information")
-        (size,) = struct.unpack_from("<I", hef, len(MAGIC))
-        start = len(MAGIC) + 4
-        self.about, self.hef = json.loads(hef[start : start + size]), self
-        self.session = onnxruntime.InferenceSession(hef[start + size :], providers=["CPUExecutionProvider"])
-        self.inputs = [Stream(name, part["shape"]) for name, part in self.about["inputs"].items()]
-        self.outputs = [Stream(name, part["shape"]) for name, part in self.about["outputs"].items()]
+        about, _, model = hef.removeprefix(MAGIC).partition(b"\0")
+        self.about, self.hef = json.loads(about), self
+        self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+        self.inputs, self.outputs = ([Stream(name, shape)] for name, shape, _ in self.about["streams"])
 
     def get_original_names_from_vstream_name(self, name: str) -> list[str]:
-        return [(self.about["inputs"] | self.about["outputs"])[name]["original"]]
+        return [original for stream, _, original in self.about["streams"] if stream == name]
 
     def input(self, name: str) -> Stream:
         return next(s for s in self.inputs if s.name == name)
@@ -73,87 +69,63 @@ class InferModel:
     def output(self, name: str) -> Stream:
         return next(s for s in self.outputs if s.name == name)
 
-    def configure(self) -> "Configured":
-        return Configured(self)
+    def configure(self) -> "InferModel":
+        return self
 
+    create_bindings = configure
 
-class Configured:
-    fails = False  # True: the chip no longer answers
-
-    def __init__(self, model: InferModel):
-        self._model = model
-
-    def create_bindings(self) -> InferModel:
-        return self._model
-
-    def run(self, bindings: list[InferModel], timeout: int) -> None:
-        if Configured.fails:
+    def run(self, bindings: list["InferModel"], timeout: int) -> None:
+        if InferModel.fails:
             raise HailoRTException("Received a timeout - hailort has failed because a timeout had occurred")
-        (model,), given = bindings, {}
-        for stream in model.inputs:
-            about, x = model.about["inputs"][stream.name], stream.buffer.reshape(stream.shape).astype(np.float32)
-            if norm := about["normalization"]:
-                x = (x - np.array(norm[0], np.float32)) / np.array(norm[1], np.float32)
-            given[about["original"]] = x.transpose(2, 0, 1)[None]
-        for stream, y in zip(model.outputs, model.session.run(None, given), strict=True):
-            stream.buffer[...] = (y[0].transpose(1, 2, 0) if y.ndim == 4 else y).reshape(stream.buffer.shape)
+        (given,), (answer,), (mean, std) = self.inputs, self.outputs, self.about["normalization"]
+        x = given.buffer.reshape(given.shape).astype(np.float32)
+        x = (x - np.array(mean, np.float32)) / np.array(std, np.float32)
+        (y,) = self.session.run(None, {self.about["streams"][0][2]: x.transpose(2, 0, 1)[None]})
+        answer.buffer[...] = y[0].transpose(1, 2, 0).reshape(answer.buffer.shape)
 
 
 class VDevice:
-    def create_infer_model(self, hef_source: str | bytes) -> InferModel:
-        return InferModel(hef_source if type(hef_source) is bytes else Path(hef_source).read_bytes())
+    def create_infer_model(self, hef_source: bytes) -> InferModel:
+        return InferModel(hef_source)
 
 
 class ClientRunner:
     first: ClassVar[int] = 1  # number of the first input layer
-    calibrated: ClassVar[dict[str, np.ndarray]] = {}  # the data given to the last optimize()
+    calibrated: ClassVar[np.ndarray]  # the data given to the last optimize()
 
     def __init__(self, hw_arch: str):
         assert hw_arch in ("hailo8", "hailo8l", "hailo10h")
 
     def translate_onnx_model(self, path, name, *, start_node_names, end_node_names, net_input_shapes):
         self._model, self._name = onnx.load(path), name
-        graph = self._model.graph
-        assert start_node_names == [i.name for i in graph.input] == list(net_input_shapes)
-        made = {node.name: node.output[0] for node in graph.node}
-        assert [made[node] for node in end_node_names] == [o.name for o in graph.output]
-        self._inputs = {}
-        for i, (original, (_, c, h, w)) in enumerate(net_input_shapes.items(), self.first):
-            self._inputs[f"{name}/input_layer{i}"] = {"original": original, "shape": [h, w, c], "normalization": None}
+        ((self._original, (_, c, self._height, self._width)),) = net_input_shapes.items()
+        assert start_node_names == [i.name for i in self._model.graph.input] == [self._original] and c == 3
+        made = {node.name: node.output[0] for node in self._model.graph.node}
+        assert [made[node] for node in end_node_names] == [o.name for o in self._model.graph.output]
+        self._layer, self._end = f"{name}/input_layer{self.first}", end_node_names[0]
 
     def get_hn_dict(self) -> dict:
-        return {"layers": {layer: {"original_names": [about["original"]]} for layer, about in self._inputs.items()}}
+        return {"layers": {self._layer: {"original_names": [self._original]}}}
 
     def save_har(self, path: str) -> None:
         Path(path).write_bytes(b"stand-in HAR")
 
     def load_model_script(self, path: str) -> None:
-        """Accept only the commands that the model zoo's scripts use."""
-        for line in Path(path).read_text().splitlines():
-            command = line.partition("#")[0].strip()
-            assert not command or re.fullmatch(COMMAND, command), command
-            if found := re.search(r"normalization\((\[[^]]*\]), (\[[^]]*\])(?:, (\S+))?\)", command):
-                self._inputs[found[3] or next(iter(self._inputs))]["normalization"] = [
-                    json.loads(found[1]),
-                    json.loads(found[2]),
-                ]
+        found = re.search(NORMALIZATION, Path(path).read_text())
+        self._normalization = json.loads(found[1]), json.loads(found[2])
 
-    def optimize(self, data) -> None:
-        data = data if isinstance(data, dict) else dict.fromkeys(self._inputs, data)
-        assert {layer: list(x.shape[1:]) for layer, x in data.items()} == {
-            layer: about["shape"] for layer, about in self._inputs.items()
-        }
+    def optimize(self, data: np.ndarray) -> None:
+        assert data.shape[1:] == (self._height, self._width, 3)
         ClientRunner.calibrated = data
 
     def compile(self) -> bytes:
-        outputs = {}
-        for o in self._model.graph.output:
-            shape = [d.dim_value for d in o.type.tensor_type.shape.dim]
-            node = next(n for n in self._model.graph.node if o.name in n.output)
-            shape = [shape[2], shape[3], shape[1]] if len(shape) == 4 else shape
-            outputs[f"{self._name}/{node.name}"] = {"original": node.name, "shape": shape}
-        about = json.dumps({"inputs": self._inputs, "outputs": outputs}).encode()
-        return MAGIC + struct.pack("<I", len(about)) + about + self._model.SerializeToString()
+        _, *grid = (d.dim_value for d in self._model.graph.output[0].type.tensor_type.shape.dim)
+        streams = [
+            (self._layer, [self._height, self._width, 3], self._original),
+            (f"{self._name}/{self._end}", [*grid[1:], grid[0]], self._end),
+        ]
+        about = json.dumps({"streams": streams, "normalization": self._normalization})
+        return MAGIC + about.encode() + b"\0" + self._model.SerializeToString()
 
 
 def install(monkeypatch) -> None:

@@ -1,7 +1,7 @@
-"""Compile a network of this kit for one chip, and pack what the rover loads.
+"""Compile this kit's network for one chip, and pack what the rover loads.
 
-    python3 compile.py hailo8 backbone                     # parse, quantize, compile, pack
-    python3 compile.py hailo8 backbone --hef mine.hef      # only pack a HEF that was compiled otherwise
+    python3 compile.py hailo8                     # parse, quantize, compile, pack
+    python3 compile.py hailo8 --hef mine.hef      # only pack a HEF that was compiled otherwise
 
 It runs where Hailo's Dataflow Compiler is installed: on x86-64 Linux, version 3.x for Hailo-8 and 8L, 5.x for
 Hailo-10H. It is a kit's compile.py, and needs nothing else of the project.
@@ -18,63 +18,61 @@ from pathlib import Path
 import numpy as np
 
 CHIPS = ("hailo8", "hailo8l", "hailo10h")
+NAME = "backbone"  # of the network
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Compile a network of this kit for a chip, and pack it.")
+    parser = argparse.ArgumentParser(description="Compile this kit's network for a chip, and pack it.")
     parser.add_argument("chip", choices=CHIPS)
-    parser.add_argument("network", choices=["backbone", "whole"])
     parser.add_argument("--hef", type=Path, help="do not compile: pack this one")
     given = parser.parse_args()
     kit = Path(__file__).resolve().parent
-    hef = given.hef or compile_network(kit, given.chip, given.network)
-    print(f"{pack(kit, given.chip, given.network, hef)}: take it to the rover, and run `rover doctor` there")
+    hef = given.hef or compile_network(kit, given.chip)
+    print(f"{pack(kit, given.chip, hef)}: take it to the rover, and run `rover doctor` there")
 
 
-def compile_network(kit: Path, chip: str, name: str) -> Path:
-    """Compile a network and return the path of its HEF.
+def compile_network(kit: Path, chip: str) -> Path:
+    """Compile the network and return the path of its HEF.
 
     Ends the program if the compiler does not number the inputs as the model script takes them to be numbered: it would
     normalise another one.
     """
     from hailo_sdk_client import ClientRunner
 
-    network = json.loads((kit / "kit.json").read_text())["networks"][name]
+    network = json.loads((kit / "kit.json").read_text())
     runner = ClientRunner(hw_arch=chip)
     runner.translate_onnx_model(
-        str(kit / f"{name}.onnx"),
-        name,
+        str(kit / f"{NAME}.onnx"),
+        NAME,
         start_node_names=list(network["inputs"]),
         end_node_names=network["end_nodes"],
         net_input_shapes=network["inputs"],
     )
     layers, data = runner.get_hn_dict()["layers"], {}
     for number, key in enumerate(network["inputs"], 1):
-        layer = f"{name}/input_layer{number}"
+        layer = f"{NAME}/input_layer{number}"
         if key not in layers.get(layer, {}).get("original_names", []):
-            raise SystemExit(f"{name}.alls takes {layer} for '{key}', and the layers are {', '.join(layers)}")
+            raise SystemExit(f"{NAME}.alls takes {layer} for '{key}', and the layers are {', '.join(layers)}")
         data[layer] = np.load(kit / f"calibration_{key}.npy", mmap_mode="r")
-    runner.load_model_script(str(kit / f"{name}.alls"))
+    runner.load_model_script(str(kit / f"{NAME}.alls"))
     runner.optimize(data if len(data) > 1 else next(iter(data.values())))
-    runner.save_har(str(kit / f"{name}_{chip}.har"))
-    hef = kit / f"{name}_{chip}.hef"
+    runner.save_har(str(kit / f"{NAME}_{chip}.har"))
+    hef = kit / f"{NAME}_{chip}.hef"
     hef.write_bytes(runner.compile())
     return hef
 
 
-def pack(kit: Path, chip: str, name: str, hef: Path) -> Path:
+def pack(kit: Path, chip: str, hef: Path) -> Path:
     """Pack the artifact for the rover: the HEF, what runs after it on the CPU, the manifest and the parity vectors."""
-    content = json.loads((kit / "kit.json").read_text())
-    network = content["networks"][name]
-    manifest = content["manifest"] | {"hailo": network["hailo"] | {"chip": chip}, "weights_mb": network["weights_mb"]}
-    path = kit / f"policy_{name}_{chip}.hailo.zip"
+    manifest = json.loads((kit / "kit.json").read_text())["manifest"]
+    manifest["hailo"]["chip"] = chip
+    path = kit / f"policy_{NAME}_{chip}.hailo.zip"
     new = path.with_name(f".{path.name}.new")  # so that an earlier artifact stays until this one is complete
     with zipfile.ZipFile(new, "w", zipfile.ZIP_STORED) as z:
         z.writestr("archive/extra/manifest.json", json.dumps(manifest, sort_keys=True, indent=1))
         z.write(kit / "parity.npz", "archive/extra/parity.npz")
         z.write(hef, "archive/network.hef")
-        if name == "backbone":
-            z.write(kit / "transformer.onnx", "archive/model.onnx")
+        z.write(kit / "transformer.onnx", "archive/model.onnx")
     return new.replace(path)
 
 

@@ -3,9 +3,7 @@
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from numpy.lib.format import open_memmap
 
 from rover_exchange.hailo.networks import Network, networks
 from rover_lib.onboard.artifact.manifest import Artifact, largest_tolerance
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, parameters_by_block, zero_colour
@@ -22,6 +21,7 @@ from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run.pipeline import Recipe
 from rover_lib.workshop.run.session import Opened
 
+NAME = "backbone"  # of the network on the chip
 LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transformers (vit_small.alls, deit_base.alls)
 # The chip's answers may be this many times as far from FP32 as what is allowed to torch's INT8. The chip rounds in
 # other places, and nobody knows by how much; a HEF that computes something else is hundreds of times as far off.
@@ -47,56 +47,40 @@ def write_kit(
             remedy="record more; or say --samples, and expect more of an error",
         )
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
-    front, whole, rest = networks(policy)
-    described = {}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
-        folder = Path(temporary) / out.name
-        folder.mkdir()
-        manifest = _manifest(Path(run_dir), samples, folder)
+    front, rest = networks(policy)
+    with build_folder(out) as folder:
+        manifest = _manifest(Path(run_dir), samples, folder) | _describe(policy, front)
         onnx.save(rest, folder / "transformer.onnx")
-        for name, network in (("backbone", front), ("whole", whole)):
-            onnx.save(network.model, folder / f"{name}.onnx")
-            (folder / f"{name}.alls").write_text(model_script(name, network, policy.config, samples))
-            described[name] = _describe(policy, name, network)
+        onnx.save(front.model, folder / f"{NAME}.onnx")
+        (folder / f"{NAME}.alls").write_text(model_script(front, policy.config, samples))
         for name in ("KIT.md", "compile.py"):
             shutil.copyfile(Path(__file__).with_name(name), folder / name)
         write_calibration(policy, chosen, folder, progress)
-        content = {"schema": 1, "networks": described, "manifest": manifest}
+        content = {"schema": 1, "inputs": front.inputs, "end_nodes": list(front.outputs.values()), "manifest": manifest}
         (folder / "kit.json").write_text(json.dumps(content, indent=1))
-        folder.rename(out)
 
 
 def write_calibration(policy: ACT, samples: Sequence[Sample], folder: Path, progress: Progress) -> None:
-    """Write calibration_<input>.npy: frames (n, height, width, 3) uint8 RGB, normalised states (n, 1, 1, S) float32."""
+    """Write calibration_frame_<camera>.npy, (n, height, width, 3) uint8 RGB."""
     config = policy.config
-    shapes = {"state": (1, 1, len(config.state_names))}
-    shapes |= {f"frame_{name}": (*size, 3) for name, size in zip(config.cameras, config.image_sizes, strict=True)}
     arrays = [
-        open_memmap(
-            folder / f"calibration_{name}.npy",
-            "w+",
-            np.float32 if name == "state" else np.uint8,
-            (len(samples), *shape),
-        )
-        for name, shape in shapes.items()
+        open_memmap(folder / f"calibration_frame_{name}.npy", "w+", np.uint8, (len(samples), *size, 3))
+        for name, size in zip(config.cameras, config.image_sizes, strict=True)
     ]
     for i, sample in enumerate(progress(samples, desc="calibration set")):
-        state, *frames = inputs_of(sample, config)
-        for array, value in zip(arrays, [policy.state_norm(state), *frames], strict=True):
-            array[i] = value.numpy()
+        for array, frame in zip(arrays, inputs_of(sample, config)[1:], strict=True):
+            array[i] = frame.numpy()
     for array in arrays:
         array.flush()
 
 
-def model_script(name: str, network: Network, config: ActConfig, samples: int) -> str:
-    """Return the .alls file of a network. Comments in it give its sources; zoo means hailo_model_zoo."""
-    lines = [f"# {name}; compiled by nobody yet"]
-    layers = {of: f"{name}/input_layer{i}" for i, of in enumerate(network.inputs, 1)}  # as the parser numbers them
-    for i, (camera, norm) in enumerate(zip(config.cameras, config.image_norm, strict=True), 1):
+def model_script(network: Network, config: ActConfig, samples: int) -> str:
+    """Return the network's .alls file. Comments in it give its sources; zoo means hailo_model_zoo."""
+    lines = [f"# {NAME}; compiled by nobody yet"]
+    for i, norm in enumerate(config.image_norm, 1):  # the parser numbers the inputs in this order
         mean = [round(v, 6) for v in zero_colour(norm)]
         std = [round(255 / s, 6) for s in norm.scale]
-        layer = f", {layers[f'frame_{camera}']}" if len(layers) > 1 else ""
+        layer = f", {NAME}/input_layer{i}" if len(network.inputs) > 1 else ""
         lines.append(f"normalization{i} = normalization({mean}, {std}{layer})")
     lines += [
         f"model_optimization_config(calibration, batch_size=8, calibset_size={samples})",
@@ -105,45 +89,24 @@ def model_script(name: str, network: Network, config: ActConfig, samples: int) -
         "pre_quantization_optimization(equalization, policy=enabled)",
         "quantization_param({output_layer*}, precision_mode=a16_w16)",
     ]
-    if name == "whole":
-        lines += [
-            "# zoo, vit_small and deit_base, where only sums before a LayerNormalization have 16 bits; and the state",
-            "pre_quantization_optimization(ew_add_fusing, policy=disabled)",
-            "pre_quantization_optimization(matmul_correction, layers={matmul*}, correction_type=zp_comp_block)",
-            "model_optimization_config(negative_exponent, layers={*}, rank=0)",
-            "quantization_param({ew_add*}, precision_mode=a16_w16)",
-            f"quantization_param({layers['state']}, precision_mode=a16_w16)",
-        ]
     return "\n".join(lines) + "\n"
 
 
-def _describe(policy: ACT, name: str, network: Network) -> dict[str, Any]:
-    """Return what kit.json says of a network. "hailo" is for the rover's engine, with shapes as HailoRT gives them."""
-    config, parameters = policy.config, parameters_by_block(policy)
-    if name == "whole":
-        on_chip = set(parameters)
-        shapes = [[1, config.chunk, len(config.action_names)]]
-        around = {"state": config.state_norm, "actions": config.action_unnorm}
-    else:
-        on_chip = {block for block in parameters if block.startswith("backbone") or block == "image_project"}
-        shapes = [[*config.grid(*size), config.dim] for size in config.image_sizes]
-        around = {"state": None, "actions": None}
+def _describe(policy: ACT, network: Network) -> dict[str, Any]:
+    """Return the manifest's part for the rover's engine, with shapes as HailoRT gives them."""
+    parameters = parameters_by_block(policy)
+    on_chip = {block for block in parameters if block.startswith("backbone") or block == "image_project"}
+    shapes = [[*policy.config.grid(*size), policy.config.dim] for size in policy.config.image_sizes]
+    outputs = dict(zip(network.outputs, shapes, strict=True))
     return {
-        "inputs": network.inputs,
-        "end_nodes": list(network.outputs.values()),
         # Weights that are not on the chip stay in float.
         "weights_mb": sum(n if block in on_chip else 4 * n for block, n in parameters.items()) / 1e6,
-        "hailo": {
-            "network": name,
-            "outputs": dict(zip(network.outputs, shapes, strict=True)),
-            "original_names": network.outputs,
-            **{key: affine and asdict(affine) for key, affine in around.items()},
-        },
+        "hailo": {"network": NAME, "outputs": outputs, "original_names": network.outputs},
     }
 
 
 def _manifest(run_dir: Path, samples: int, folder: Path) -> dict[str, Any]:
-    """Return the manifest of what compile.py packs, without what depends on the network, and write parity.npz.
+    """Return the manifest of what compile.py packs, without what depends on the networks, and write parity.npz.
 
     Both come from the run's FP32 artifact, and how far the chip may be off from its static INT8.
     """

@@ -1,6 +1,5 @@
 """Make the networks of a kit from a policy, in ONNX."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import onnx
@@ -24,63 +23,26 @@ class Front(nn.Module):
         return tuple(self.image_project(self.backbone(pictures[i])) for i in range(self.cameras))
 
 
-class Transformer(nn.Module):
-    """The policy's transformer, which two networks have."""
-
-    def __init__(self, policy: ACT):
-        super().__init__()
-        self.encoder, self.decoder, self.memory = policy.encoder, policy.decoder, policy.memory
-        self.encoder_norm, self.norm, self.head = policy.encoder_norm, policy.norm, policy.head
-        self.cameras = len(policy.config.cameras)
-        self.latent: Tensor
-        for name in ("latent", "pos", "q_pos"):
-            self.register_buffer(name, getattr(policy, name))
-
-    def plan(self, state: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """state: a token (1, 1, D); images: tokens (1, h * w, D) each. Returns (1, C, A), still normalised."""
-        return transform(self, torch.cat([self.latent, state, *images], 1))
-
-
-class Rest(Transformer):
-    """What runs after the chip in split `backbone`: (state (1, S), features (h, w, D) each) -> actions (1, C, A).
+class Rest(nn.Module):
+    """What runs after the chip: (state (1, S), features (h, w, D) each) -> actions (1, C, A).
 
     The state and the actions are raw. The features are as HailoRT gives them: channels last, without a batch.
     """
 
     def __init__(self, policy: ACT):
-        super().__init__(policy)
+        super().__init__()
+        self.encoder, self.decoder, self.memory = policy.encoder, policy.decoder, policy.memory
+        self.encoder_norm, self.norm, self.head = policy.encoder_norm, policy.norm, policy.head
         self.state_norm, self.state_project = policy.state_norm, policy.state_project
-        self.action_unnorm = policy.action_unnorm
+        self.action_unnorm, self.cameras = policy.action_unnorm, len(policy.config.cameras)
+        self.latent: Tensor
+        for name in ("latent", "pos", "q_pos"):
+            self.register_buffer(name, getattr(policy, name))
 
     def forward(self, state: Tensor, *features: Tensor) -> Tensor:
         images = [features[i].flatten(0, 1).unsqueeze(0) for i in range(self.cameras)]
         token = self.state_project(self.state_norm(state)).unsqueeze(1)
-        return self.action_unnorm(self.plan(token, images))
-
-
-class Whole(Transformer):
-    """(state (1, S, 1, 1), pictures (1, 3, height, width) each) -> (1, C, A), all of them normalised.
-
-    Normalisation happens outside, because the chip has one scale for all numbers of a layer: normalised numbers are of
-    similar size, but degrees and shares are not. The state is a picture of one pixel, so that the parser sees nothing
-    but pictures.
-    """
-
-    def __init__(self, policy: ACT):
-        super().__init__(policy)
-        self.backbone, self.image_project = policy.backbone, policy.image_project
-        self.state_project = nn.Conv2d(policy.state_project.in_features, policy.config.dim, 1)
-        self.state_project.weight.data = policy.state_project.weight[:, :, None, None].clone()
-        self.state_project.bias = policy.state_project.bias
-        self.eval().requires_grad_(False)
-
-    def forward(self, state: Tensor, *pictures: Tensor) -> Tensor:
-        token = self.state_project(state).flatten(2).transpose(1, 2)
-        images = []
-        for i in range(self.cameras):
-            features = self.image_project(self.backbone(pictures[i]))
-            images.append(features.flatten(2).transpose(1, 2))
-        return self.plan(token, images)
+        return self.action_unnorm(transform(self, torch.cat([self.latent, token, *images], 1)))
 
 
 @dataclass(frozen=True)
@@ -92,8 +54,8 @@ class Network:
     outputs: dict[str, str]
 
 
-def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
-    """Make an FP32 policy's networks: `backbone`, `whole`, and what runs after `backbone` on the processor.
+def networks(policy: ACT) -> tuple[Network, onnx.ModelProto]:
+    """Make an FP32 policy's networks: what runs on the chip, and what runs after it on the processor.
 
     Raises ArtifactError for a policy that sees no state: its networks have no place for one.
     """
@@ -103,17 +65,16 @@ def networks(policy: ACT) -> tuple[Network, Network, onnx.ModelProto]:
     pictures = {f"frame_{n}": torch.zeros(1, 3, *s) for n, s in zip(config.cameras, config.image_sizes, strict=True)}
     grids = [config.grid(*size) for size in config.image_sizes]
     features = {f"features_{n}": torch.zeros(*g, config.dim) for n, g in zip(config.cameras, grids, strict=True)}
-    state = torch.zeros(1, len(config.state_names))
-    front = _network(Front(policy), pictures, list(features))
-    whole = _network(Whole(policy), {"state": state[:, :, None, None], **pictures}, ["actions"])
-    return front, whole, onnx_model(graph_of(Rest(policy)), {"state": state, **features}, ["chunk"])
+    inputs = {"state": torch.zeros(1, len(config.state_names)), **features}
+    front = onnx_model(graph_of(Front(policy)), pictures, list(features))
+    return _without_ends(front, pictures, list(features)), onnx_model(graph_of(Rest(policy)), inputs, ["chunk"])
 
 
-def _network(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> Network:
-    model = onnx_model(graph_of(module), inputs, outputs)
+def _without_ends(model: onnx.ModelProto, inputs: dict[str, Tensor], outputs: list[str]) -> Network:
+    """Remove the Identity before each output: the compiler's end is the node before it."""
     made = {node.output[0]: node for node in model.graph.node}
     ends = {}
-    for name in outputs:  # each is an Identity, which nothing else reads; the compiler's end is the node before it
+    for name in outputs:
         end = made[made[name].input[0]]
         model.graph.node.remove(made[name])
         end.output[0] = name

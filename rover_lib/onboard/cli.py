@@ -159,7 +159,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
         failed = False
         for part in (parts := find_killed(out_dir)):
             try:
-                click.echo(f"finished: {finish_killed(part) or 'nothing, it was killed before its first row'}")
+                click.echo(f"finished: {finish_killed(part) or 'nothing recorded'}")
             except RoverError as error:  # the others are finished all the same
                 failed = True
                 notify(f"rover: {error}")

@@ -6,6 +6,8 @@ Metric keys end in their unit (_ms _mb _us _pct _hz _c _g). Papermill, pytest, A
 
 import contextlib
 import errno
+import fcntl
+import glob
 import hashlib
 import json
 import math
@@ -19,12 +21,13 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from io import BufferedReader
+from io import BufferedReader, BufferedWriter
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
 
+from rover_lib.onboard.durable import sync
 from rover_lib.onboard.errors import RoverError
 
 SCHEMA = 1
@@ -36,19 +39,20 @@ FILE_BYTES = 50_000_000  # largest report, list or file of settings that is read
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`. It is renamed to `path` if the block succeeds, and removed if it fails.
 
+    What a killed process left beside it is removed too. A lock tells it from what another process is writing.
+
     Raises RoverError if torch.save cannot write the whole file, and OSError that names `path` for all else.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
-    # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the umask;
-    # a process can learn its umask only by setting it, which would affect all of its threads.
     try:
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        yield temporary
-        with temporary.open("rb") as f:
-            os.fsync(f.fileno())  # a power cut after the rename must not leave an empty file
-        temporary.replace(path)
+        with _create_locked(temporary):
+            yield temporary
+            sync(temporary)  # a power cut after the rename must not leave an empty file
+            temporary.replace(path)
+            sync(path.parent)
     except OSError as error:
         if error.filename in (None, str(temporary)):  # of a full disk it says no name, else a name that nobody knows
             raise OSError(error.errno, error.strerror, str(path)) from error
@@ -59,6 +63,25 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         raise RoverError(f"{path}: cannot be written whole", remedy="is the disk full?") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _create_locked(path: Path) -> BufferedWriter:
+    """Create a file, with a lock that tells it from what a killed process left."""
+    while True:
+        # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the
+        # umask; a process can learn its umask only by setting it, which would affect all of its threads.
+        file = os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666), "wb")
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink:
+            return file
+        file.close()  # another process removed it before it was locked
+
+
+def _remove_leftovers(path: Path) -> None:
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}{glob.escape(path.suffix)}"):
+        with contextlib.suppress(OSError), left.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
 
 
 def open_plain(path: Path | str, refusal: RoverError | OSError) -> BufferedReader:

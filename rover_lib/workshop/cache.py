@@ -4,14 +4,13 @@ import hashlib
 import inspect
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.durable import build_folder
 
 
 def cache_root() -> Path:
@@ -37,20 +36,11 @@ def car_in_key() -> dict[str, Any]:
 def cache_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
     """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if it is not there yet.
 
-    It appears complete or not at all: made beside its place and renamed.
+    It appears complete or not at all. A second process that needs it waits for the first.
     """
     folder = cache_root() / f"{kind}-{key}"
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        make(temporary)
-        try:
-            temporary.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # another process may have made the same one meanwhile
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    if not folder.is_dir():
+        with build_folder(folder, wait=True) as new:
+            if not folder.is_dir():  # another process may have made it meanwhile
+                make(new)
     return folder

@@ -42,9 +42,8 @@ def recorded(tmp_path):
 def check_equal(found, expected, pixels=0):
     assert len(found) == len(expected) > 0
     for ours, theirs in zip(found, expected, strict=True):
-        assert np.array_equal(ours.state, theirs.state)
-        assert np.array_equal(ours.chunk, theirs.chunk)
-        assert np.array_equal(ours.is_pad, theirs.is_pad)
+        for name in ("state", "chunk", "is_pad"):
+            assert np.array_equal(getattr(ours, name), getattr(theirs, name))
         assert np.abs(ours.frame_bgr().astype(int) - theirs.frame_bgr()).max() <= pixels
 
 
@@ -76,13 +75,6 @@ def test_lerobot_reads_it_back_edits_it_and_so_do_we(recorded, tmp_path):
     check_equal(load(tmp_path / "less").samples, [s for s in original.samples if s.episode != original.episodes[1].id])
 
 
-def test_as_video(recorded, tmp_path):
-    result = CliRunner().invoke(main, ["export-dataset", str(recorded), str(tmp_path / "out"), "--video", "--json"])
-    assert result.exit_code == 0, result.output
-    assert list((tmp_path / "out").rglob("*.mp4"))
-    check_equal(load(tmp_path / "out").samples, load(recorded).samples, pixels=6)  # plain pictures: AV1 is close
-
-
 def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     first = recorded / "episode_20260101_120000"
 
@@ -107,6 +99,9 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     for ours, theirs in zip(again, original, strict=True):
         assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk[0], theirs.chunk[0])
     check_equal(again[18:], original[18:])  # the first episode is in parts now, so its chunks end earlier
+    result = CliRunner().invoke(main, ["export-dataset", str(recorded), str(tmp_path / "video"), "--video", "--json"])
+    assert result.exit_code == 0 and list((tmp_path / "video").rglob("*.mp4")), result.output
+    check_equal(load(tmp_path / "video").samples[18:], original[18:], pixels=6)  # plain pictures: AV1 is close
 
 
 def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
@@ -192,9 +187,7 @@ def test_interventions_are_lerobots(mixed, tmp_path):
     [
         lambda report: report.update(car={"name": "a cat"}),
         lambda report: report["driven_by"].pop(),
-        lambda report: report["driven_by"].__setitem__(0, "the cat"),
         lambda report: report["outcomes"].__setitem__(0, ["hit"]),
-        lambda report: report.pop("outcomes"),
     ],
 )
 def test_a_report_of_another_dataset_is_not_used_and_said(mixed, tmp_path, change):
@@ -248,13 +241,9 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
     (tmp_path / "car.yml").write_text(yaml_of(CRAWLER))
     monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
     assert car_of(load(tmp_path / "out").samples) == CRAWLER
-
-
-def test_two_cars_or_none_that_was_driven_are_no_dataset(tmp_path):
-    backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
     backwards(tmp_path / "mine", "episode_20260101_120001", Car())
     driven(record(tmp_path / "held", frames=20), ("nobody", 0))
     for folder, word in (("mine", "several cars"), ("held", "no two whole frames")):
         with pytest.raises(EpisodeError, match=word):
-            export_dataset(tmp_path / folder, tmp_path / "out")
-        assert not (tmp_path / "out").exists()
+            export_dataset(tmp_path / folder, tmp_path / "new")
+        assert not (tmp_path / "new").exists()

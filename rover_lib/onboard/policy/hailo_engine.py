@@ -23,25 +23,21 @@ TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take
 class HailoEngine(SessionEngine):
     """A network on the chip, and the rest of the policy on the processor. Make it with `load`.
 
-    _how: the manifest's "hailo": network ("backbone" or "whole"), outputs (name: shape), original_names, and state and
-    actions, each None or a scale and a shift.
+    _how: the manifest's "hailo": network, outputs (name: shape) and original_names.
     """
 
     def __init__(self, artifact: Artifact, threads: int | None):
         self._path, self._how = artifact.path, artifact.manifest["hailo"]
         cameras = artifact.manifest["cameras"]
-        self._frames = [f"frame_{c['name']}" for c in cameras]
         shapes = {f"frame_{c['name']}": [c["height"], c["width"], 3] for c in cameras}
-        if self._how["network"] == "whole":
-            shapes["state"] = [1, 1, len(artifact.manifest["state_names"])]
-        self._rest_model = None if self._how["network"] == "whole" else artifact.record(ONNX)
+        self._rest_model = artifact.record(ONNX)
         formats = hailo_platform.FormatType
         self._device = hailo_platform.VDevice()
         self._model = self._device.create_infer_model(artifact.record(HEF))
         self._inputs = self._match(self._model.inputs, shapes)
         outputs = self._match(self._model.outputs, self._how["outputs"])
-        for name, stream in self._inputs.items():
-            self._model.input(stream).set_format_type(formats.UINT8 if name in self._frames else formats.FLOAT32)
+        for stream in self._inputs.values():
+            self._model.input(stream).set_format_type(formats.UINT8)
         for stream in outputs.values():
             self._model.output(stream).set_format_type(formats.FLOAT32)
         self._network = self._model.configure()
@@ -53,24 +49,18 @@ class HailoEngine(SessionEngine):
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         """As Engine.run()."""
-        given = dict(zip(self._frames, frames_rgb, strict=True))
-        if "state" in self._inputs:
-            given["state"] = _affine(state, self._how["state"]).reshape(1, 1, -1)
         try:
-            for name, value in given.items():
-                self._bindings.input(self._inputs[name]).set_buffer(np.ascontiguousarray(value))
+            for stream, frame in zip(self._inputs.values(), frames_rgb, strict=True):
+                self._bindings.input(stream).set_buffer(np.ascontiguousarray(frame))
             self._network.run([self._bindings], TIMEOUT_MS)
-            if self._rest_model is None:
-                return _affine(self._answers["actions"], self._how["actions"])
             return self._rest.run(None, {"state": state[None], **self._answers})[0]
         except Exception as e:  # HailoRT raises a dozen types, and so does ONNX Runtime
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
 
     def _make_session(self, threads: int) -> None:
-        if self._rest_model is not None:  # a whole network on the chip does not need ONNX Runtime
-            from rover_lib.onboard.policy.onnx_engine import session_of
+        from rover_lib.onboard.policy.onnx_engine import session_of
 
-            self._rest = session_of(self._rest_model, threads, self._path)
+        self._rest = session_of(self._rest_model, threads, self._path)
 
     def _match(self, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
         """Return HailoRT's name of the stream for each of our names: by its size and, if several have it, by name."""
@@ -97,7 +87,3 @@ def load(artifact: Artifact, threads: int | None) -> HailoEngine:
         why = " ".join(f"{type(e).__name__}: {e}".split())[:200]
         remedy = "is the card in, its driver loaded, and the HEF for this chip? ('hailortcli fw-control identify')"
         raise ArtifactError(f"{artifact.path}: the Hailo chip does not run it here ({why})", remedy=remedy) from None
-
-
-def _affine(x: np.ndarray, by: dict[str, list[float]] | None) -> np.ndarray:
-    return x if by is None else x * np.array(by["scale"], np.float32) + np.array(by["shift"], np.float32)

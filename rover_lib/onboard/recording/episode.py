@@ -14,24 +14,26 @@ DRIVERS. Whether a drive succeeded, one of OUTCOMES, is metadata.outcome, noted 
 import contextlib
 import csv
 import errno
-import fcntl
 import json
 import math
 import os
 import shutil
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import FileIO
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import cv2
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.durable import lock_folder, move_durably, sync_disk
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.stage import atomic_path, open_plain, plain, read_plain
+from rover_lib.onboard.stage import atomic_path, plain, read_plain
 
 CHANNELS = ("steering", "throttle")
 CONTROL_FIELDS = (
@@ -44,7 +46,12 @@ FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
 HIT, MISSED = OUTCOMES = ("hit", "missed")  # whether a drive succeeded: metadata.outcome
 
+DATA = "episode_data.json"
+PART = ".part"  # how the name of the hidden folder ends
 ABOUT = "about.json"  # in the hidden folder: what finish_killed() needs
+KINDS = {"control": "system_timestamp", "frame": "timestamp"}  # of rows, and the name of their time
+CUT_OFF = "the recording was cut off"
+SYNC_S = 0.4  # and two syncs of 0.3 s: a power cut costs the last second
 DATA_BYTES = 200_000_000  # largest data file that is read: three hours of driving
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
@@ -75,7 +82,8 @@ class About:
 class EpisodeWriter:
     """Write one episode. The complete folder appears when the `with` block ends without an error, and only then.
 
-    Until then everything is in a hidden folder beside it, on the disk and not in memory.
+    Until then everything is in a hidden folder beside it, synced about twice a second. After an error, a kill or a
+    power cut it stays there for finish_killed(), unless nothing was recorded.
 
     folder: the folder to make, e.g. episodes/episode_20251007_144013; it must not exist. Its name is the episode's id.
     resolution: (width, height) of the frames; None: that of the first frame. flags: write the two columns that say what
@@ -94,8 +102,7 @@ class EpisodeWriter:
         flags: bool = False,
     ):
         self.folder, self.about = Path(folder), about
-        self.resolution = resolution and (int(resolution[0]), int(resolution[1]))
-        self.jpeg_quality, self.flags = jpeg_quality, flags
+        self.resolution, self.jpeg_quality, self.flags = resolution, jpeg_quality, flags
         car = about.car or Car()
         self.pwm = car.pwm
         self.metadata: dict[str, Any] = {}  # further entries of the episode's metadata
@@ -106,8 +113,12 @@ class EpisodeWriter:
         self.controls = self.frames = self.picture_bytes = 0
         self._extra: dict[str, None] = {}  # names of further columns, in order
         self._first_s, self._last_s = math.inf, -math.inf
-        self._temporary: Path | None = None  # while it is open
+        self._part: Path | None = None  # the hidden folder, while it is open
+        self._lock: int | None = None
         self._rows: dict[str, FileIO] = {}
+        self._damaged: set[str] = set()  # pictures that a kill or a power cut has left without their end
+        self._closing, self._syncing = threading.Event(), threading.Thread(target=self._keep_synced, daemon=True)
+        self._unsynced: OSError | None = None
 
     def __enter__(self) -> "EpisodeWriter":
         self.open()
@@ -117,34 +128,35 @@ class EpisodeWriter:
         if kind is None:
             self.finish()
         else:
-            self.discard()
+            self.close()
 
     def open(self) -> None:
         """Begin the episode. Raises EpisodeError if the folder exists or another program is recording it."""
         self._refuse_existing()
         # beside the target, so that the rename stays within one filesystem; hidden from loaders
-        temporary = self.folder.with_name(f".{self.folder.name}.part")
+        part = self.folder.with_name(f".{self.folder.name}{PART}")
         with self._disk():
             self.folder.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                temporary.mkdir()
-            except FileExistsError:
-                raise EpisodeError(
-                    f"{self.folder}: is being recorded, or was when its program was killed",
-                    remedy=f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded",
-                    kind="exists",
-                ) from None
-        self._temporary = temporary
+            with contextlib.suppress(FileExistsError):
+                part.mkdir()
+                self._lock = lock_folder(part)
+        if self._lock is None:
+            raise EpisodeError(
+                f"{self.folder}: is being recorded, or was when its program was killed",
+                remedy=f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded",
+                kind="exists",
+            )
+        self._part = part
         try:
             with self._disk():
-                (temporary / "frames").mkdir()
+                (part / "frames").mkdir()
                 told = {"about": vars(replace(self.about, car=None)), "metadata": self.metadata, "flags": self.flags}
-                (temporary / ABOUT).write_text(json.dumps(told))
-                for name in ("control", "frame"):
-                    self._rows[name] = (temporary / f"{name}.rows").open("ab", buffering=0)
-                fcntl.flock(self._rows["control"], fcntl.LOCK_EX | fcntl.LOCK_NB)  # says that it is being recorded
+                (part / ABOUT).write_text(json.dumps(told))
+                for kind in KINDS:
+                    self._rows[kind] = (part / f"{kind}.rows").open("ab", buffering=0)
+            self._syncing.start()
         except BaseException:
-            self.discard()  # no __exit__ follows a failed open()
+            self.close()  # no __exit__ follows a failed open()
             raise
 
     def control(
@@ -163,35 +175,32 @@ class EpisodeWriter:
         Without flags they are 0 where no pulse was measured, as the firmware has it.
         """
         self._must_be_open()
+        self._check_time(t_system_s)
         row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
-        row["arduino_timestamp"] = self._whole("arduino_timestamp", arduino_ms)
-        row["system_timestamp"] = self._time(t_system_s)
+        row["arduino_timestamp"], row["system_timestamp"] = arduino_ms, float(t_system_s)
         for name, pulse_us, period_us, flag in (
             ("steering", steering_us, steering_period_us, FLAG_FIELDS[0]),
             ("throttle", throttle_us, throttle_period_us, FLAG_FIELDS[1]),
         ):
             action = None
             if not (self.flags and (pulse_us is None or period_us is None)):
-                pulse_us = self._whole(f"{name}_raw_us", pulse_us)
-                period_us = self._whole(f"{name}_period_us", period_us)
+                if not is_whole(pulse_us, 0) or not is_whole(period_us, 0):
+                    what = f"{self.folder.name}: pulse and period of {name} must be whole numbers from 0"
+                    raise EpisodeError(what, found=f"{pulse_us!r} and {period_us!r}")
                 action = self.pwm.channel(name).action(pulse_us, period_us)
             if action is not None or not self.flags:
                 row[f"{name}_normalized"] = round(action or 0.0, 4) + 0.0  # + 0.0: no "-0.0" in the file
                 row[f"{name}_raw_us"], row[f"{name}_period_us"] = pulse_us, period_us
             if self.flags:
                 row[flag] = action is not None
-        if extra:
-            if taken := extra.keys() & {*CONTROL_FIELDS, *FLAG_FIELDS}:
-                raise EpisodeError(f"{self.folder.name}: column {min(taken)} is taken", remedy="give it another name")
-            row |= plain(extra)
-            self._extra |= dict.fromkeys(extra)
-        self._append("control", row, row["system_timestamp"])
+        self._extra |= dict.fromkeys(extra)
+        self._append("control", plain(extra) | row, t_system_s)
         self.controls += 1
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
         """Add one picture, (height, width, 3) uint8 BGR of the episode's resolution, at system time `t_s`."""
-        temporary = self._must_be_open()
-        t_s = self._time(t_s)
+        part = self._must_be_open()
+        self._check_time(t_s)
         if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
             self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
         shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
@@ -201,10 +210,8 @@ class EpisodeWriter:
             raise EpisodeError(what, found=found, remedy="check the camera")
         number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
-        ok, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
-        if not ok:
-            raise EpisodeError(f"{self.folder.name}: frame {number} is not JPEG", remedy="check the camera")
-        picture = temporary / relative
+        _, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
+        picture = part / relative
         try:
             with self._disk():
                 picture.write_bytes(jpeg.data)
@@ -212,82 +219,102 @@ class EpisodeWriter:
             with contextlib.suppress(OSError):  # half a file is no picture, and the episode may go on without it
                 picture.unlink()
             raise
-        self._append("frame", {"frame_id": number, "timestamp": t_s, "image_path": relative}, t_s)
+        self._append("frame", {"frame_id": number, "timestamp": float(t_s), "image_path": relative}, t_s)
         self.frames, self.picture_bytes = number, self.picture_bytes + len(jpeg)
 
     def finish(self) -> Path:
-        """Make the folder appear and return it. If that fails, nothing is left, and EpisodeError says why."""
+        """Make the folder appear and return it. If that fails, the hidden folder stays, and EpisodeError says why."""
+        part = self._must_be_open()
         try:
-            temporary = self._must_be_open()
             with self._disk():
-                self._write(temporary)
+                if (part / "control.rows").is_file() or not (part / DATA).is_file():  # else only the rename is missing
+                    self._write(part)
+                    sync_disk(part)
+                for name in (*(f"{kind}.rows" for kind in KINDS), ABOUT):
+                    (part / name).unlink(missing_ok=True)
                 self._refuse_existing()  # rename would replace an empty folder without a word
-                temporary.rename(self.folder)
-            return self.folder
+                move_durably(part, self.folder)
+            self._part = None
         finally:
-            self.discard()
+            self.close()
+        return self.folder
 
-    def discard(self) -> None:
-        """End the episode, and remove it unless it is finished."""
+    def close(self, unwanted: bool = False) -> None:
+        """End the episode as it is. Its hidden folder is removed if nothing was recorded, or if it is unwanted."""
+        self._closing.set()
+        if self._syncing.is_alive():
+            self._syncing.join()
         for file in self._rows.values():
             file.close()
-        self._rows = {}
-        if self._temporary:
-            shutil.rmtree(self._temporary, ignore_errors=True)
-        self._temporary = None
+        if self._part and (unwanted or not _holds_anything(self._part)):
+            shutil.rmtree(self._part, ignore_errors=True)
+        if self._lock is not None:
+            os.close(self._lock)
+        self._rows, self._part, self._lock = {}, None, None
 
-    def _take(self, part: Path, controls: list[dict[str, Any]], frames: list[dict[str, Any]]) -> None:
-        """Go on with what a killed recording has left: its rows, of which there is one of each kind at least."""
-        known = {*CONTROL_FIELDS, *FLAG_FIELDS}
-        self._extra = dict.fromkeys(name for row in controls for name in row if name not in known)
-        times = [row["system_timestamp"] for row in controls] + [row["timestamp"] for row in frames]
-        self.controls, self.frames, self._first_s, self._last_s = len(controls), len(frames), min(times), max(times)
-        first = cv2.imread(str(part / frames[0]["image_path"]))
-        if first is not None:
-            self.resolution = first.shape[1], first.shape[0]
-        self.metadata["fault"] = "the program that recorded it was killed"
+    def _take(self, part: Path, lock: int) -> None:
+        """Go on with what an ended process has left in a hidden folder."""
+        self._part, self._lock = part, lock
+        known, left_out = {*CONTROL_FIELDS, *FLAG_FIELDS}, 0
+        for kind, time in KINDS.items():
+            for line in _lines(part, kind):
+                row = _whole_row(line, kind)
+                if row and kind == "frame" and not _is_whole_picture(part / row["image_path"]):
+                    self._damaged.add(row["image_path"])
+                    row = None
+                if row is None:
+                    left_out += 1
+                    continue
+                self.controls += kind == "control"
+                self.frames += kind == "frame"
+                self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in known)
+                self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
+                if kind == "frame" and self.frames == 1:
+                    self.resolution = cv2.imread(str(part / row["image_path"])).shape[1::-1]
+        self.metadata["fault"] = CUT_OFF + (f"; {left_out} damaged rows and pictures are left out" if left_out else "")
+
+    def _rows_of(self, part: Path, kind: str) -> Iterator[dict[str, Any]]:
+        for line in _lines(part, kind):
+            row = _whole_row(line, kind)
+            if row and row.get("image_path") not in self._damaged:
+                yield row
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
-        try:
-            line = json.dumps(row, allow_nan=False).encode() + b"\n"
-        except (TypeError, ValueError) as e:
-            what = f"{self.folder.name}: a column cannot be written ({e})"
-            raise EpisodeError(what, remedy="give numbers or text") from None
+        line = json.dumps(row, allow_nan=False).encode() + b"\n"
         with self._disk():
+            if self._unsynced:
+                raise self._unsynced
             file = self._rows[kind]
             if (written := file.write(line)) < len(line):
                 file.truncate(file.tell() - written)  # half a row would spoil the next one
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._first_s, self._last_s = min(self._first_s, t_s), max(self._last_s, t_s)
 
+    def _keep_synced(self) -> None:
+        while self._part and not self._closing.wait(SYNC_S):
+            try:
+                sync_disk(self._part)
+            except OSError as error:
+                self._unsynced = error
+                return
+
     @contextlib.contextmanager
     def _disk(self) -> Iterator[None]:
         try:
             yield
         except OSError as e:
-            raise EpisodeError(
-                f"{self.folder}: cannot be written ({e.strerror or e})", remedy="make room, or name another folder"
-            ) from e
+            remedy = f"make room; `rover record {self.folder.parent} --finish` keeps what was recorded"
+            raise EpisodeError(f"{self.folder}: cannot be written ({e.strerror or e})", remedy=remedy) from e
 
     def _must_be_open(self) -> Path:
         """Return the hidden folder. Raises EpisodeError if there is none."""
-        if self._temporary is None:
+        if self._part is None:
             raise EpisodeError(f"{self.folder.name}: not open", remedy="use it as `with EpisodeWriter(...) as writer:`")
-        return self._temporary
+        return self._part
 
-    def _whole(self, name: str, value: object) -> int:
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise EpisodeError(f"{self.folder.name}: {name} must be a whole number from 0", found=f"{value!r}")
-        return int(value)
-
-    def _time(self, t_s: float) -> float:
-        try:
-            found = float(t_s)
-        except (TypeError, ValueError, OverflowError):
-            found = math.nan
-        if not math.isfinite(found):
+    def _check_time(self, t_s: float) -> None:
+        if not is_number(t_s):
             raise EpisodeError(f"{self.folder.name}: a time must be finite seconds", found=repr(t_s))
-        return found
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
@@ -295,17 +322,15 @@ class EpisodeWriter:
                 f"{self.folder}: exists already", remedy="name another folder, or move it away first", kind="exists"
             )
 
-    def _write(self, temporary: Path) -> None:
+    def _write(self, part: Path) -> None:
         """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
             found = f"{self.controls} controls and {self.frames} frames"
-            remedy = "check that the camera and the Arduino deliver"
+            remedy = f"check that the camera and the Arduino deliver; {part.name} has what there is"
             raise EpisodeError(f"{self.folder.name}: too little for an episode", found=found, remedy=remedy)
-        for file in self._rows.values():
-            file.close()
         about = self.about
-        start_s = self._first_s if about.start_time_s is None else self._time(about.start_time_s)
-        end_s = self._last_s if about.end_time_s is None else self._time(about.end_time_s)
+        start_s = self._first_s if about.start_time_s is None else about.start_time_s
+        end_s = self._last_s if about.end_time_s is None else about.end_time_s
         duration_s = end_s - start_s
         head = {
             "episode_id": self.folder.name,
@@ -328,103 +353,88 @@ class EpisodeWriter:
             "control": (*CONTROL_FIELDS, *(FLAG_FIELDS if self.flags else ()), *self._extra),
             "frame": FRAME_FIELDS,
         }
-        with (temporary / "episode_data.json").open("w") as f:
+        with atomic_path(part / DATA) as path, path.open("w") as f:
             # As json.dumps(episode, indent=2) would, but a row at a time: a long drive does not fit in memory.
             f.write(json.dumps(head, indent=2, allow_nan=False).removesuffix("\n}"))
-            for kind in columns:
+            for kind, names in columns.items():
                 f.write(f',\n  "{kind}_samples": [')
-                for i, row in enumerate(_read_rows(temporary, kind, columns[kind])):
-                    fields = json.dumps(row, separators=(",\n      ", ": "))[1:-1]
+                for i, row in enumerate(self._rows_of(part, kind)):
+                    fields = json.dumps({name: row.get(name) for name in names}, separators=(",\n      ", ": "))[1:-1]
                     f.write(f"{',' if i else ''}\n    {{\n      {fields}\n    }}")
                 f.write("\n  ]")
             f.write("\n}")
-            _to_disk(f)
-        for kind in columns:
-            with (temporary / f"{kind}_data.csv").open("w", newline="") as f:
-                table = csv.DictWriter(f, columns[kind])  # ends lines with CR LF, as the user's recorder did
+        for kind, names in columns.items():
+            with atomic_path(part / f"{kind}_data.csv") as path, path.open("w", newline="") as f:
+                # ends lines with CR LF, as the user's recorder did
+                table = csv.DictWriter(f, names, extrasaction="ignore")
                 table.writeheader()
-                table.writerows(_read_rows(temporary, kind, columns[kind]))
-                _to_disk(f)
-        for name in (*(f"{kind}.rows" for kind in columns), ABOUT):
-            (temporary / name).unlink(missing_ok=True)
+                table.writerows(self._rows_of(part, kind))
 
 
 def find_killed(folder: Path) -> list[Path]:
     """Return the hidden folders of recordings whose program was killed, in a folder of episodes."""
-    return [path for path in sorted(folder.glob(".*.part")) if path.is_dir() and not _is_recording(path)]
+    found = []
+    for part in sorted(folder.glob(f".*{PART}")):
+        if (lock := lock_folder(part)) is not None:
+            os.close(lock)
+            found.append(part)
+    return found
 
 
-def _is_recording(part: Path) -> bool:
-    try:
-        with open_plain(part / "control.rows", OSError("not a plain file")) as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
+def remove_if_empty(part: Path) -> bool:
+    """Remove what a killed recording has left if nothing was recorded; return whether it is gone."""
+    if (lock := lock_folder(part)) is not None:
+        if not _holds_anything(part):
+            shutil.rmtree(part)
+        os.close(lock)
+    return not part.exists()
 
 
 def finish_killed(part: Path) -> Path | None:
-    """Make an episode of what a killed recording has left, and return its folder.
+    """Make an episode of what a killed recording has left, and return its folder; None, if nothing was recorded.
 
-    A row or a picture that was cut is left out. A recording that was killed before its first row is removed, and None
-    returned. Raises EpisodeError, and changes nothing, if there are no controls or no pictures.
+    A row or a picture that was cut is left out; metadata.fault counts them. Raises EpisodeError, and removes nothing,
+    if there are no controls or no pictures, or if another process is recording or finishing it.
     """
-    folder = part.with_name(part.name.removeprefix(".").removesuffix(".part"))
-    if _is_recording(part):
-        raise EpisodeError(f"{folder}: is being recorded", remedy="wait until it is", kind="exists")
-    rows = {kind: part / f"{kind}.rows" for kind in ("control", "frame")}
+    folder = part.with_name(part.name.removeprefix(".").removesuffix(PART))
+    if remove_if_empty(part):
+        return None
+    if (lock := lock_folder(part)) is None:
+        raise EpisodeError(
+            f"{folder}: is being recorded, or finished by another process", remedy="wait until it is", kind="exists"
+        )
     try:
         told = json.loads(_data_of(part / ABOUT))
         writer = EpisodeWriter(folder, About(**told["about"]), resolution=None, flags=told["flags"])
         writer.metadata = dict(told["metadata"])
     except (ValueError, TypeError, KeyError):
         writer = EpisodeWriter(folder, About(), resolution=None, flags=True)
-    writer._refuse_existing()
-    if all(path.is_file() for path in rows.values()):  # else all was written already, and only the rename is missing
-        kept = {kind: list(_whole_rows(path)) for kind, path in rows.items()}
-        kept["frame"] = [row for row in kept["frame"] if _is_whole_picture(part / str(row.get("image_path")))]
-        if not kept["control"] and not kept["frame"]:
-            shutil.rmtree(part)
-            return None
-        if not kept["control"] or not kept["frame"]:
-            raise EpisodeError(f"{part}: nothing usable was recorded", remedy="remove it")
-        for kind, path in rows.items():
-            with atomic_path(path) as whole:
-                whole.write_text("".join(json.dumps(row) + "\n" for row in kept[kind]))
-        writer._take(part, kept["control"], kept["frame"])
-        writer._write(part)
-    elif not (part / "episode_data.json").is_file():
-        shutil.rmtree(part)
+    writer._take(part, lock)
+    return writer.finish()
+
+
+def _holds_anything(part: Path) -> bool:
+    return any(path.stat().st_size for path in part.rglob("*") if path.is_file() and path.name != ABOUT)
+
+
+def _lines(part: Path, kind: str) -> Iterator[bytes]:
+    path = part / f"{kind}.rows"
+    if path.is_file():
+        with path.open("rb") as file:
+            yield from file
+
+
+def _whole_row(line: bytes, kind: str) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except ValueError:
         return None
-    part.rename(folder)
-    return folder
-
-
-def _whole_rows(path: Path) -> Iterator[dict[str, Any]]:
-    for line in _data_of(path).splitlines(keepends=True):
-        with contextlib.suppress(ValueError):
-            row = json.loads(line)
-            if line.endswith(b"\n") and isinstance(row, dict):
-                yield row
+    return row if isinstance(row, dict) and KINDS[kind] in row else None
 
 
 def _is_whole_picture(path: Path) -> bool:
     data = _data_of(path)
     return data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")
-
-
-def _read_rows(folder: Path, kind: str, columns: tuple[str, ...]) -> Iterator[dict[str, Any]]:
-    with (folder / f"{kind}.rows").open() as f:
-        for line in f:
-            row = json.loads(line)
-            yield {name: row.get(name) for name in columns}
-
-
-def _to_disk(file: IO[str]) -> None:
-    file.flush()
-    os.fsync(file.fileno())  # a power cut after the rename must not leave an empty file
 
 
 def number_of(value: object) -> float | None:
@@ -489,7 +499,7 @@ def read_car_of(folder: Path | str) -> Car:
     description is not that of a car.
     """
     try:
-        metadata = json.loads(_data_of(Path(folder) / "episode_data.json"))["metadata"]
+        metadata = json.loads(_data_of(Path(folder) / DATA))["metadata"]
         described, said = metadata.get("car"), metadata.get("steering_positive")
         before = metadata.get("arduino_port") == SIMULATED and said is None
     except (ValueError, RecursionError, TypeError, KeyError, AttributeError):

@@ -13,21 +13,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import DATA_BYTES, HIT, MISSED
+from rover_lib.onboard.recording.episode import DATA, DATA_BYTES, HIT, MISSED
 from rover_lib.onboard.stage import atomic_path, read_plain
 
 NONE = "none"
 CHOICES = (HIT, MISSED, NONE)
-DATA = "episode_data.json"
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:
-    """Note an outcome, one of CHOICES, in each of these episode folders. Raises EpisodeError as relabel() does.
+    """Note an outcome, one of CHOICES, in each of these episode folders.
 
     All episodes are read before the first is written. Owner and mode of a file stay the same, so that a rover's service
-    can still read it.
+    can still read it. Raises EpisodeError for one without a complete episode_data.json, or that cannot be written.
     """
-    for path, text in [relabel(episode, outcome) for episode in episodes]:
+    for path, text in [_relabelled(episode / DATA, outcome) for episode in episodes]:
         try:
             before = path.stat()
             with atomic_path(path) as temporary:
@@ -39,19 +38,15 @@ def label(episodes: Sequence[Path], outcome: str) -> None:
             raise EpisodeError(f"{path}: cannot be written ({error.strerror})", remedy="use sudo on a rover") from None
 
 
-def relabel(episode: Path, outcome: str) -> tuple[Path, str]:
-    """Return an episode's file and its new text. Raises EpisodeError if it has no complete episode_data.json."""
-    if outcome not in CHOICES:
-        raise EpisodeError(f"an outcome is one of {', '.join(CHOICES)}", found=outcome)
-    path = episode / DATA
+def _relabelled(path: Path, outcome: str) -> tuple[Path, str]:
+    """Return an episode's file and its new text."""
     try:
         content = json.loads(read_plain(path, DATA_BYTES))
         metadata = content.setdefault("metadata", {})
         metadata.pop("outcome", None)
-    except OSError as error:
-        raise EpisodeError(f"{path}: cannot be read ({error.strerror})", remedy="give each episode's folder") from None
-    except (ValueError, RecursionError, AttributeError, TypeError) as error:
-        raise EpisodeError(f"{path}: not an episode's JSON ({str(error)[:120]})", remedy="copy it again") from None
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        what = f"{path}: not an episode's JSON ({str(error)[:120]})"
+        raise EpisodeError(what, remedy="give each episode's folder") from None
     if outcome != NONE:
         metadata["outcome"] = outcome
     return path, json.dumps(content, indent=2)

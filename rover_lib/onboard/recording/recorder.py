@@ -21,7 +21,7 @@ from typing import Any, TextIO
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import EpisodeError, RoverError, sentence_of
-from rover_lib.onboard.recording.episode import About, EpisodeWriter, find_killed
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, find_killed, remove_if_empty
 from rover_lib.onboard.signal_event import SignalEvent, signals
 from rover_lib.onboard.status_line import StatusLine
 
@@ -74,7 +74,7 @@ class Recorder:
             self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
             self._thread.start()
         except BaseException:
-            self._writer.discard()
+            self._writer.close()
             raise
 
     def __enter__(self) -> "Recorder":
@@ -85,28 +85,17 @@ class Recorder:
             self.discard()  # the drive had not begun, say because the car was not armed
         self.close(sentence_of(error) if error else None)
 
-    def control(
-        self,
-        host_s: float,
-        arduino_ms: int,
-        steering_us: int | None,
-        throttle_us: int | None,
-        steering_period_us: int | None,
-        throttle_period_us: int | None,
-        **extra: Any,
-    ) -> None:
-        """Hand over one control, at time `host_s` of the clock. None means "no pulse". Never blocks, never raises.
+    def control(self, host_s: float, *reading: int | None, **extra: Any) -> None:
+        """Hand over one control, at time `host_s` of the clock. Never blocks, never raises.
 
-        extra: further columns of the episode, numbers or text.
+        reading, extra: as EpisodeWriter.control() takes them.
         """
         if self.failure is not None or self._closing.is_set():
             return
-        if len(self._queue) >= QUEUE_MOST:
+        if len(self._queue) < QUEUE_MOST:
+            self._queue.append((host_s, reading, extra))
+        else:
             self._lost += 1
-            return
-        self._queue.append(
-            (host_s, arduino_ms, steering_us, throttle_us, steering_period_us, throttle_period_us, extra)
-        )
 
     def note(self, **metadata: Any) -> None:
         """Add entries to the episode's metadata, of JSON's types. Does nothing if the episode has ended."""
@@ -149,20 +138,14 @@ class Recorder:
             _log.error("recording ended: %s", sentence)
 
     def _check_room(self) -> None:
-        rows = ROW_BYTES * (self._writer.controls + self._writer.frames)
-        needed = SPARE_BYTES + rows
+        folder, rows = self.folder.parent, ROW_BYTES * (self._writer.controls + self._writer.frames)
         if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
-            raise EpisodeError(
-                f"{self.folder.parent}: no room is left of what episodes may take here",
-                remedy="fetch them with ansible/drive.yml, or delete some",
-            )
-        disk = os.statvfs(self.folder.parent)
-        if (free := disk.f_bavail * disk.f_frsize) < needed:
-            raise EpisodeError(
-                f"{self.folder.parent}: the disk is as good as full ({free / 1e6:.1f} MB free, {needed / 1e6:.1f} are "
-                "kept in reserve)",
-                remedy="make room, or name a folder on another one",
-            )
+            what = f"{folder}: no room is left of what episodes may take here"
+            raise EpisodeError(what, remedy="fetch them with ansible/drive.yml, or delete some")
+        disk = os.statvfs(folder)
+        if (free := disk.f_bavail * disk.f_frsize) < (needed := SPARE_BYTES + rows):
+            found = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} are kept in reserve"
+            raise EpisodeError(f"{folder}: the disk is almost full", found=found, remedy="make room, or use another")
 
     def _run(self) -> None:
         try:
@@ -170,15 +153,13 @@ class Recorder:
         except Exception as error:  # whatever it is, the car drives on, and what was recorded is kept
             self._fail(sentence_of(error))
         if self._unwanted:
-            return self._writer.discard()
+            return self._writer.close(unwanted=True)
         if self.failure:
             self._writer.metadata["fault"] = self.failure
         if self._lost:
             self._writer.metadata["controls_lost"] = self._lost
         try:
-            path = self._writer.finish()
-            os.sync()  # a reported episode must survive if the car is switched off right after
-            self.path = path
+            self.path = self._writer.finish()
         except Exception as error:
             self._fail(sentence_of(error))
 
@@ -190,16 +171,15 @@ class Recorder:
             frame = self._camera.wait(seen, 0.1)
             closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost
             for _ in range(len(self._queue)):
-                host_s, *control, extra = self._queue.popleft()
-                self._writer.control(host_s + self._to_system_s, *control, **extra)
+                host_s, reading, extra = self._queue.popleft()
+                self._writer.control(host_s + self._to_system_s, *reading, **extra)
             if closing:
                 return
             now = self._clock()
             if frame is None:
                 if now - last_s > SILENT_S:
-                    raise EpisodeError(
-                        f"{self._camera.source}: no frame for {SILENT_S:g} s", remedy="is the camera plugged in?"
-                    )
+                    what = f"{self._camera.source}: no frame for {SILENT_S:g} s"
+                    raise EpisodeError(what, remedy="is the camera plugged in?")
                 continue
             seen, last_s = frame.number, now
             if frame.captured_s - captured_s < self._frame_s:
@@ -224,9 +204,9 @@ def room_for(folder: Path | str, most_mb: float) -> int:
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
     """Open an episode in `folder`, named by its start; if that name is taken, by the next free second."""
-    if killed := find_killed(folder):
-        text = f"{len(killed)} recordings here were killed; `rover record {folder} --finish` keeps what they have"
-        _log.warning(text)
+    if killed := [part for part in find_killed(folder) if not remove_if_empty(part)]:
+        text = "%d recordings here were killed; `rover record %s --finish` keeps what they have"
+        _log.warning(text, len(killed), folder)
     while True:
         name = time.strftime("episode_%Y%m%d_%H%M%S", time.localtime(start_s))
         writer = EpisodeWriter(folder / name, about, resolution=None, flags=True)
@@ -282,17 +262,17 @@ def record(
     until then is kept. status: a stream for a status line for people. Raises EpisodeError if recording cannot begin.
     """
     stop = stop or threading.Event()
-    lost = [0, 0]
+    lost = 0, 0
     with contextlib.ExitStack() as stack:
         about = About(label, arduino_port=link.port, source="human", car=link.car)
         recorder = stack.enter_context(Recorder(folder, camera, about, rate_hz=rate_hz, clock=clock))
         start = heard_s = recorder.start_s  # earlier statuses do not belong to this episode
         if status:
-            line = stack.enter_context(
-                StatusLine(
-                    lambda: f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames", status
-                )
-            )
+
+            def words() -> str:
+                return f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames"
+
+            line = stack.enter_context(StatusLine(words, status))
             _log.addHandler(line)
             stack.callback(_log.removeHandler, line)
         tick = 0
@@ -303,9 +283,8 @@ def record(
             try:
                 telemetry = link.latest()
                 if now - heard_s > SILENT_S:
-                    raise EpisodeError(
-                        f"{link.port}: no status for {SILENT_S:g} s", remedy="is the Arduino plugged in?"
-                    )
+                    what = f"{link.port}: no status for {SILENT_S:g} s"
+                    raise EpisodeError(what, remedy="is the Arduino plugged in?")
             except RoverError as error:
                 recorder.close(str(error))
                 break
@@ -314,14 +293,11 @@ def record(
                 steering, throttle = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
                 periods = telemetry.receiver_steering_period_us, telemetry.receiver_throttle_period_us
                 recorder.control(heard_s, telemetry.uptime_ms, steering, throttle, *periods)
-                lost[0] += steering is None
-                lost[1] += throttle is None
+                lost = lost[0] + (steering is None), lost[1] + (throttle is None)
             tick = max(tick + 1, int((now - start) * rate_hz))
             stop.wait(max(0.0, start + tick / rate_hz - clock()))
         seconds = clock() - start
-    return RecordReport(
-        recorder.path, recorder.controls, recorder.frames, seconds, (lost[0], lost[1]), recorder.failure
-    )
+    return RecordReport(recorder.path, recorder.controls, recorder.frames, seconds, lost, recorder.failure)
 
 
 def record_episodes(

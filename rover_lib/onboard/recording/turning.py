@@ -20,7 +20,7 @@ import numpy as np
 
 from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.errors import CameraError, EpisodeError
-from rover_lib.onboard.recording.episode import json_controls, no_pulse, number_of
+from rover_lib.onboard.recording.episode import DATA, json_controls, no_pulse, number_of
 
 WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
 STEP = 2  # frames from one examined picture to the next
@@ -90,7 +90,7 @@ def measure_recorded(folder: Path | str) -> Turning:
     Raises EpisodeError if there are no two controls and pictures.
     """
     folder = max((p for p in Path(folder).glob("episode_*") if p.is_dir()), default=Path(folder))
-    data, controls, shots = folder / "episode_data.json", [], []
+    data, controls, shots = folder / DATA, [], []
     for row in json_controls(data):
         found = [number_of(row.get(name)) for name in ("system_timestamp", "steering_normalized")]
         if not no_pulse(row, "steering") and all(v is not None and math.isfinite(v) for v in found):

@@ -11,10 +11,10 @@ import shutil
 import sys
 from pathlib import Path
 
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.swap_folder import build_beside
 
 
 def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
@@ -32,7 +32,7 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
         return folder
     if folder.exists():
         raise RoverError(f"{folder}: is there, and no copy of a run", remedy="give the copy another name: AS=try1")
-    with build_beside(folder) as new:
+    with build_folder(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
         for path in new.glob("*.ipynb"):  # earlier versions wrote the run's own folder into them

@@ -23,6 +23,7 @@ from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
+from rover_lib.onboard.durable import ASKED, build_folder, sync_disk
 from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
@@ -30,7 +31,6 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import LOG_VARIABLE, TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder
-from rover_lib.workshop.swap_folder import ASKED, build_beside
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -122,7 +122,7 @@ def run(
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
-    with build_beside(folder, files_of_a_run, asked) as new:
+    with build_folder(folder, files_of_a_run, asked) as new:
         finished = {path.name for path in new.glob("*.ipynb")}
         for path in folder.glob("benchmark-*.json"):  # notebook 05 shows those of other hosts
             shutil.copy2(path, new)
@@ -185,6 +185,7 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
     with set_environment({**places, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
+            sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
         except papermill.PapermillExecutionError as e:
             raise RoverError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
