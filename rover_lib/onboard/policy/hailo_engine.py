@@ -52,7 +52,6 @@ class HailoEngine(SessionEngine):
         self.set_threads(threads or usable_cores())
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As Engine.run()."""
         given = dict(zip(self._frames, frames_rgb, strict=True))
         if "state" in self._inputs:
             given["state"] = _affine(state, self._how["state"]).reshape(1, 1, -1)
