@@ -18,9 +18,12 @@ from rover_lib.onboard.errors import RoverError
 def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
     """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
 
-    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, FileExistsError for a
+    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, RoverError for a
     folder that exists.
     """
+    folder = Path(folder)
+    if folder.exists():
+        raise RoverError(f"{folder}: is there already", remedy="name a new folder")
     config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
     policy = RoverArtifactPolicy(config)
     with build_folder(folder) as new:
