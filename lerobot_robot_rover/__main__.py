@@ -12,18 +12,18 @@ from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, Rov
 from lerobot_robot_rover.modeling_rover_artifact import RoverArtifactPolicy
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
 from rover_lib.onboard.durable import build_folder
-from rover_lib.onboard.errors import ParamsError, RoverError
+from rover_lib.onboard.errors import RoverError
 
 
 def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
     """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
 
-    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, ParamsError for a folder
-    that exists. The folder appears complete, or not at all.
+    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, RoverError for a
+    folder that exists.
     """
     folder = Path(folder)
     if folder.exists():
-        raise ParamsError(f"{folder}: is there already", remedy="name a new folder")
+        raise RoverError(f"{folder}: is there already", remedy="name a new folder")
     config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
     policy = RoverArtifactPolicy(config)
     with build_folder(folder) as new:

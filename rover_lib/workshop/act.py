@@ -9,6 +9,7 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from typing import Any, TypeVar
@@ -78,14 +79,10 @@ def layer_norm(w: Weights) -> nn.LayerNorm:
     return _load(nn.LayerNorm(w["weight"].shape[0], device="meta"), w["weight"], w["bias"])
 
 
-def conv(weight: Tensor, bias: Tensor, stride: int, padding: int, dilation: int = 1) -> nn.Conv2d:
-    out_channels, in_channels, size, _ = weight.shape
+def conv(weight: Tensor, bias: Tensor, stride: Any, padding: int, dilation: int = 1) -> nn.Conv2d:
+    out_channels, in_channels, height, width = weight.shape
+    size = height, width
     return _load(nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta"), weight, bias)
-
-
-def fold_conv(w: Weights, bn: Weights, stride: int, padding: int) -> nn.Conv2d:
-    """Merge a convolution without bias and the frozen batch norm behind it into one convolution."""
-    return conv(*fold(w, bn), stride, padding)
 
 
 def norm_gain(bn: Weights) -> Tensor:
@@ -94,7 +91,7 @@ def norm_gain(bn: Weights) -> Tensor:
 
 
 def fold(w: Weights, bn: Weights) -> Pair:
-    """Return the weight and bias of `fold_conv`."""
+    """Return the weight and bias of a convolution and the frozen batch norm behind it, merged."""
     gain = norm_gain(bn)
     return w["weight"] * gain[:, None, None, None], bn["bias"] - bn["running_mean"] * gain
 
@@ -102,8 +99,7 @@ def fold(w: Weights, bn: Weights) -> Pair:
 def fold_block(w: Weights, kind: str) -> list[Pair]:
     """Return the weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
 
-    All weights of such a channel are zero and its bias is not positive, so after ReLU it is zero whatever the block
-    sees, and the block without it computes the same function. The module `channels` makes such channels.
+    All weights of such a channel are zero and its bias is not positive. The module `channels` makes such channels.
     """
     pairs = [fold(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
     for i, (weight, bias) in enumerate(pairs[:-1]):
@@ -131,10 +127,9 @@ class Columns(nn.Module):
     """Turns a frame, (height, width, 3) uint8 RGB, into the INT8 input of a stem over columns: the pixels themselves.
 
     The result has, for each second pixel, the 8 pixels around it in its row: (1, 24, rows, width / 2), padded with the
-    colour that normalises to zero. The stem's 7x7 convolution with stride 2 over 3 channels becomes a 7x1 convolution
-    over these 24 (`column_conv`), which needs half the instructions, because XNNPACK's kernels are made for at least 8
-    channels. Normalisation is in that convolution's weights, so a pixel is its own quantized value, and nothing is
-    computed in float or rounded.
+    colour that normalises to zero. The stem's 7x7 convolution over 3 channels becomes a 7x1 convolution over these 24
+    (`of_columns`), with half the instructions, because XNNPACK's kernels are made for at least 8 channels.
+    Normalisation is in that convolution's weights, so a pixel is its own quantized value.
     """
 
     WINDOW = 8  # pixels: the kernel's 7, and one with weight 0 that fills the kernel's lanes
@@ -146,18 +141,11 @@ class Columns(nn.Module):
         self.out_width = (width - 1) // 2 + 1
         self.rows = 2 * ((height - 1) // 2) + 7
         self.pitch = 2 * (self.out_width - 1) + self.WINDOW  # padded pixels in a row
-        self.left: Tensor
-        self.right: Tensor
-        self.top: Tensor
-        self.bottom: Tensor
         colour = torch.tensor(zero_colour(norm)).round().to(torch.uint8)
-        for name, rows, pixels in (
-            ("left", height, 3),
-            ("right", height, self.pitch - width - 3),
-            ("top", 3, self.pitch),
-            ("bottom", self.rows - height - 3, self.pitch),
-        ):
-            self.register_buffer(name, colour.repeat(rows, pixels))
+        self.left = nn.Buffer(colour.repeat(height, 3))
+        self.right = nn.Buffer(colour.repeat(height, self.pitch - width - 3))
+        self.top = nn.Buffer(colour.repeat(3, self.pitch))
+        self.bottom = nn.Buffer(colour.repeat(self.rows - height - 3, self.pitch))
 
     def forward(self, frame: Tensor) -> Tensor:
         x = torch.cat([self.left, frame.flatten(1), self.right], 1)
@@ -187,16 +175,8 @@ def column_scale(norm: Affine) -> tuple[float, int]:
     return sum(norm.scale) / len(norm.scale) / 255, round(sum(zero_colour(norm)) / len(norm.scale))
 
 
-def column_conv(conv: nn.Conv2d, norm: Affine) -> nn.Conv2d:
-    """Turn the stem's convolution over normalised pixels into one over `Columns`."""
-    assert conv.bias is not None
-    weight, bias = of_columns(conv.weight, conv.bias, norm)
-    out_channels, in_channels, _, _ = weight.shape
-    return _load(nn.Conv2d(in_channels, out_channels, (7, 1), (2, 1), device="meta"), weight, bias)
-
-
-def of_columns(weight: Tensor, bias: Tensor, norm: Affine) -> tuple[Tensor, Tensor]:
-    """Return the weight and bias of `column_conv`."""
+def of_columns(weight: Tensor, bias: Tensor, norm: Affine) -> Pair:
+    """Return the weight and bias of the stem's convolution over `Columns`, from those over normalised pixels."""
     scale, zero_pixel = column_scale(norm)
     pixel_scale = torch.tensor(norm.scale) / 255
     offset = pixel_scale * zero_pixel + torch.tensor(norm.shift)
@@ -225,7 +205,7 @@ class Residual(nn.Module):
             layers += [conv(weight, bias, *geometry), nn.ReLU()]
         self.body = nn.Sequential(*layers[:-1])
         down = w.at("downsample")
-        self.shortcut = fold_conv(down.at("0"), down.at("1"), stride, 0) if "downsample" in w else nn.Identity()
+        self.shortcut = conv(*fold(down.at("0"), down.at("1")), stride, 0) if "downsample" in w else nn.Identity()
         self.relu = nn.ReLU()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -238,31 +218,23 @@ class Backbone(nn.Module):
     def __init__(self, w: Weights, config: ActConfig, columns: bool):
         super().__init__()
         kind, depths, _ = BACKBONES[config.backbone]
-        stem = fold_conv(w.at("conv1"), w.at("bn1"), 2, 3)
-        if columns:
-            stem = column_conv(stem, config.image_norm[0])
+        folded = fold(w.at("conv1"), w.at("bn1"))
+        stem = conv(*of_columns(*folded, config.image_norm[0]), (2, 1), 0) if columns else conv(*folded, 2, 3)
         self.stem = nn.Sequential(stem, nn.ReLU(), nn.MaxPool2d(3, 2, 1))
-        self.layer1: nn.Sequential
-        self.layer2: nn.Sequential
-        self.layer3: nn.Sequential
-        self.layer4: nn.Sequential
-        dilation = 1
-        for i, depth in enumerate(depths):
-            stride = 1 if i == 0 else 2
-            first = dilation
-            if i == 3 and config.dilation:  # torchvision's replace_stride_with_dilation: only later blocks dilate
-                stride, dilation = 1, dilation * 2
-            blocks = [
-                Residual(w.at(f"layer{i + 1}.{j}"), kind, stride if j == 0 else 1, first if j == 0 else dilation)
-                for j in range(depth)
-            ]
-            setattr(self, f"layer{i + 1}", nn.Sequential(*blocks))
+
+        def stage(i: int) -> nn.Sequential:
+            # torchvision's replace_stride_with_dilation: in the last stage all blocks but the first dilate
+            dilated = config.dilation and i == 4
+            stride, dilation = 1 if i == 1 or dilated else 2, 2 if dilated else 1
+            geometry = [(stride, 1), *[(1, dilation)] * (depths[i - 1] - 1)]
+            return nn.Sequential(*(Residual(w.at(f"layer{i}.{j}"), kind, *g) for j, g in enumerate(geometry)))
+
+        self.layer1, self.layer2, self.layer3, self.layer4 = map(stage, (1, 2, 3, 4))
 
     def forward(self, x: Tensor) -> Tensor:
         return self.layer4(self.layer3(self.layer2(self.layer1(self.stem(x)))))
 
 
-# Buffers are annotated in __init__, because torch.jit reads annotations in a class body and tries to compile them.
 class Pointwise(nn.Module):
     """A module with token projections, which are linears over (1, T, D) or 1x1 convolutions over (1, D, 1, T).
 
@@ -289,10 +261,10 @@ class Pointwise(nn.Module):
 class Attention(Pointwise):
     """Multi-head attention added to the residual stream.
 
-    Channel scales (buffers, all None until `quantize` sets them) give the channels of the INT8 tensors inside similar
-    ranges, and cancel exactly: q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs. The scale
-    of the keys' output is merged into q_out (the scores contain only products of the two), and the scale of the output
-    projection's input into v_out. In cross-attention `Memory` has applied k_in and v_in already, once for all layers.
+    Channel scales (buffers, None until they are set) give the channels of the INT8 tensors inside similar ranges, and
+    cancel exactly: q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs. The scale of the keys'
+    output is merged into q_out, and that of the output projection's input into v_out. In cross-attention `Memory` has
+    applied k_in and v_in already, once for all layers.
     """
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, *, cross: bool = False):
@@ -304,13 +276,6 @@ class Attention(Pointwise):
         self.k = self.project(wk, bk)
         self.v = self.project(wv, bv)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
-        self.constant_q: Tensor | None
-        self.q_in: Tensor | None
-        self.k_in: Tensor | None
-        self.v_in: Tensor | None
-        self.q_out: Tensor | None
-        self.v_out: Tensor | None
-        self.o_out: Tensor | None
         for name in ("constant_q", "q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
             self.register_buffer(name, None)
 
@@ -342,8 +307,6 @@ class Memory(Pointwise):
 
     def __init__(self, as_conv: bool):
         super().__init__(as_conv)
-        self.k_in: Tensor | None
-        self.v_in: Tensor | None
         for name in ("k_in", "v_in"):  # channel scales, as in Attention
             self.register_buffer(name, None)
 
@@ -359,9 +322,6 @@ class FeedForward(Pointwise):
         self.up = self.project(w["linear1.weight"], w["linear1.bias"])
         self.act = ACTIVATIONS[config.activation]()
         self.down = self.project(w["linear2.weight"], w["linear2.bias"])
-        self.up_in: Tensor | None
-        self.down_in: Tensor | None
-        self.down_out: Tensor | None
         for name in ("up_in", "down_in", "down_out"):
             self.register_buffer(name, None)
 
@@ -372,11 +332,11 @@ class FeedForward(Pointwise):
         return _plus_scaled(residual, self.leave(self.down(h)), self.down_out)
 
 
-def _times(x: Tensor, scale: Tensor | None) -> Tensor:
+def _times(x: Tensor, scale: Any) -> Tensor:  # an optional buffer, as below: mypy takes it for a Module
     return x if scale is None else x * scale
 
 
-def _plus_scaled(x: Tensor, y: Tensor, scale: Tensor | None) -> Tensor:
+def _plus_scaled(x: Tensor, y: Tensor, scale: Any) -> Tensor:
     return x + y if scale is None else torch.addcmul(x, y, scale)
 
 
@@ -412,11 +372,9 @@ class DecoderLayer(nn.Module):
         self.attention = Attention(w.at("self_attn"), config, as_conv)
         self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, cross=True)
         self.feed_forward = FeedForward(w, config, as_conv)
-        self.start: Tensor
-        self.register_buffer("start", None)
         if first:
             with torch.no_grad():
-                self.start = self._self_attend(torch.zeros_like(q_pos), q_pos)
+                self.start = nn.Buffer(self._self_attend(torch.zeros_like(q_pos), q_pos))
                 self.cross_attention.fix_query((self.norm2(self.start) if self.pre_norm else self.start) + q_pos)
             del self.attention, self.norm1
 
@@ -444,10 +402,8 @@ class Normalise(nn.Module):
         super().__init__()
         self.acts = affine is not None
         if affine is not None:
-            self.scale: Tensor
-            self.shift: Tensor
-            self.register_buffer("scale", torch.tensor(affine.scale, dtype=torch.float32).reshape(shape))
-            self.register_buffer("shift", torch.tensor(affine.shift, dtype=torch.float32).reshape(shape))
+            self.scale = nn.Buffer(torch.tensor(affine.scale, dtype=torch.float32).reshape(shape))
+            self.shift = nn.Buffer(torch.tensor(affine.shift, dtype=torch.float32).reshape(shape))
 
     def forward(self, x: Tensor) -> Tensor:
         return x * self.scale + self.shift if self.acts else x
@@ -457,9 +413,8 @@ class ACT(nn.Module):
     """The policy, for one observation at a time.
 
     weights: by LeRobot's names without the leading `model.`. config: checked against them (see `checkpoint`).
-    for_int8: arrange the policy as static INT8 needs it, with token projections as 1x1 convolutions instead of linears,
-    and frames as columns of pixels (see Columns) if their normalisation allows it, padded with a colour of whole
-    numbers.
+    for_int8: as static INT8 needs it, with token projections as 1x1 convolutions instead of linears, and frames as
+    columns of pixels (see Columns) if their normalisation allows it, padded with a colour of whole numbers.
     forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32: it takes a
     raw state and returns raw actions, with all normalisation inside.
     """
@@ -483,14 +438,11 @@ class ACT(nn.Module):
             state = w.at("encoder_robot_state_input_proj")
             self.state_project = linear(state["weight"], state["bias"])
         # The latent is zero when driving, so its projection gives the bias alone.
-        self.latent: Tensor
-        self.pos: Tensor
-        self.q_pos: Tensor
-        self.register_buffer("latent", w["encoder_latent_input_proj.bias"][None, None])
+        self.latent = nn.Buffer(w["encoder_latent_input_proj.bias"][None, None])
         pos = [w["encoder_1d_feature_pos_embed.weight"]]
         pos += [positions_2d(config.dim, *config.grid(*size)) for size in config.image_sizes]
-        self.register_buffer("pos", torch.cat(pos)[None])  # (1, T, D)
-        self.register_buffer("q_pos", w["decoder_pos_embed.weight"][None])  # (1, C, D)
+        self.pos = nn.Buffer(torch.cat(pos)[None])  # (1, T, D)
+        self.q_pos = nn.Buffer(w["decoder_pos_embed.weight"][None])  # (1, C, D)
         self.encoder = nn.ModuleList(
             EncoderLayer(w.at(f"encoder.layers.{i}"), config, for_int8) for i in range(config.encoder_layers)
         )
@@ -505,7 +457,7 @@ class ACT(nn.Module):
         self.eval().requires_grad_(False)
 
     def forward(self, state: Tensor, *frames: Tensor) -> Tensor:
-        tokens = [self.latent]
+        tokens: list[Tensor] = [self.latent]
         if self.sees_state:
             tokens.append(self.state_project(self.state_norm(state))[:, None])
         for i, image_input in enumerate(self.image_input):  # frames by index, because FX cannot trace an iteration
@@ -546,37 +498,28 @@ def block_of(module_name: str) -> str:
 
 def multiply_accumulates(model: ACT) -> dict[str, int]:
     """Count the multiply-accumulates of one inference by block. Attention's two products count for its block."""
-    counts: dict[str, int] = {}
-
-    def add(name: str, n: int) -> None:
-        counts[block_of(name)] = counts.get(block_of(name), 0) + n
-
-    def watch(name: str):
-        def hook(module: nn.Module, args: tuple, out: Tensor) -> None:
-            if isinstance(module, Attention):
-                residual, _, key, _ = args
-                add(name, 2 * residual.shape[1] * key.numel())  # queries x tokens x width
-            elif isinstance(module, nn.Conv2d):
-                add(name, out.numel() * module.weight[0].numel())
-            elif isinstance(module, nn.Linear):
-                add(name, out.numel() * module.in_features)
-
-        return hook
-
+    counts: Counter[str] = Counter()
     with ExitStack() as hooks, torch.inference_mode():
         for name, module in model.named_modules():
-            if isinstance(module, (nn.Conv2d, nn.Linear, Attention)):
-                hooks.enter_context(module.register_forward_hook(watch(name)))
+
+            def watch(m: nn.Module, args: tuple, out: Tensor, block: str = block_of(name)) -> None:
+                if isinstance(m, Attention):
+                    residual, _, key, _ = args
+                    counts[block] += 2 * residual.shape[1] * key.numel()  # queries x tokens x width
+                elif isinstance(m, Projection):
+                    counts[block] += out.numel() * m.weight[0].numel()
+
+            hooks.enter_context(module.register_forward_hook(watch))
         model(*example_inputs(model.config))
-    return counts
+    return dict(counts)
 
 
 def parameters_by_block(model: ACT) -> dict[str, int]:
     """Count weights and biases by block, with the names of `multiply_accumulates`."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for name, tensor in model.named_parameters():
-        counts[block_of(name)] = counts.get(block_of(name), 0) + tensor.numel()
-    return counts
+        counts[block_of(name)] += tensor.numel()
+    return dict(counts)
 
 
 def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:

@@ -17,12 +17,13 @@ from rover_lib.workshop.act import (
     Pixels,
     block_of,
     blocks,
-    column_conv,
+    conv,
     example_inputs,
     fits_columns,
     imagenet,
     lerobot_act,
     multiply_accumulates,
+    of_columns,
 )
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
@@ -135,15 +136,16 @@ def test_columns_are_the_pixels_where_the_border_can_be_a_colour(mean, std, colu
     if not columns:
         return
     torch.manual_seed(0)
-    conv = torch.nn.Conv2d(3, 8, 7, 2, 3).requires_grad_(False)
+    plain = torch.nn.Conv2d(3, 8, 7, 2, 3).requires_grad_(False)
+    over_columns = conv(*of_columns(plain.weight, plain.bias, norm), (2, 1), 0)
     for size in ((36, 64), (35, 61), (7, 8)):
         frame = torch.randint(0, 256, (*size, 3), dtype=torch.uint8)
-        expected = conv(Pixels(norm)(frame))
-        ours = column_conv(conv, norm)(Columns(norm, *size)(frame))
+        expected = plain(Pixels(norm)(frame))
+        ours = over_columns(Columns(norm, *size)(frame))
         assert ours.shape == expected.shape
         gap = (ours - expected).abs()
         assert gap[..., 2:-2, 2:-2].numel() == 0 or gap[..., 2:-2, 2:-2].max() < 1e-5
-        assert gap.max() < 0.5 / 255 / min(std) * conv.weight.abs().sum((1, 2, 3)).max() + 1e-5
+        assert gap.max() < 0.5 / 255 / min(std) * plain.weight.abs().sum((1, 2, 3)).max() + 1e-5
 
 
 @pytest.mark.parametrize("dtype", [torch.qint8, torch.quint8])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact.archive import ONNX
+from rover_lib.onboard.artifact.archive import ONNX, refused
 from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ArtifactError
@@ -28,10 +28,7 @@ class Expected:
     modes: tuple[str, ...] = ("static", "mixed")
 
     def refusals(self, manifest: dict[str, Any]) -> dict[str, str]:
-        """Return reasons to refuse an artifact, by kind.
-
-        The kinds are those of MAY_DIFFER, and "torch", "engine", "actions" and "state".
-        """
+        """Return reasons to refuse an artifact, by kind: MAY_DIFFER, and "torch", "engine", "actions" and "state"."""
         refusals = {}
         if manifest["mode"] not in self.modes:
             refusals["mode"] = f"its mode is {manifest['mode']}, which is several times slower than {self.modes[0]}"
@@ -77,8 +74,7 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         manifest = artifact.manifest
         code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
         if (wanted := OF_MODE[artifact.kind].get(manifest["mode"])) and wanted not in code:
-            what = f"{path}: its manifest says {manifest['mode']}, its code is not"
-            raise ArtifactError(what, remedy="quantize again")
+            raise refused(path, f"its manifest says {manifest['mode']}, its code is not")
         for kind, why in expected.refusals(manifest).items():
             if kind not in allow:
                 remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"

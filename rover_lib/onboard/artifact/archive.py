@@ -5,9 +5,7 @@
 
 It holds a program for torch (TorchScript's own records), for ONNX Runtime (one record, an ordinary .onnx with its
 weights inside), or for a Hailo chip (a compiled network, and an .onnx for the part that runs on the processor after
-it). The manifest and the parity vectors lie beside the program. ONNX could store these two in its own file, as
-properties and tensors. A zip is better for two reasons: it has checksums of every byte, and all engines can share one
-reader that needs neither onnx nor protobuf.
+it). The manifest and the parity vectors lie beside the program.
 """
 
 import os
@@ -32,19 +30,15 @@ REQUIRED = {
 }
 MANIFEST, PARITY, ONNX = "archive/extra/manifest.json", "archive/extra/parity.npz", "archive/model.onnx"
 HEF = "archive/network.hef"
-RECORD_BYTES = {  # largest size by name after "archive/"; None: limited only by ARCHIVE_BYTES for all
+RECORD_BYTES = {  # largest size by name after "archive/"
     r"version|byteorder|\.data/serialization_id": 100,
     r"(data|constants)\.pkl": PICKLE_BYTES,
     r"extra/manifest\.json": MANIFEST_BYTES,
     r"extra/parity\.npz": PARITY_BYTES,
     r"code/__torch__/[\w/]+\.py": CODE_BYTES,
     r"code/__torch__/[\w/]+\.py\.debug_pkl": DEBUG_BYTES,
-    r"constants/\d{1,6}": None,
-    r"model\.onnx": None,
-    r"network\.hef": None,
+    r"constants/\d{1,6}|model\.onnx|network\.hef": ARCHIVE_BYTES,
 }
-# Compiled once, because an artifact has hundreds of records and is opened several times before it drives.
-KNOWN_RECORDS = tuple((re.compile(pattern, re.ASCII), limit) for pattern, limit in RECORD_BYTES.items())
 
 
 def refused(path: Path | str, what: str, found: object = None) -> ArtifactError:
@@ -87,10 +81,7 @@ def kind_of(records: list[zipfile.ZipInfo]) -> str:
 
 
 def _check_directory(file: BinaryIO, path: Path | str) -> None:
-    """Raise an error unless the file is one zip archive from first byte to last, with a directory that fits in memory.
-
-    Otherwise two readers that look for the directory in different places could see two different archives.
-    """
+    """Raise an error unless the file is one zip archive from first byte to last, so that all readers see the same."""
     if file.read(4) != b"PK\3\4":
         raise zipfile.BadZipFile("it does not begin as an archive")
     size = file.seek(0, os.SEEK_END)
@@ -119,12 +110,12 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
         name = record.filename.removeprefix("archive/")
         if name == ".data/version":  # torch moves it there if the program has an operator that changed, as gelu did
             name = "version"
-        known = [limit for pattern, limit in KNOWN_RECORDS if pattern.fullmatch(name)]
+        known = [limit for pattern, limit in RECORD_BYTES.items() if re.fullmatch(pattern, name, re.ASCII)]
         if not known or not record.filename.startswith("archive/"):
             raise refused(path, "unknown record", repr(record.filename)[:80])
         if name.lower() in names:  # torch ignores case in names
             raise refused(path, f"'{name}' is in it twice")
-        if known[0] is not None and record.file_size > known[0]:
+        if record.file_size > known[0]:
             raise refused(path, f"'{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken")
         packed = record.compress_type == zipfile.ZIP_DEFLATED and name.startswith("code/")
         if not packed and (record.compress_type != zipfile.ZIP_STORED or record.compress_size != record.file_size):
@@ -134,12 +125,8 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
     if total > ARCHIVE_BYTES:
         raise refused(path, f"{total} bytes are more than an artifact has")
     kind = kind_of(records)
-    required = REQUIRED[kind]
     optional = {"model.onnx"} if kind == "hailo" else set()
-    if kind != "torch" and names - required - optional:
+    if kind != "torch" and names - REQUIRED[kind] - optional:
         raise refused(path, "it is a policy for two engines")
-    for name in sorted(required - names):
-        raise ArtifactError(
-            f"{path}: no {name.removeprefix('extra/')} in it",
-            remedy="is it an artifact of this project? ('rover inspect' says what)",
-        )
+    for name in sorted(REQUIRED[kind] - names):
+        raise ArtifactError(f"{path}: no {name.removeprefix('extra/')} in it", remedy="give a policy_*.pt of a run")

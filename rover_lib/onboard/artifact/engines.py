@@ -42,9 +42,7 @@ class Engine(Protocol):
         """How many threads compute."""
 
     def set_threads(self, threads: int) -> None:
-        """Compute with that many threads from now on. For torch this sets those of the whole process; a pool of
-        XNNPACK's keeps the number of its first plan, so load a policy with the number that it shall have.
-        """
+        """Compute with that many threads from now on. XNNPACK's pool keeps the number of its first plan."""
 
 
 class SessionEngine(ABC):
@@ -57,25 +55,17 @@ class SessionEngine(ABC):
         """Make the session with that many threads. Raises ArtifactError, and then keeps the present session."""
 
     def give_back(self) -> bool:
-        """As Engine.give_back(): there is nothing to free."""
         return False
 
     @property
     def threads(self) -> int:
-        """As Engine.threads: the threads of the part that runs on the processor."""
         return self._threads
 
     def set_threads(self, threads: int) -> None:
-        """As Engine.set_threads(). A session cannot change its threads, so a new one is made. Raises ArtifactError."""
         self._make_session(threads)
         self._threads = threads
 
 
 def module_of(name: str) -> Any:
-    """Import an engine's module now, which takes seconds, and return it.
-
-    For a process that will later limit what it may open or allocate.
-
-    Raises KeyError for an engine that is not known, ImportError for one that is not installed.
-    """
+    """Import an engine's module, which takes seconds. Raises KeyError or ImportError."""
     return importlib.import_module(MODULES[name])

@@ -12,10 +12,12 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record, refused
 from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
@@ -24,10 +26,10 @@ from rover_lib.onboard.checked import Rule, broken_rule, is_number, is_whole, nu
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.stage import atomic_path
 
-if TYPE_CHECKING:  # reading a manifest needs neither
-    import numpy as np
+if TYPE_CHECKING:  # only who writes an artifact needs it
     import torch
 
+Vectors = dict[str, np.ndarray]  # state, chunk, and frame_<camera>: see save_artifact
 SCHEMA = 1
 ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, as .pt is of torch's; readers go by the content instead
 MANGLED = re.compile(rb"___torch_mangle_\d+")
@@ -36,7 +38,7 @@ SCHEMES = ("float", "dynamic", "symmetric", "affine")
 # What the reader accepts, whatever a manifest says; both ends included
 SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
 WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
-MOST_NAMES, NAME_LENGTH, MOST_DEPTH = 64, 64, 8
+MOST_NAMES, NAME_LENGTH = 64, 64
 MOST_VECTORS = 16
 # How far a car's actions may differ from the parity vectors. FP32 policies differ by the order of sums, INT8 ones by
 # flipped roundings: by at most 0.13 with random weights and 0.03 with trained ones, as far as we have seen.
@@ -64,13 +66,13 @@ def _are_cameras(cameras: Any) -> bool:
 
 
 _NAMES = Rule(_are_names, f"1 to {MOST_NAMES} different names")
-_CAMERAS = Rule(_are_cameras, f"a name, height and width ({SIDE_PX[0]} to {SIDE_PX[1]} pixels) of each camera")
 RULES = {
     "schema": Rule(lambda value: value == SCHEMA, f"{SCHEMA} for this rover_lib"),
     "mode": one_of(MODES),
     "scheme": one_of(SCHEMES),
     "engine": of_type(str),  # see engines.py
-    "cameras": _CAMERAS,  # [{name, height, width}], in the graph's order, and recorded, see seen_size
+    # [{name, height, width}], in the graph's order, and recorded, see seen_size
+    "cameras": Rule(_are_cameras, f"a name, and a height and width in {SIDE_PX} pixels, of each camera"),
     "state_names": _NAMES,
     "action_names": _NAMES,
     "chunk": whole(*CHUNK),  # actions per inference
@@ -85,9 +87,7 @@ RULES = {
 }
 
 
-def save_artifact(
-    path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: "dict[str, np.ndarray]"
-) -> str:
+def save_artifact(path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: Vectors) -> str:
     """Write an artifact for torch atomically, and return its content hash.
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
@@ -103,7 +103,7 @@ def save_artifact(
     return content_hash(path)
 
 
-def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> str:
+def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: Vectors) -> str:
     """Write an artifact for ONNX Runtime, as save_artifact() does for torch. model: the bytes of an ONNX model."""
     records = {f"archive/extra/{name}": content for name, content in _extra(path, manifest, parity).items()}
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as z:
@@ -112,9 +112,7 @@ def save_onnx(path: Path | str, model: bytes, manifest: dict[str, Any], parity: 
     return content_hash(path)
 
 
-def _extra(path: Path | str, manifest: dict[str, Any], parity: "dict[str, np.ndarray]") -> dict[str, str | bytes]:
-    import numpy as np
-
+def _extra(path: Path | str, manifest: dict[str, Any], parity: Vectors) -> dict[str, str | bytes]:
     check_manifest(manifest, str(path))
     vectors = io.BytesIO()
     np.savez_compressed(vectors, allow_pickle=False, **parity)
@@ -157,15 +155,24 @@ class Artifact:
     @cached_property
     def manifest(self) -> dict[str, Any]:
         """What the artifact is, checked (see RULES). Nothing is run or even loaded for it."""
-        return _manifest_in(self._z, self.path)
+        try:
+            manifest = json.loads(read_record(self._z, MANIFEST))
+            check_manifest(manifest, str(self.path))
+        except (ValueError, zipfile.BadZipFile, RecursionError) as e:
+            raise refused(self.path, f"its manifest is not readable ({e})") from None
+        kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
+        if kind != self.kind:
+            raise refused(
+                self.path, "its manifest names another engine than its policy is for", manifest["engine"][:60]
+            )
+        return manifest
 
     @cached_property
     def content_hash(self) -> str:
         """The hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
 
-        The bytes of the file may differ, because TorchScript also writes debug tables (source positions), a serial
-        number, and in the class's name a counter of all classes that the process ever made. Reading each record for it
-        also checks the record's checksum.
+        TorchScript also writes debug tables (source positions), a serial number, and in the class's name a counter of
+        all classes that the process ever made. Reading each record also checks its checksum.
         """
         digest = hashlib.sha256()
         code = (r for r in self._z.infolist() if r.filename.startswith("archive/code/") and r.filename.endswith(".py"))
@@ -182,9 +189,28 @@ class Artifact:
         return digest.hexdigest()
 
     @cached_property
-    def parity(self) -> "dict[str, np.ndarray]":
+    def parity(self) -> Vectors:
         """The parity vectors, as save_artifact() takes them, of the shapes that the manifest says."""
-        return _parity_in(self._z, self.path, self.manifest)
+        wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+            "state": ("float32", (len(self.manifest["state_names"]),)),
+            "chunk": ("float32", (self.manifest["chunk"], len(self.manifest["action_names"]))),
+        } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in self.manifest["cameras"]}
+        most = MOST_VECTORS * sum(math.prod(shape) * np.dtype(dtype).itemsize for dtype, shape in wanted.values())
+        try:
+            with np.lib.npyio.NpzFile(io.BytesIO(read_record(self._z, PARITY)), allow_pickle=False) as packed:
+                if sum(record.file_size for record in packed.zip.infolist()) > most + 1000 * len(wanted):
+                    raise refused(self.path, "its parity vectors are too large")
+                vectors = {name: np.asarray(packed[name]) for name in wanted}
+        except (KeyError, ValueError, OSError, MemoryError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
+            raise refused(self.path, f"its parity vectors are not readable ({e})") from None
+        for name, (dtype, shape) in wanted.items():
+            found = vectors[name]
+            if found.dtype != dtype or found.shape != (len(vectors["state"]), *shape) or not len(found):
+                what = "its parity vectors have another shape than its manifest says"
+                raise refused(self.path, what, f"{name} of {found.dtype} {found.shape}")
+            if not np.isfinite(found).all():
+                raise refused(self.path, "its parity vectors are not finite", name)
+        return vectors
 
     @property
     def names(self) -> list[str]:
@@ -229,7 +255,8 @@ def check_manifest(manifest: Any, where: str) -> None:
     """Raise ArtifactError, naming the key, if the manifest has another schema or an impossible value."""
     if not isinstance(manifest, dict):
         raise refused(where, "its manifest is not a JSON object", type(manifest).__name__)
-    _check_texts(manifest, where, MOST_DEPTH)
+    if text := next((text for text in _texts(manifest) if not text.isprintable()), None):  # it might reach a terminal
+        raise refused(where, "its manifest contains unprintable text", ascii(text)[:60])
     if broken := broken_rule(manifest, RULES):
         raise refused(where, f"manifest {broken[0]} must be {broken[1]}", broken[2])
     car_of(manifest)
@@ -243,11 +270,7 @@ def check_manifest(manifest: Any, where: str) -> None:
 
 
 def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
-    """Return (width, height) of the pictures that a policy's first camera gave.
-
-    That is the policy's own size unless its recordings have another shape, which then is the camera's `recorded`:
-    [height, width].
-    """
+    """Return (width, height) of what a policy's first camera gave: the policy's own size, or the one `recorded`."""
     camera = manifest["cameras"][0]
     height, width = camera.get("recorded", (camera["height"], camera["width"]))
     return width, height
@@ -258,78 +281,21 @@ def largest_tolerance(mode: str, action: str) -> float:
     return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"] if action in CAR_ACTIONS else math.inf
 
 
-def _check_texts(value: Any, where: str, depth: int) -> None:
-    """Raise ArtifactError for text with unprintable characters, or values that are nested more than `depth` deep.
-
-    Such characters could control the terminal: a manifest's values appear in sentences, and some stay in a release.
-    """
-    if isinstance(value, str) and not value.isprintable():
-        raise refused(where, "its manifest contains unprintable text", ascii(value)[:60])
-    inner = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
-    if inner and not depth:
-        raise refused(where, f"its manifest is nested more than {MOST_DEPTH} deep")
-    for each in inner:
-        _check_texts(each, where, depth - 1)
+def _texts(value: Any) -> Iterator[str]:
+    """Yield every text in a value of JSON."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for each in [*value, *value.values()] if isinstance(value, dict) else value:
+            yield from _texts(each)
 
 
-def distinct_names(paths: Sequence[Path], drop: str = "") -> dict[str, Path]:
-    """Give each artifact the shortest name that no other has: its stem, with as many of its folders as that needs.
-
-    drop: a prefix of stems that says nothing, such as "policy_". Raises ArtifactError for a file given twice.
-    """
-    longest = max((len(path.absolute().parts) for path in paths), default=0)
+def distinct_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """Name each artifact by its stem, or its path if another has the same stem. Raises ArtifactError for one twice."""
+    stems = [path.stem for path in paths]
     names: dict[str, Path] = {}
     for path in paths:
         if any(path.resolve() == other.resolve() for other in names.values()):
             raise ArtifactError(f"{path}: given twice", remedy="name each file once")
-        name = str(path)  # if two files of one folder differ only in what a name leaves out
-        for folders in range(longest):
-            candidate = _name(path, folders, drop)
-            if [_name(other, folders, drop) for other in paths].count(candidate) == 1:
-                name = candidate
-                break
-        names[name] = path
+        names[path.stem if stems.count(path.stem) == 1 else str(path)] = path
     return names
-
-
-def _name(path: Path, folders: int, drop: str) -> str:
-    """Return the stem of a path, preceded by the last `folders` of its folders."""
-    parents = path.absolute().parts[1:-1]
-    return "/".join([*parents[max(0, len(parents) - folders) :], path.stem.removeprefix(drop)])
-
-
-def _manifest_in(z: zipfile.ZipFile, path: Path | str) -> dict[str, Any]:
-    try:
-        manifest = json.loads(read_record(z, MANIFEST))
-    except (ValueError, zipfile.BadZipFile, RecursionError) as e:
-        raise ArtifactError(f"{path}: its manifest is not readable ({e})", remedy="copy the file again") from None
-    check_manifest(manifest, str(path))
-    kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
-    if kind != kind_of(z.infolist()):
-        raise refused(path, "its manifest names another engine than its policy is for", manifest["engine"][:60])
-    return manifest
-
-
-def _parity_in(z: zipfile.ZipFile, path: Path, manifest: dict[str, Any]) -> "dict[str, np.ndarray]":
-    import numpy as np
-
-    wanted: dict[str, tuple[str, tuple[int, ...]]] = {
-        "state": ("float32", (len(manifest["state_names"]),)),
-        "chunk": ("float32", (manifest["chunk"], len(manifest["action_names"]))),
-    } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in manifest["cameras"]}
-    most = MOST_VECTORS * sum(math.prod(shape) * np.dtype(dtype).itemsize for dtype, shape in wanted.values())
-    try:
-        with np.lib.npyio.NpzFile(io.BytesIO(read_record(z, PARITY)), allow_pickle=False) as packed:
-            if sum(record.file_size for record in packed.zip.infolist()) > most + 1000 * len(wanted):
-                raise refused(path, "its parity vectors are too large")
-            vectors = {name: np.asarray(packed[name]) for name in wanted}
-    except (KeyError, ValueError, OSError, MemoryError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
-        raise refused(path, f"its parity vectors are not readable ({e})") from None
-    for name, (dtype, shape) in wanted.items():
-        found = vectors[name]
-        if found.dtype != dtype or found.shape != (len(vectors["state"]), *shape) or not len(found):
-            what = "its parity vectors have another shape than its manifest says"
-            raise refused(path, what, f"{name} of {found.dtype} {found.shape}")
-        if not np.isfinite(found).all():
-            raise refused(path, "its parity vectors are not finite", name)
-    return vectors

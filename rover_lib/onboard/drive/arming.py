@@ -19,7 +19,7 @@ WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduin
 
 
 def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
-    """Return a check for a car that was asked for at asked_s: it raises RoverError if that is over WAIT_S ago."""
+    """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
     return lambda: check_age(clock() - asked_s, WAIT_S)
 
 
@@ -58,9 +58,8 @@ def arm_when_ready(
 ) -> Telemetry | None:
     """Arm for a human in a terminal: say what is missing, wait for it, and then arm.
 
-    checks: called while waiting; each raises if its device fails. still_wanted: raises RoverError when the human asked
-    too long ago; None: they ask now. Raises RoverError too when told to stop, what a check raises,
-    and what arm() raises.
+    checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked
+    too long ago; None: they ask now. Raises RoverError when told to stop, and what checks and arm() raise.
     """
     still_wanted = still_wanted or wanted_since(boottime())
     link.request()

@@ -158,8 +158,8 @@ class Service:
 
         arm: must call check_request() just before the Arduino is told. checks: called again and again while waiting;
         each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing; requests
-        are refused with this text. said: how the previous drive ended. Raises RoverError when told to stop, and
-        whatever a check raises.
+        are refused with this text. said: how the previous drive ended. Raises RoverError when told to stop, and what
+        a check raises.
         """
         checks = tuple(checks)
         first, self._state, self._text = not self._rounds, DISARMED, ""
@@ -198,7 +198,7 @@ class Service:
         raise RoverError("told to stop before a human armed the car", kind="not armed")
 
     def check_request(self) -> None:
-        """Call just before the Arduino is told. Raises RoverError if the operator asked too long ago or is gone."""
+        """Call this just before the Arduino is told. Raises if the operator asked too long ago or is gone."""
         check_age(self._clock() - self._asked_s)
         if self._hung_up():
             raise RoverError("whoever asked for the car is gone", remedy="ask again", kind="not armed")

@@ -30,9 +30,9 @@ _log = logging.getLogger("rover")
 def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None, **arguments: Any) -> Any:
     """Call a function of a module in a new process, and return what it returned there.
 
-    function: calls load_confined(), and so confines its process. Its arguments and its result are of JSON's types; a
-    pickle as the answer of a process that is not trusted could run anything here. Raises the function's RoverError
-    as a PolicyError, and PolicyError if the process ends otherwise or takes longer than timeout_s.
+    function: calls load_confined(), and so confines its process. Arguments and result are of JSON's types, because a
+    pickle of a process that is not trusted could run anything here. Raises the function's RoverError as a PolicyError,
+    and PolicyError if the process ends otherwise or takes longer than timeout_s.
     """
     command = [sys.executable, "-m", __name__, function.__module__, function.__qualname__, json.dumps(plain(arguments))]
     what = f"the process of {function.__qualname__}"

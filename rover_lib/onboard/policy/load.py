@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rover_lib.onboard.artifact.archive import refused
 from rover_lib.onboard.artifact.engines import PACKAGES, Engine, module_of
 from rover_lib.onboard.artifact.manifest import Artifact, car_of
 from rover_lib.onboard.car.car import Car
@@ -53,27 +54,22 @@ class Policy:
     def predict_unclipped(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """Predict like predict_chunk(), but without clipping, to show how far a prediction was beyond a limit.
 
-        Raises PolicyError for a frame that is no picture, PolicyError for frames of other cameras, for a state that is
-        not finite or has another shape, and for a prediction that is not finite, which must never drive a car.
+        Raises PolicyError for a frame that is not a picture, frames of other cameras, a state that is not finite or has
+        another shape, and a prediction that is not finite.
         """
-        frames = self._frames(frame_bgr)
+        cameras = self.manifest["cameras"]
+        frames = frame_bgr if isinstance(frame_bgr, Mapping) else {self.cameras[0]: frame_bgr}
+        if set(frames) != set(self.cameras):
+            raise PolicyError(f"the policy looks through {list(self.cameras)}", found=f"frames of {sorted(frames)}")
         state = np.asarray(state, np.float32)
         if state.shape != (len(self.state_names),):
             raise PolicyError(f"the state must have shape ({len(self.state_names)},)", found=state.shape)
         if not np.isfinite(state).all():
             raise PolicyError("the state is not finite", found=state.tolist(), remedy="send what was last commanded")
-        chunk = self.run(state, [prepare_frame(f, c["height"], c["width"]) for f, c in frames])
+        chunk = self.run(state, [prepare_frame(frames[c["name"]], c["height"], c["width"]) for c in cameras])
         if not np.isfinite(chunk).all():
             raise PolicyError(f"{self.path}: the policy predicted NaN or Inf", remedy="stop the car and quantize again")
         return chunk
-
-    def _frames(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, dict[str, Any]]]:
-        cameras = self.manifest["cameras"]
-        if not isinstance(frame_bgr, Mapping):
-            frame_bgr = {self.cameras[0]: frame_bgr}
-        if set(frame_bgr) != set(self.cameras):
-            raise PolicyError(f"the policy looks through {list(self.cameras)}", found=f"frames of {sorted(frame_bgr)}")
-        return [(frame_bgr[c["name"]], c) for c in cameras]
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
         """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped.
@@ -82,11 +78,8 @@ class Policy:
         """
         y = self._engine.run(state, frames_rgb)
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
-            raise PolicyError(
-                f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32",
-                found=f"{tuple(y.shape)} {y.dtype}",
-                remedy="do not drive with it",
-            )
+            what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
+            raise PolicyError(what, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
         return y[0].copy()
 
     @property
@@ -108,14 +101,11 @@ def import_engine(artifact: Artifact) -> str:
     try:
         module_of(name)
     except KeyError:
-        raise ArtifactError(
-            f"{path}: needs the engine '{name[:80]}'", remedy=f"this rover_lib knows {', '.join(PACKAGES)}"
-        ) from None
+        known = f"this rover_lib knows {', '.join(PACKAGES)}"
+        raise ArtifactError(f"{path}: needs the engine '{name[:80]}'", remedy=known) from None
     except ImportError as e:
-        raise ArtifactError(
-            f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})",
-            remedy=f"install {PACKAGES[name]}, or use an artifact of another engine",
-        ) from None
+        what = f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})"
+        raise ArtifactError(what, remedy=f"install {PACKAGES[name]}, or use an artifact of another engine") from None
     return name
 
 
@@ -127,11 +117,10 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     parity vectors (which also warm the kernels). Raises ArtifactError with one sentence if any of these fails, and
     if root calls it, who has too much to lose.
     """
+    refuse_root()
     if not isinstance(source, Artifact):
-        refuse_root()
         with Artifact(source) as artifact:
             return load_policy(artifact, threads=threads)
-    refuse_root()
     source.prove()
     engine = module_of(import_engine(source)).load(source, threads)
     path, vectors = source.path, source.parity
@@ -139,10 +128,8 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     chunks = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
     if engine.give_back() and not np.array_equal(_predict(policy, vectors), chunks):
-        raise ArtifactError(
-            f"{path}: predicts something else once the memory of its original weights was given back",
-            remedy="do not drive with it; report this, with the version of torch",
-        )
+        what = f"{path}: predicts something else once the memory of its original weights was given back"
+        raise ArtifactError(what, remedy="do not drive with it; report this, with the version of torch")
     give_back_freed()
     return policy
 
@@ -155,23 +142,15 @@ def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
     except PolicyError as e:
         raise ArtifactError(e.what, found=e.found, remedy=e.remedy) from None
     except (IndexError, RuntimeError) as e:
-        raise ArtifactError(
-            f"{policy.path}: its parity vectors do not run ({' '.join(str(e).split())[-200:]})", remedy="quantize again"
-        ) from None
+        why = " ".join(str(e).split())[-200:]
+        raise refused(policy.path, f"its parity vectors do not run ({why})") from None
 
 
 def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> None:
-    """Raise ArtifactError if the answers, (n, chunk, A), differ more from the vectors' than the manifest tolerates.
-
-    Between processors, FP32 differs only by the order of sums. INT8 differs more, because its float parts (exp,
-    LayerNorm) round differently and each flipped rounding grows over the layers.
-    """
+    """Raise ArtifactError if the answers, (n, chunk, A), differ more from the vectors' than the manifest tolerates."""
     difference = np.abs(chunks - vectors["chunk"]).max((0, 1))
     tolerance = policy.manifest["parity"]["tolerance"]
     for name, d in zip(policy.action_names, difference.tolist(), strict=True):
         if not d <= tolerance[name]:  # so that NaN fails too
-            raise ArtifactError(
-                f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}, "
-                f"at most {tolerance[name]:.3g} is rounding",
-                remedy="do not drive with it",
-            )
+            what = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
+            raise ArtifactError(f"{what}, at most {tolerance[name]:.3g} is rounding", remedy="do not drive with it")

@@ -1,9 +1,8 @@
 """Give memory back to the kernel: weights that torch holds twice, and what malloc keeps after loading.
 
-XNNPACK packs the weights of an INT8 convolution when it runs for the first time, and computes with the packed copy from
-then on. torch keeps the original for as long as the policy exists, so that it can be saved, which nobody does on a
-rover. For the policy of full size this wastes 66 MB. torch has no way to drop the original:
-`setReleaseWeightsWhenPrepacking` has no effect on XNNPACK's path.
+XNNPACK packs the weights of an INT8 convolution when it runs for the first time. torch keeps the original, 66 MB of the
+full-size policy, so that it can be saved, and has no way to drop it: `setReleaseWeightsWhenPrepacking` has no effect on
+XNNPACK's path.
 """
 
 import ctypes

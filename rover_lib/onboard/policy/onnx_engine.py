@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-from rover_lib.onboard.artifact.archive import ONNX
+from rover_lib.onboard.artifact.archive import ONNX, refused
 from rover_lib.onboard.artifact.engines import SessionEngine
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
-from rover_lib.onboard.errors import ArtifactError
 
 onnxruntime.disable_telemetry_events()  # nobody has agreed to it
 ERRORS_ONLY = 3  # log level; ONNX Runtime warns of what a machine without a graphics card lacks
@@ -30,7 +29,7 @@ def session_of(model: bytes, threads: int, path: Path | str = "the model") -> on
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as e:  # ONNX Runtime raises a dozen types
         why = " ".join(str(e).split())[:200]
-        raise ArtifactError(f"{path}: ONNX Runtime cannot load it ({why})", remedy="quantize again") from None
+        raise refused(path, f"ONNX Runtime cannot load it ({why})") from None
     # The session keeps the model's bytes (68 MB) beside its packed weights, only to be made again with other providers.
     session._model_bytes = None
     return session
@@ -45,7 +44,6 @@ class OnnxEngine(SessionEngine):
         self._threads = threads
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As Engine.run()."""
         inputs = dict(zip(self._names, (state[None], *frames_rgb), strict=True))
         try:
             (y,) = self._session.run(None, inputs)
@@ -69,7 +67,5 @@ def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
     engine = OnnxEngine(path, artifact.record(ONNX), threads or usable_cores())
     wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
     if engine._names != wanted:
-        raise ArtifactError(
-            f"{path}: its model takes {engine._names}, its manifest says {wanted}"[:300], remedy="quantize again"
-        )
+        raise refused(path, f"its model takes {engine._names}, its manifest says {wanted}"[:300])
     return engine

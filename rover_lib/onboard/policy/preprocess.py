@@ -14,27 +14,20 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     """Resize and reorder one camera frame.
 
     frame_bgr: (h, w, 3) uint8 of any size, as OpenCV gives it.
-    Returns (height, width, 3) uint8 RGB, contiguous. It is not normalised: the artifact's graph does that (see
-    `normalise`), so that a Pi moves bytes, not floats.
-    A frame of that size is only reordered. One with a larger side is averaged over areas (no aliasing), a smaller one
-    is interpolated. The aspect ratio is not kept, as in the trainer.
-    Raises PolicyError for anything that is not such a picture.
+    Returns (height, width, 3) uint8 RGB, contiguous, not normalised: the artifact's graph does that. One with a larger
+    side is averaged over areas (no aliasing), a smaller one is interpolated. The aspect ratio is not kept, as in the
+    trainer. Raises PolicyError for anything that is not such a picture.
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
         found = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
-        raise PolicyError(
-            "a frame must be (height, width, 3) BGR", found=found, remedy="is the camera delivering colour?"
-        )
-    if frame_bgr.dtype != np.uint8:
-        raise PolicyError("a frame must be uint8", found=frame_bgr.dtype, remedy="pass the picture as OpenCV reads it")
+        raise PolicyError("a frame must be (height, width, 3) BGR", found=found, remedy="does the camera give colour?")
     h, w = frame_bgr.shape[:2]
-    if h == 0 or w == 0:
-        raise PolicyError(f"a frame of {w}x{h} pixels has no picture in it", remedy="check the camera")
+    if frame_bgr.dtype != np.uint8 or h == 0 or w == 0:
+        found = f"{w}x{h} of {frame_bgr.dtype}"
+        raise PolicyError("a frame must be pixels of uint8", found=found, remedy="pass the picture as OpenCV reads it")
     if (h, w) != (height, width):
-        shrinks = height < h or width < w
-        frame_bgr = cv2.resize(
-            frame_bgr, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        )
+        how = cv2.INTER_AREA if height < h or width < w else cv2.INTER_LINEAR
+        frame_bgr = cv2.resize(frame_bgr, (width, height), interpolation=how)
     return cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)
 
 

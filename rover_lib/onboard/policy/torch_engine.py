@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from rover_lib.onboard.artifact.archive import refused
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_packed_weights
@@ -17,23 +18,19 @@ class TorchEngine:
         self._module = module
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """As Engine.run()."""
         # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
         with torch.inference_mode(), torch.jit.optimized_execution(False):
             y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
         return y.numpy()
 
     def give_back(self) -> bool:
-        """As Engine.give_back(). What it frees are the convolutions' original weights."""
         return give_back_packed_weights(self._module) > 0
 
     @property
     def threads(self) -> int:
-        """As Engine.threads."""
         return torch.get_num_threads()
 
     def set_threads(self, threads: int) -> None:
-        """As Engine.set_threads()."""
         torch.set_num_threads(threads)
 
 
@@ -46,28 +43,17 @@ def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     path, manifest = artifact.path, artifact.manifest
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
-        raise ArtifactError(
-            f"{path}: made with torch {made_with}, here is {here}",
-            remedy="make it again where this torch is: rover run CHECKPOINT EPISODES",
-        )
-    engine = manifest["engine"]
-    if engine not in torch.backends.quantized.supported_engines:
-        raise ArtifactError(
-            f"{path}: needs the quantization engine '{engine}', this torch has "
-            f"{list(torch.backends.quantized.supported_engines)}",
-            remedy="install PyPI's build of torch",
-        )
+        remedy = "make it again where this torch is: rover run CHECKPOINT EPISODES"
+        raise ArtifactError(f"{path}: made with torch {made_with}", found=here, remedy=remedy)
+    engine, known = manifest["engine"], list(torch.backends.quantized.supported_engines)
+    if engine not in known:
+        what = f"{path}: needs the quantization engine '{engine}'"
+        raise ArtifactError(what, found=known, remedy="install PyPI's build of torch")
     torch.backends.quantized.engine = engine
     if threads:
         torch.set_num_threads(threads)
     try:
-        str(path).encode()  # torch cannot open any other name
-    except UnicodeEncodeError:
-        raise ArtifactError(f"{path}: its name is no text that torch can read", remedy="rename it") from None
-    try:
         module = torch.jit.load(str(path), map_location="cpu").eval()
-    except RuntimeError as e:
-        raise ArtifactError(
-            f"{path}: TorchScript cannot load it ({str(e).splitlines()[0][:200]})", remedy="quantize again"
-        ) from None
+    except (RuntimeError, UnicodeEncodeError) as e:  # torch cannot open any name
+        raise refused(path, f"TorchScript cannot load it ({str(e).splitlines()[0][:200]})") from None
     return TorchEngine(module)

@@ -270,7 +270,8 @@ class EpisodeWriter:
                 self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in known)
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
                 if kind == "frame" and self.frames == 1:
-                    self.resolution = cv2.imread(str(part / row["image_path"])).shape[1::-1]
+                    picture = cv2.imread(str(part / row["image_path"]))
+                    self.resolution = None if picture is None else picture.shape[1::-1]
         self.metadata["fault"] = CUT_OFF + (f"; {left_out} damaged rows and pictures are left out" if left_out else "")
 
     def _rows_of(self, part: Path, kind: str) -> Iterator[dict[str, Any]]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.fx import GraphModule
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
@@ -34,20 +35,17 @@ Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judge
 # A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an
 # emulated Cortex-A76.
 FLOAT_PER_INT8 = 4.2
-# Min-max alone clips nothing that calibration saw. On a handful of frames others often seem a little better, and on
-# frames of other episodes they were up to twice as bad: docs/quantization.md has how often, and by how much.
-CLIPPING_PAYS = 0.8  # times the error of what clips less: what clips more must be better than that
+# Min-max clips nothing that calibration saw. On a few frames others often seem a little better, and on frames of other
+# episodes they were up to twice as bad. So what clips more must have less than this times the error:
+CLIPPING_PAYS = 0.8
 SENSITIVITY_FRAMES = 24  # of the choosing frames: they only order the blocks, which are then tried on all
 USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are odd frames
-# Odd frames far above the others in every tensor lose their plans by narrow ranges, and widening one tensor mends
-# nothing while the next one clips. So all but the odd frames are also tried with every range wider, by these shares:
+# Where odd frames are far above the others in every tensor, widening one range mends nothing while the next one clips.
+# So all but the odd frames are also tried with every range wider, by these shares:
 ALL_WIDER = (0.9, 0.8, 0.7, 0.5, 0.3)
-# Then, where odd frames reach furthest beyond the usual ones, ranges are widened, as long as that pays:
-WIDENED = 8  # this many tensors,
-WIDER = 0.2  # by this share of the way at a time,
-WIDENING_PAYS = 0.99  # if the error is at most this times what it was,
-WIDENING_COSTS = 1.1  # and that of usual frames at most this times what it was without any,
-WIDENING_ROUNDS = 3  # this many times at most
+# Then the ranges of the tensors whose odd frames reach furthest are widened by WIDER of the way at a time, if the error
+# is at most WIDENING_PAYS times what it was, and that of usual frames WIDENING_COSTS times what it was without any.
+WIDENED, WIDER, WIDENING_PAYS, WIDENING_COSTS, WIDENING_ROUNDS = 8, 0.2, 0.99, 1.1, 3
 
 
 def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) -> Errors:
@@ -79,8 +77,7 @@ class Chooser:
         if not samples:
             raise ArtifactError("choosing needs samples that did not calibrate", remedy="record more episodes")
         if len(constant_actions(action_range)) == len(action_range):
-            remedy = "record episodes in which the car is steered"
-            raise ArtifactError(f"{' and '.join(action_range)} never change in these recordings", remedy=remedy)
+            raise ArtifactError("no action changes in these recordings", remedy="record episodes with steering")
         forget_graphs()  # for the first time, as nothing is converted yet
         self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
         self.warnings = not_judged(action_range)
@@ -89,12 +86,15 @@ class Chooser:
         self.is_odd = torch.arange(len(self.inputs)) >= len(samples)
         self.weights = torch.ones(len(self.inputs))
         if odd:
-            graph = restore_observed(checkpoint, Scheme(smooth=calibration.smooth), calibration)
+            graph = self._observed(Scheme(smooth=calibration.smooth))
             unseen = times_of(graph, calibration, self.inputs[: len(samples)]) > ODD
             self.is_odd[: len(samples)] = unseen
             share = max(odd_share(calibration.frames), unseen.float().mean().item())
             for of_all, kind in ((1 - share, ~self.is_odd), (share, self.is_odd)):
                 self.weights[kind] = of_all * len(kind) / kind.sum().clamp(min=1)
+
+    def _observed(self, scheme: Scheme) -> GraphModule:
+        return restore_observed(self.checkpoint, scheme, self.calibration)
 
     def errors(self, module: nn.Module) -> Tensor:
         """(frames, actions): each frame's mean absolute difference to its own plan in FP32, in units of the actions."""
@@ -105,40 +105,26 @@ class Chooser:
         return (actions - self.reference[of]).abs().mean(1)
 
     def error(self, module: nn.Module) -> Errors:
-        """The errors of a quantized policy against FP32, on the samples, in % of the recorded range."""
-        return self._mean(self.errors(module))
-
-    def _mean(self, errors: Tensor) -> Errors:
-        return mae_pct(errors, self.weights, self.action_range)
+        """The errors of a quantized policy against FP32, in % of the recorded range."""
+        return mae_pct(self.errors(module), self.weights, self.action_range)
 
     def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
         """The same on usual and on odd frames, of the kinds that there are."""
         errors, kinds = self.errors(module), {"usual": ~self.is_odd, "odd": self.is_odd}
+        ones = torch.ones(len(errors))
         return {
-            name: mae_pct(errors[kind], torch.ones(int(kind.sum())), self.action_range)
-            for name, kind in kinds.items()
-            if kind.any()
+            name: mae_pct(errors[kind], ones[kind], self.action_range) for name, kind in kinds.items() if kind.any()
         }
 
     def observer(
         self, scheme: Scheme, observers: Sequence[str] = OBSERVERS, progress: Progress = silent
     ) -> tuple[Scheme, dict[str, Errors]]:
-        """Quantize with each observer; the one whose worse action has the least error wins.
+        """Quantize with each observer, and return the scheme of `best_of`, and every error.
 
-        One that clips must win clearly: its error is at most CLIPPING_PAYS of that of min-max, or of `frames` with more
-        frames left, or these are taken. `frames` is tried only where there are odd frames, also with all ranges wider,
-        and the ranges are then widened tensor by tensor.
+        `frames` is tried only where there are odd frames, and its ranges are then widened tensor by tensor.
         """
-        tried = {name: replace(scheme, observer=name) for name in observers if name != "frames"}
-        if "frames" in observers and (share := odd_share(self.calibration.frames)):
-            all_but_odd = round(100 * (1 - share), 1)
-            for pct in sorted({*USUAL_PCT, all_but_odd}, reverse=True):
-                tried[f"frames {pct:g}"] = replace(scheme, observer="frames", usual_pct=pct)
-            for by in ALL_WIDER:
-                wider = tuple((place, by) for place in self.calibration.frames)
-                name = f"frames {all_but_odd:g}, all {by:g} wider"
-                tried[name] = replace(scheme, observer="frames", usual_pct=all_but_odd, wider=wider)
-        graph = restore_observed(self.checkpoint, scheme, self.calibration)
+        tried = self._candidates(scheme, observers)
+        graph = self._observed(scheme)
         forget_graphs()
         policy = Rangeable(graph, self.checkpoint.config, scheme)
 
@@ -147,12 +133,25 @@ class Chooser:
             policy.take()
             return self._from_reference(predictions(policy.module, self.inputs))
 
-        table = {name: self._mean(judge(tried[name])) for name in progress(tried, desc="observers")}
+        table = {}
+        for name in progress(tried, desc="observers"):
+            table[name] = mae_pct(judge(tried[name]), self.weights, self.action_range)
         best = best_of(tried, table)
         if tried[best].observer != "frames":
             return tried[best], table
         chosen, table[f"{best}, widened"] = self._widen(tried[best], judge, progress)
         return chosen, table
+
+    def _candidates(self, scheme: Scheme, observers: Sequence[str]) -> dict[str, Scheme]:
+        tried = {name: replace(scheme, observer=name) for name in observers if name != "frames"}
+        if "frames" in observers and (share := odd_share(self.calibration.frames)):
+            frames = replace(scheme, observer="frames", usual_pct=round(100 * (1 - share), 1))
+            for pct in sorted({*USUAL_PCT, frames.usual_pct}, reverse=True):
+                tried[f"frames {pct:g}"] = replace(frames, usual_pct=pct)
+            for by in ALL_WIDER:
+                wider = tuple((place, by) for place in self.calibration.frames)
+                tried[f"frames {frames.usual_pct:g}, all {by:g} wider"] = replace(frames, wider=wider)
+        return tried
 
     def _widen(self, scheme: Scheme, errors: Callable[[Scheme], Tensor], progress: Progress) -> tuple[Scheme, Errors]:
         """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
@@ -163,7 +162,7 @@ class Chooser:
         def judge(scheme: Scheme) -> tuple[Errors, float]:
             found = errors(scheme)
             of_usual = mae_pct(found, self.weights * ~self.is_odd, self.action_range)
-            return self._mean(found), _worst(of_usual)
+            return mae_pct(found, self.weights, self.action_range), _worst(of_usual)
 
         error, usually = judge(scheme)
         best, wider, touched = scheme, dict(scheme.wider), set[str]()
@@ -179,8 +178,8 @@ class Chooser:
 
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:
         """Each block quantized alone, everything else in float: {block: errors}."""
-        graph = restore_observed(self.checkpoint, scheme, self.calibration)
-        config, plain = self.checkpoint.config, replace(scheme, float_blocks=())
+        graph, config = self._observed(scheme), self.checkpoint.config
+        plain = replace(scheme, float_blocks=())
         some = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES))
         inputs, table = [self.inputs[i] for i in some], {}
         for block in progress(blocks(config), desc="blocks"):
@@ -200,36 +199,41 @@ class Chooser:
     ) -> tuple[Scheme, list[dict[str, Any]]]:
         """Leave blocks in float that take much of the error for few instructions, until every action is in the budget.
 
-        Blocks are tried in the order of squared error taken per instruction added. One that is too dear for what is
-        left of `max_cost_pct`, the instructions that mixed may have more than static, or after which the worse action
-        is not better, stays INT8. Returns the mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct},
-        static first; the last is the best within the cost, in the budget or not.
-
-        blocks: leave these in float instead, whatever they cost. Raises ArtifactError for an unknown one.
+        Blocks are tried in the order of squared error taken per instruction added. One that costs more than is left of
+        `max_cost_pct` of static's instructions, or after which the worse action is not better, stays INT8. Returns the
+        mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct}, static first, the best last. blocks:
+        leave these in float instead, whatever they cost. Raises ArtifactError for an unknown one.
         """
         if unknown := [block for block in blocks or () if block not in sensitivity]:
             raise ArtifactError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
-        graph = restore_observed(self.checkpoint, scheme, self.calibration)
-        costs = float_costs_pct(self.checkpoint)
-        order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
+        graph, costs = self._observed(scheme), float_costs_pct(self.checkpoint)
         best = replace(scheme, mode="mixed", float_blocks=())
-        cost, error = 0.0, self.error(convert(graph, self.checkpoint.config, best))
-        steps: list[dict[str, Any]] = [{"float_blocks": [], "cost_pct": cost, **error}]
+
+        def step(*in_float: str) -> dict[str, Any]:
+            trial = replace(best, float_blocks=in_float)
+            errors = self.error(convert(graph, self.checkpoint.config, trial))
+            return {
+                "float_blocks": list(in_float),
+                "cost_pct": sum((costs[block] for block in in_float), 0.0),
+                **errors,
+            }
+
+        steps = [step()]
         if blocks is not None:
-            best, cost = replace(best, float_blocks=tuple(blocks)), sum(costs[block] for block in blocks)
-            error = self.error(convert(graph, self.checkpoint.config, best))
-            return best, [*steps, {"float_blocks": list(blocks), "cost_pct": cost, **error}]
+            steps.append(step(*blocks))
+            order = []
+        else:
+            order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
         for block in order:
-            if _worst(error) <= budget_pct:
+            last = steps[-1]
+            if _worst(last) <= budget_pct:
                 break
-            if cost + costs[block] > max_cost_pct or len(best.float_blocks) == len(sensitivity) - 1:
+            if last["cost_pct"] + costs[block] > max_cost_pct or len(last["float_blocks"]) == len(sensitivity) - 1:
                 continue
-            trial = replace(best, float_blocks=(*best.float_blocks, block))
-            found = self.error(convert(graph, self.checkpoint.config, trial))
-            if _worst(found) < _worst(error):
-                best, cost, error = trial, cost + costs[block], found
-                steps.append({"float_blocks": list(best.float_blocks), "cost_pct": cost, **error})
-        return best, steps
+            trial = step(*last["float_blocks"], block)
+            if _worst(trial) < _worst(last):
+                steps.append(trial)
+        return replace(best, float_blocks=tuple(steps[-1]["float_blocks"])), steps
 
 
 def best_of(tried: Mapping[str, Scheme], table: Mapping[str, Errors]) -> str:
@@ -249,7 +253,6 @@ def float_costs_pct(checkpoint: Checkpoint) -> dict[str, float]:
     return {block: 100 * (FLOAT_PER_INT8 - 1) * macs[block] / whole for block in blocks(checkpoint.config)}
 
 
-def _worst(errors: Errors) -> float:
-    largest = worst(errors)
-    assert largest is not None  # a Chooser has an action to judge
-    return largest
+def _worst(errors: Mapping[str, Any]) -> float:
+    """The larger error of the judged actions."""
+    return worst(e for name, e in errors.items() if name.endswith("_mae_pct")) or 0.0

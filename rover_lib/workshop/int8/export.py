@@ -57,15 +57,10 @@ class TorchScript:
 
 
 def _reread(frozen: torch.jit.ScriptModule) -> torch.jit.ScriptModule:
-    """Return a frozen module as a file gives it, and empty the one that was given.
-
-    torch never frees a frozen module's type, nor the weights in its graph: a run would keep those of each artifact that
-    it writes. The type of a module that was read goes with it.
-    """
-    file = BytesIO()
+    """Return a frozen module as a file gives it, and empty the one that was given, whose graph torch never frees."""
+    file, graph = BytesIO(), frozen.graph
     torch.jit.save(frozen, file)
     file.seek(0)
-    graph = frozen.graph
     for _ in list(graph.outputs()):
         graph.eraseOutput(0)
     for node in reversed(list(graph.nodes())):
@@ -107,10 +102,10 @@ Form = TorchScript | Onnx
 class Parity:
     """How far an artifact's answers may differ when it is loaded elsewhere, and how many questions it is asked.
 
-    tolerance: how far FP32 may differ, in action units; relative to the largest planned action if that is above 1.
-    int8_errors: INT8 may differ by this many times its own largest error against FP32 if that is more than `tolerance`,
-    because a flipped rounding is as large as the quantization error itself. Steering and throttle may never differ by
-    more than `artifact.largest_tolerance`. vectors: how many samples are stored in the artifact.
+    tolerance: of FP32, in action units; relative to the largest planned action if that is above 1. int8_errors: INT8
+    may differ by this many times its own largest error against FP32 if that is more, because a flipped rounding is as
+    large as the quantization error itself; steering and throttle never by more than `artifact.largest_tolerance`.
+    vectors: how many samples are stored in the artifact.
     """
 
     tolerance: float = 1e-4
@@ -119,7 +114,7 @@ class Parity:
 
 
 class Exporter:
-    """Writes artifacts of one checkpoint. FP32's answers to the samples are computed once for all artifacts.
+    """Writes artifacts of one checkpoint.
 
     samples: recorded observations. `parity.vectors` of them, evenly spaced, become the parity vectors; INT8's largest
     error is taken over all of them. Raises ArtifactError without samples, and for samples of several cars.
@@ -152,7 +147,7 @@ class Exporter:
         calibration: a quantized policy's, for the manifest. Raises ArtifactError, and writes nothing, if the engine's
         form of the policy does not compute what the policy computes, or gives anything that is not finite.
         """
-        checkpoint, config = self.checkpoint, self.checkpoint.config
+        config = self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
         # The eager policy can be slow, so it answers only the stored samples: enough to see that the form is right.
@@ -166,32 +161,56 @@ class Exporter:
         for (name, most), gap in zip(limits.items(), gaps, strict=True):
             if not gap <= most:  # written so that NaN fails
                 raise ArtifactError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
+        manifest = self._manifest(policy, calibration, form)
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
-        allowed = {
-            name: min(most, artifact.largest_tolerance(_mode(policy), name))
+        tolerance = {
+            name: min(most, artifact.largest_tolerance(manifest["mode"], name))
             for name, most in self._tolerance(policy, actions, np.arange(len(actions))).items()
         }
-        vectors = {
-            "state": np.stack([self.inputs[i][0][0].numpy() for i in self.stored]),
-            "chunk": np.stack([actions[i].numpy() for i in self.stored]),
-        }
-        for at, camera in enumerate(config.cameras, 1):
-            vectors[f"frame_{camera}"] = np.stack([self.inputs[i][at].numpy() for i in self.stored])
-        other = not self.car.drives_like(Car()) or self.car.positive != Car().positive
-        names_car = bool({*config.action_names} & {*ACTION_NAMES}) and other
-        manifest = _manifest(policy, checkpoint, calibration, form, self.recorded) | {
-            **({"car": self.car.description()} if names_car else {}),
-            "weights_mb": _weights_mb(module),
-            "gmac": self.gmac,
-            "parity": {"tolerance": allowed, "reason": REASONS[isinstance(policy, QuantizedPolicy)]},
-        }
+        manifest["parity"] = {"tolerance": tolerance, "reason": REASONS[isinstance(policy, QuantizedPolicy)]}
+        states, *frames = zip(*(self.inputs[i] for i in self.stored), strict=True)
+        vectors = {"state": np.concatenate(states), "chunk": actions[self.stored].numpy()}
+        vectors |= {f"frame_{name}": np.stack(seen) for name, seen in zip(config.cameras, frames, strict=True)}
         return form.save(path, manifest, vectors)
 
-    def _tolerance(self, policy: ACT | QuantizedPolicy, actions: Tensor, rows: np.ndarray) -> dict[str, float]:
-        """Return for each action, in its units, how far another computation of it may be off.
+    def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
+        """Return the manifest without its parity."""
+        config, scheme = self.checkpoint.config, getattr(policy, "scheme", None)
+        mode = scheme.mode if scheme else "fp32"
+        static = scheme if mode in ("static", "mixed") else None
+        calibrated = calibration and {
+            "samples": calibration.samples,
+            "observer": static.observer if static else None,
+            "channel_scales": calibration.smooth,
+            "float_blocks": list(scheme.float_blocks) if scheme else [],
+        }
+        cameras = [
+            {"name": n, "height": h, "width": w} | self.recorded[n]
+            for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
+        ]
+        other = not self.car.drives_like(Car()) or self.car.positive != Car().positive
+        names_car = other and bool({*config.action_names} & {*ACTION_NAMES})
+        return {
+            "schema": artifact.SCHEMA,
+            "mode": mode,
+            "scheme": static.kind if static else "dynamic" if scheme else "float",
+            "engine": form.engine,
+            "cameras": cameras,
+            "state_names": list(config.state_names),
+            "action_names": list(config.action_names),
+            "chunk": config.chunk,
+            "rate_hz": config.rate_hz,
+            "normalisation": "inside the graph: uint8 RGB frames and raw states in, raw actions out",
+            "checkpoint": {"sha256": self.checkpoint.sha256, "format": self.checkpoint.format},
+            "calibration": calibrated,
+            "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
+            **({"car": self.car.description()} if names_car else {}),
+            "weights_mb": _weights_mb(policy.module if isinstance(policy, QuantizedPolicy) else policy),
+            "gmac": self.gmac,
+        }
 
-        actions: (n, C, A), what the policy computes. rows: (n,), the indices of the samples that it computed them for.
-        """
+    def _tolerance(self, policy: ACT | QuantizedPolicy, actions: Tensor, rows: np.ndarray) -> dict[str, float]:
+        """Return by action how far another computation may be off `actions`, (n, C, A), of the samples `rows`."""
         # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
         sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
         allowed = [self.parity.tolerance * size for size in sizes]
@@ -209,51 +228,8 @@ def export(
     calibration: Calibration | None = None,
     parity: Parity | None = None,
 ) -> str:
-    """Write one artifact as `Exporter.export` does, and return its content hash."""
+    """Write one artifact as `Exporter.export` does."""
     return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
-
-
-def _mode(policy: ACT | QuantizedPolicy) -> str:
-    return policy.scheme.mode if isinstance(policy, QuantizedPolicy) else "fp32"
-
-
-def _manifest(
-    policy: ACT | QuantizedPolicy,
-    checkpoint: Checkpoint,
-    calibration: Calibration | None,
-    form: Form,
-    recorded: Mapping[str, dict[str, Any]],
-) -> dict[str, Any]:
-    """Return the part of the manifest that follows from the policy, its checkpoint, the form and `recorded_shapes`."""
-    config = checkpoint.config
-    scheme = policy.scheme if isinstance(policy, QuantizedPolicy) else None
-    mode = _mode(policy)
-    arithmetic = {"fp32": "float", "dynamic": "dynamic"}
-    return {
-        "schema": artifact.SCHEMA,
-        "mode": mode,
-        "scheme": scheme.kind if scheme and mode not in arithmetic else arithmetic[mode],
-        "engine": form.engine,
-        "cameras": [
-            {"name": n, "height": h, "width": w} | recorded[n]
-            for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
-        ],
-        "state_names": list(config.state_names),
-        "action_names": list(config.action_names),
-        "chunk": config.chunk,
-        "rate_hz": config.rate_hz,
-        "normalisation": "inside the graph: uint8 RGB frames and raw states in, raw actions out",
-        "checkpoint": {"sha256": checkpoint.sha256, "format": checkpoint.format},
-        "calibration": None
-        if calibration is None
-        else {
-            "samples": calibration.samples,
-            "observer": scheme.observer if scheme and mode not in arithmetic else None,
-            "channel_scales": calibration.smooth,
-            "float_blocks": list(scheme.float_blocks) if scheme else [],
-        },
-        "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
-    }
 
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:

@@ -31,9 +31,8 @@ def oddness(extremes: Extremes) -> dict[str, Tensor]:
 
 
 def oddest(extremes: Extremes) -> Tensor:
-    """(frames,) of each frame's largest oddness at any place; empty for a calibration that kept no frames."""
-    times = list(oddness(extremes).values())
-    return torch.stack(times).amax(0) if times else torch.empty(0)
+    """(frames,) of each frame's largest oddness at any place."""
+    return torch.stack(list(oddness(extremes).values())).amax(0)
 
 
 def usual(extremes: Extremes, usual_pct: float) -> Tensor:
@@ -63,16 +62,14 @@ def odd_samples(extremes: Extremes, seen: Sequence[Frame], samples: Sequence[Sam
 
     seen: what frame each row of `extremes` is of.
     """
-    times = oddest(extremes).tolist()
-    odd = {frame: t for frame, t in zip(seen, times, strict=True) if t > ODD}
-    found = [s for s in samples if (s.episode, s.row) in odd]
-    return pick_evenly(sorted(found, key=lambda s: odd[s.episode, s.row]), ODD_FRAMES)
+    times = dict(zip(seen, oddest(extremes).tolist(), strict=True))
+    found = [s for s in samples if times.get((s.episode, s.row), 0) > ODD]
+    return pick_evenly(sorted(found, key=lambda s: times[s.episode, s.row]), ODD_FRAMES)
 
 
 def odd_share(extremes: Extremes) -> float:
     """The share of the frames that are odd."""
-    times = oddest(extremes)
-    return float((times > ODD).float().mean()) if len(times) else 0.0
+    return float((oddest(extremes) > ODD).float().mean())
 
 
 def describe_odd(extremes: Extremes, seen: Sequence[Frame]) -> dict[str, Any]:
@@ -80,7 +77,7 @@ def describe_odd(extremes: Extremes, seen: Sequence[Frame]) -> dict[str, Any]:
     are; empty if there are none. times: the median of the odd frames' oddness there.
     """
     odd = oddest(extremes) > ODD
-    if not len(odd) or not odd.any():
+    if not odd.any():
         return {}
     at = {place: times[odd].median().item() for place, times in oddness(extremes).items()}
     place = max(at, key=lambda p: at[p])

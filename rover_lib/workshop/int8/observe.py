@@ -13,11 +13,10 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor, nn
-from torch.ao.quantization import PerChannelMinMaxObserver, QConfig, QConfigMapping, float_qparams_weight_only_qconfig
+from torch.ao.quantization import PerChannelMinMaxObserver, QConfig, QConfigMapping
 from torch.ao.quantization.backend_config import get_qnnpack_backend_config
 from torch.ao.quantization.fx.custom_config import PrepareCustomConfig
 from torch.ao.quantization.observer import UniformQuantizationObserverBase
@@ -37,15 +36,15 @@ from rover_lib.workshop.recordings.episodes import Sample
 
 AGAIN = "calibrate again"
 BROKEN_INPUT = "check the checkpoint and the recordings"
+OBSERVER = "activation_post_process"  # in FX's names of observers
 
 
 class RangeObserver(UniformQuantizationObserverBase):
     """Sees a tensor's values during calibration; the range is chosen afterwards, in any of four ways.
 
     Keeps the exact minimum and maximum and a histogram over [-limit, limit] whose limit doubles when it is outgrown:
-    two neighbouring bins merge into one, so nothing is ever re-binned by guess. One calibration serves all observers.
-    frames: the least and the largest value of each frame, (2,) each. of_frames: the range that the choice `frames`
-    takes, set from outside, because it depends on which frames are odd anywhere in the policy.
+    two neighbouring bins merge into one, so nothing is ever re-binned by guess. frames: the least and the largest value
+    of each frame, (2,) each. of_frames: the range that the choice `frames` takes, which depends on the whole policy.
     """
 
     BINS = 4096
@@ -57,14 +56,10 @@ class RangeObserver(UniformQuantizationObserverBase):
         self.choice, self.percentile, self.observing = choice, percentile, True
         self.frames: list[Tensor] = []
         self.of_frames: tuple[float, float] | None = None
-        self.min_val: Tensor
-        self.max_val: Tensor
-        self.limit: Tensor
-        self.histogram: Tensor
-        self.register_buffer("min_val", torch.tensor(torch.inf))
-        self.register_buffer("max_val", torch.tensor(-torch.inf))
-        self.register_buffer("limit", torch.tensor(0.0))
-        self.register_buffer("histogram", torch.zeros(self.BINS))
+        self.min_val = nn.Buffer(torch.tensor(torch.inf))
+        self.max_val = nn.Buffer(torch.tensor(-torch.inf))
+        self.limit = nn.Buffer(torch.tensor(0.0))
+        self.histogram = nn.Buffer(torch.zeros(self.BINS))
 
     def forward(self, x: Tensor) -> Tensor:
         if not self.observing:
@@ -86,7 +81,7 @@ class RangeObserver(UniformQuantizationObserverBase):
             self.limit.mul_(2)
         limit = self.limit.item()
         # A feature map has millions of values: every 17th draws the same histogram.
-        self.histogram += torch.histc(v[::17] if v.numel() > 1 << 18 else v, self.BINS, -limit, limit)
+        self.histogram.add_(torch.histc(v[::17] if v.numel() > 1 << 18 else v, self.BINS, -limit, limit))
         return x
 
     def range(self) -> tuple[float, float]:
@@ -101,8 +96,8 @@ class RangeObserver(UniformQuantizationObserverBase):
             low, high = self._percentiles(low, high)
         elif self.choice == "histogram":
             low, high = self._least_squares(low, high)
-        elif self.choice == "frames" and self.of_frames is not None:
-            low, high = self.of_frames
+        elif self.choice == "frames":
+            low, high = self.of_frames or (low, high)
         return min(low, 0.0), max(high, 0.0)
 
     def _centres(self) -> Tensor:
@@ -145,9 +140,9 @@ class Calibration:
     channels: Maxima = field(repr=False)  # in_max, out_max, and the same after scaling
     observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
     ranges: dict[str, dict[str, float]] = field(repr=False)  # of each quantized layer's output: min, max
-    seconds: float = 0.0
-    seen: tuple[Frame, ...] = field(default=(), repr=False)  # (episode, row) of each sample
-    frames: dict[str, Tensor] = field(default_factory=dict, repr=False)  # (samples, 2) extremes on each, by place
+    seconds: float
+    seen: tuple[Frame, ...] = field(repr=False)  # (episode, row) of each sample
+    frames: dict[str, Tensor] = field(repr=False)  # (samples, 2) extremes on each, by place
 
     def save(self, path: Path | str) -> None:
         save_torch(Path(path), self.__dict__)
@@ -160,9 +155,8 @@ class Calibration:
                 return cls(**torch.load(file, weights_only=True))
         except FileNotFoundError:
             raise ArtifactError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
-        except Exception as e:  # torch wraps what it meets in many types
-            reason = str(e).splitlines()[0][:120]
-            raise ArtifactError(f"{path}: not a calibration ({reason})", remedy="calibrate again") from None
+        except Exception:  # torch wraps what it meets in many types
+            raise ArtifactError(f"{path}: not a calibration", remedy=AGAIN) from None
 
 
 def calibrate(
@@ -170,12 +164,11 @@ def calibrate(
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
-    smooth: SmoothQuant's a, None for no channel scales. progress: like tqdm. Raises ArtifactError without samples, and
-    for activations that are not finite.
+    smooth: SmoothQuant's a, None for no channel scales. Raises ArtifactError without samples, and for activations that
+    are not finite.
     """
     if not samples:
-        remedy = "give recordings with matching frames and controls"
-        raise ArtifactError("calibration needs samples", found="none", remedy=remedy)
+        raise ArtifactError("calibration needs samples", found="none", remedy="give other recordings")
     torch.backends.quantized.engine = ENGINE
     start = time.monotonic()
     config = checkpoint.config
@@ -196,29 +189,33 @@ def calibrate(
     with torch.inference_mode():
         for x in inputs("observers"):
             prepared(*x)
-    observers = {k: v.clone() for k, v in prepared.state_dict().items() if "activation_post_process" in k}
     frames = {}
     for place, observer in _places(prepared).items():
         each = torch.stack(observer.frames).view(len(samples), -1, 2)  # some run once for each camera
         frames[place] = torch.stack((each[..., 0].amin(1), each[..., 1].amax(1)), 1)
-    ranges = {}
-    for node in prepared.graph.nodes:
-        if node.op != "call_module" or block_of(str(node.target)) in STAYS_FLOAT:
-            continue
-        if (o := _observer_behind(prepared, node)) is not None:
-            ranges[str(node.target)] = {"min": o.min_val.item(), "max": o.max_val.item()}
     return Calibration(
         samples=len(samples),
         smooth=smooth,
         checkpoint=checkpoint.identity,
         image_sizes=config.image_sizes,
         channels=channels,
-        observers=observers,
-        ranges=ranges,
+        observers={k: v.clone() for k, v in prepared.state_dict().items() if OBSERVER in k},
+        ranges=_seen_ranges(prepared),
         seconds=time.monotonic() - start,
         seen=tuple((s.episode, s.row) for s in samples),
         frames=frames,
     )
+
+
+def _seen_ranges(prepared: GraphModule) -> dict[str, dict[str, float]]:
+    """The least and the largest value that each layer gave, of those that become INT8."""
+    ranges = {}
+    for node in prepared.graph.nodes:
+        if node.op == "call_module" and block_of(str(node.target)) not in STAYS_FLOAT:
+            seen = next(filter(None, (_observer(prepared, user) for user in node.users)), None)
+            if seen is not None:
+                ranges[str(node.target)] = {"min": seen.min_val.item(), "max": seen.max_val.item()}
+    return ranges
 
 
 def _places(prepared: GraphModule) -> dict[str, RangeObserver]:
@@ -226,17 +223,15 @@ def _places(prepared: GraphModule) -> dict[str, RangeObserver]:
 
     An observer that FX shares, as of a pooling's input and output, has the first of its names.
     """
-    places: dict[str, RangeObserver] = {}
+    places: dict[RangeObserver, str] = {}
     for node in prepared.graph.nodes:
-        if not _is_observer(prepared, node):
+        if (observer := _observer(prepared, node)) is None:
             continue
         (source,) = node.all_input_nodes
         takes = next((user for user in node.users if user.op == "call_module"), None)
         name = str(source.target) if source.op == "call_module" or takes is None else f"{takes.target}.input"
-        observer = cast(RangeObserver, prepared.get_submodule(str(node.target)))
-        if all(known is not observer for known in places.values()):
-            places[name] = observer
-    return places
+        places.setdefault(observer, name)
+    return {name: observer for observer, name in places.items()}
 
 
 @torch.inference_mode()
@@ -258,22 +253,16 @@ def times_of(prepared: GraphModule, calibration: Calibration, inputs: Sequence[t
 
 def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) -> None:
     """Let the observers of a restored graph choose their ranges by this scheme."""
-    places = _places(prepared)
-    if scheme.observer == "frames":
-        if not calibration.frames:
-            raise ArtifactError("the calibration is of a version that kept no frames", remedy="calibrate again")
-        kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
-        if unknown := sorted(set(wider) - set(places)):
-            raise ArtifactError(f"scheme: wider names {unknown[:3]}, which this policy does not have")
-        for place, observer in places.items():
-            observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
-    for observer in places.values():
+    kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
+    for place, observer in _places(prepared).items():
         observer.choice, observer.percentile = scheme.observer, scheme.percentile
+        observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
 
 
-def _observer_behind(prepared: nn.Module, node: Node) -> RangeObserver | None:
-    found = _behind(prepared, node)
-    return None if found is None else cast(RangeObserver, prepared.get_submodule(str(found.target)))
+def _observer(prepared: nn.Module, node: Node) -> RangeObserver | None:
+    """The observer that a node calls, None if it calls something else."""
+    called = prepared.get_submodule(str(node.target)) if node.op == "call_module" else None
+    return called if isinstance(called, RangeObserver) else None
 
 
 def _pattern(block: str, relu: bool) -> str:
@@ -296,8 +285,6 @@ def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | Non
         raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
     wanted = set(known) - set(scheme.float_blocks) if only is None else set(only)
     mapping = QConfigMapping().set_global(None)
-    # No table is left in the graph of ACT (see act.EMBEDDINGS); where one is, only its rows are worth quantizing.
-    mapping.set_object_type(nn.Embedding, float_qparams_weight_only_qconfig)
     for block in known:
         qconfig = _qconfig(scheme) if block in wanted else None
         mapping.set_module_name_regex(_pattern(block, config.activation == "relu"), qconfig)
@@ -337,32 +324,21 @@ def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
     """
     calls: dict[str, list[Node]] = {}
     for node in prepared.graph.nodes:
-        if node.op == "call_module" and not _is_observer(prepared, node):
+        if node.op == "call_module" and _observer(prepared, node) is None:
             calls.setdefault(str(node.target), []).append(node)
     for nodes in calls.values():
-        for beside in (_before, _behind):
-            observers = [beside(prepared, node) for node in nodes]
-            if (first := observers[0]) is not None:
-                for other in observers[1:]:
-                    if other is not None:
-                        other.target = first.target
+        for sides in ([node.all_input_nodes for node in nodes], [node.users for node in nodes]):
+            shared, *others = (_first_observer(prepared, side) for side in sides)
+            for other in others:
+                if shared is not None and other is not None:
+                    other.target = shared.target
     prepared.delete_all_unused_submodules()
     prepared.recompile()
     return prepared
 
 
-def _is_observer(prepared: nn.Module, node: Node) -> bool:
-    return node.op == "call_module" and isinstance(prepared.get_submodule(str(node.target)), RangeObserver)
-
-
-def _before(prepared: nn.Module, node: Node) -> Node | None:
-    """The observer of what a layer takes."""
-    return next((n for n in node.all_input_nodes if _is_observer(prepared, n)), None)
-
-
-def _behind(prepared: nn.Module, node: Node) -> Node | None:
-    """The observer of what a layer gives."""
-    return next((n for n in node.users if _is_observer(prepared, n)), None)
+def _first_observer(prepared: nn.Module, nodes: Iterable[Node]) -> Node | None:
+    return next((node for node in nodes if _observer(prepared, node)), None)
 
 
 def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
@@ -370,18 +346,17 @@ def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibr
 
     Raises ArtifactError for a calibration of another checkpoint, picture size, scheme or version.
     """
-    if calibration.image_sizes != checkpoint.config.image_sizes:
-        sizes = f"images of {calibration.image_sizes}, not {checkpoint.config.image_sizes} (height, width)"
-        raise ArtifactError(f"the calibration was made with {sizes}", remedy=AGAIN)
-    if calibration.checkpoint != checkpoint.identity:
-        raise ArtifactError("the calibration was made with another checkpoint", remedy=AGAIN)
-    if scheme.smooth != calibration.smooth:
-        raise ArtifactError(f"the calibration was made with smooth {calibration.smooth}, not {scheme.smooth}")
+    for what, made, now in (
+        ("image sizes", calibration.image_sizes, checkpoint.config.image_sizes),
+        ("checkpoint", calibration.checkpoint, checkpoint.identity),
+        ("smooth", calibration.smooth, scheme.smooth),
+    ):
+        if made != now:
+            raise ArtifactError(f"the calibration was made with {what} {made}, not {now}", remedy=AGAIN)
     torch.backends.quantized.engine = ENGINE
     prepared = _prepare(scale_model(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()
-    names = {k for k in state if "activation_post_process" in k}
-    if names != set(calibration.observers):
+    if {k for k in state if OBSERVER in k} != set(calibration.observers):
         raise ArtifactError("the calibration's observers do not fit this graph", remedy=AGAIN)
     prepared.load_state_dict(state | calibration.observers)
     for m in prepared.modules():

@@ -11,7 +11,6 @@ import copy
 import gc
 import time
 import warnings
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -33,7 +32,14 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver, qconfig_mapping, restore_observed, scale_model
+from rover_lib.workshop.int8.observe import (
+    AGAIN,
+    Calibration,
+    RangeObserver,
+    qconfig_mapping,
+    restore_observed,
+    scale_model,
+)
 from rover_lib.workshop.int8.scales import projections
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.recordings.episodes import Sample
@@ -58,35 +64,31 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
     Raises ArtifactError when nothing, or not everything that the scheme names, became INT8, or when a scale is not a
     positive finite number. Warnings, by layer, are in the report.
     """
-    start = time.monotonic()
-    if scheme.mode == "dynamic":
-        module = _dynamic(checkpoint, calibration)
-        expected = list(projections(ACT(checkpoint.config, checkpoint.weights)))
+    start, config = time.monotonic(), checkpoint.config
+    static = scheme.mode != "dynamic"
+    model = ACT(config, checkpoint.weights, for_int8=static)
+    module: nn.Module
+    if static:
+        module = convert(restore_observed(checkpoint, scheme, calibration), config, scheme).eval()
+        convs = [n for n, m in model.named_modules() if isinstance(m, nn.Conv2d)]
+        expected = [n for n in convs if block_of(n) not in (*scheme.float_blocks, *STAYS_FLOAT)]
     else:
-        module = convert(restore_observed(checkpoint, scheme, calibration), checkpoint.config, scheme)
-        left_float = {*scheme.float_blocks, *STAYS_FLOAT}
-        float_model = ACT(checkpoint.config, checkpoint.weights, for_int8=True)
-        convs = [n for n, m in float_model.named_modules() if isinstance(m, nn.Conv2d)]
-        expected = [n for n in convs if block_of(n) not in left_float]
+        module, expected = _dynamic(checkpoint, calibration).eval(), list(projections(model))
     layers = int8_layers(module)
     check_acted(layers, expected)
-    if scheme.mode != "dynamic" and scheme.kind == "symmetric":
-        check_fast(module.eval(), example_inputs(checkpoint.config))
+    if static and scheme.kind == "symmetric":
+        check_fast(module, example_inputs(config))
     rows = [_layer_row(n, m) for n, m in layers.items()]
-    notes = [
-        f"{row['name']}: its output never changed during calibration; is it dead?"
-        for row in rows
-        if row["out_scale"] == SMALLEST_SCALE
-    ]
+    dead = [row["name"] for row in rows if row["out_scale"] == SMALLEST_SCALE]
     report = {
         "layers": rows,
         "int8_modules": len(layers),
         "float_blocks": list(scheme.float_blocks),
         "embeddings": dict(EMBEDDINGS),
-        "warnings": notes,
+        "warnings": [f"{name}: its output never changed during calibration; is it dead?" for name in dead],
         "seconds": time.monotonic() - start,
     }
-    return QuantizedPolicy(scheme, checkpoint.config, module.eval(), report)
+    return QuantizedPolicy(scheme, config, module, report)
 
 
 def int8_layers(module: nn.Module) -> dict[str, Int8Layer]:
@@ -106,9 +108,8 @@ def forget_graphs() -> None:
     """Free the converted policies that nobody has any more.
 
     A graph and its module refer to each other, so only the collector frees them, and it counts objects, not megabytes:
-    without this a full-size run holds a dozen of them, and takes 0.5 GB more after eight of its 29 blocks. What they
-    leave is given back, as malloc would keep gigabytes of it in pieces. What is there at the first call is of
-    libraries, and stays: the collector takes up to 0.3 s to look at it, and does so once.
+    without this a full-size run holds a dozen of them. malloc would keep gigabytes in pieces. What is there at the
+    first call is of libraries, and stays: the collector takes up to 0.3 s to look at it, and does so once.
     """
     gc.collect()
     if not gc.get_freeze_count():
@@ -122,22 +123,19 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
 
     What torch 2.8 asks of a layer (`can_use_xnnp` in aten's qconv and qlinear) and XNNPACK of its scales: a qint8
     input, symmetric qint8 weights in [-127, 127], per channel for convolutions only, and an output scale that is
-    neither 2^-32 nor 2^8 times the product of the others. A layer that fails would run QNNPACK's kernels, several
-    times slower on a Cortex-A76, or not at all.
+    neither 2^-32 nor 2^8 times the product of the others. Another layer would run QNNPACK's kernels, several times
+    slower on a Cortex-A76, or not at all.
     """
     slow: dict[str, str] = {}
-
-    def watch(name: str):
-        def hook(m: Int8Layer, args: tuple[Tensor, ...]) -> None:
-            if reason := _why_slow(m, args[0]):
-                slow[name] = reason
-
-        return hook
-
     static = int8_layers(module)
     with ExitStack() as hooks:
-        for n, m in static.items():
-            hooks.enter_context(m.register_forward_pre_hook(watch(n)))
+        for name, layer in static.items():
+
+            def watch(m: Int8Layer, args: tuple[Tensor, ...], name: str = name) -> None:
+                if reason := _why_slow(m, args[0]):
+                    slow[name] = reason
+
+            hooks.enter_context(layer.register_forward_pre_hook(watch))
         try:
             module(*example)
         except RuntimeError as e:
@@ -197,8 +195,7 @@ def _layer_row(name: str, m: Int8Layer) -> dict[str, Any]:
     }
     for key in ("weight_scale_min", "out_scale"):
         if row[key] is not None and not 0 < row[key] < float("inf"):
-            what = f"{name}: its calibration range is no range, {key} is {row[key]}"
-            raise ArtifactError(what, remedy="check the recordings, and calibrate again")
+            raise ArtifactError(f"{name}: empty calibration range", found=f"{key} {row[key]}", remedy=AGAIN)
     return row
 
 
@@ -219,8 +216,7 @@ def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iter
 
 
 class Rangeable:
-    """A policy that was converted once and takes the ranges of other schemes: the same as `convert` makes, to the last
-    bit, in a fraction of its time.
+    """A policy that was converted once and takes the ranges of other schemes: as `convert` makes it, to the last bit.
 
     graph: observed; `take` follows what its observers now choose. Every block is INT8.
     """
@@ -283,33 +279,17 @@ def inspect_layers(
     prepared = restore_observed(checkpoint, quantized.scheme, calibration)
     layers = int8_layers(quantized.module)
     _, low, high = KINDS[quantized.scheme.kind]
-    seen: dict[str, deque[Tensor]] = {n: deque() for n in layers}  # the backbone runs once for each camera
     totals = {n: np.zeros(4) for n in layers}  # clipped, count, signal power, error power
-
-    def keep(name: str):
-        def hook(_: nn.Module, __: tuple, out: Tensor) -> None:
-            seen[name].append(out)
-
-        return hook
-
-    def measure(name: str, m: Int8Layer):
-        floor, ceiling = (low - m.zero_point - 0.5) * m.scale, (high - m.zero_point + 0.5) * m.scale
-
-        def hook(_: nn.Module, __: tuple, out: Tensor) -> None:
-            x, y = seen[name].popleft(), out.dequantize()
-            clipped = ((x < floor) | (x > ceiling)).sum().item()
-            totals[name] += (clipped, x.numel(), x.square().sum().item(), (x - y).square().sum().item())
-
-        return hook
-
-    with ExitStack() as hooks:
+    for s in samples:
+        inputs = inputs_of(s, checkpoint.config)
+        floats = _outputs({n: prepared.get_submodule(n) for n in layers}, prepared, inputs)
+        int8s = _outputs(layers, quantized.module, inputs)
         for n, m in layers.items():
-            hooks.enter_context(prepared.get_submodule(n).register_forward_hook(keep(n)))
-            hooks.enter_context(m.register_forward_hook(measure(n, m)))
-        for s in samples:
-            x = inputs_of(s, checkpoint.config)
-            prepared(*x)
-            quantized.module(*x)
+            floor, ceiling = (low - m.zero_point - 0.5) * m.scale, (high - m.zero_point + 0.5) * m.scale
+            for x, y in zip(floats[n], int8s[n], strict=True):
+                clipped = ((x < floor) | (x > ceiling)).sum().item()
+                error = x - y.dequantize()
+                totals[n] += (clipped, x.numel(), x.square().sum().item(), error.square().sum().item())
     return [
         {
             "name": n,
@@ -321,6 +301,16 @@ def inspect_layers(
         }
         for n, m in layers.items()
     ]
+
+
+def _outputs(layers: Mapping[str, nn.Module], module: nn.Module, inputs: tuple[Tensor, ...]) -> dict[str, list[Tensor]]:
+    """What each of a module's layers gives in one inference: a tensor for each of its calls."""
+    given: dict[str, list[Tensor]] = {n: [] for n in layers}
+    with ExitStack() as hooks:
+        for n, layer in layers.items():
+            hooks.enter_context(layer.register_forward_hook(lambda m, args, out, n=n: given[n].append(out)))
+        module(*inputs)
+    return given
 
 
 def warn_of_clipping(rows: list[dict[str, Any]], limit_pct: float) -> list[str]:

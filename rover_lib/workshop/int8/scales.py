@@ -6,49 +6,41 @@ channel scales move it into the weights, which have a scale per channel. In floa
 
 from collections.abc import Iterable
 from contextlib import ExitStack
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from rover_lib.workshop.act import ACT, Attention, FeedForward, Memory, Projection
+from rover_lib.workshop.act import ACT, Attention, FeedForward, Projection
 
 Maxima = dict[str, dict[str, Tensor]]  # by projection: in_max and out_max, the largest magnitude of each channel
 
 
 def projections(model: ACT) -> dict[str, Projection]:
     """The transformer's projections by name: what channel scales surround."""
-    return {
-        name: m
-        for name, m in model.named_modules()
-        if isinstance(m, (nn.Linear, nn.Conv2d)) and name.startswith(("encoder.", "decoder."))
-    }
+    kinds = (nn.Linear, nn.Conv2d)
+    parts = ("encoder.", "decoder.")
+    return {name: m for name, m in model.named_modules() if isinstance(m, kinds) and name.startswith(parts)}
 
 
 @torch.inference_mode()
 def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> Maxima:
     """The largest magnitude per channel at each projection's input and output: {name: {in_max, out_max}}."""
     maxima: Maxima = {}
-
-    def watch(name: str):
-        def hook(_: nn.Module, args: tuple[Tensor], out: Tensor) -> None:
-            for key, x in (("in_max", args[0]), ("out_max", out)):
-                largest = x.abs().amax(_all_but_channels(x))
-                seen = maxima.setdefault(name, {})
-                seen[key] = torch.maximum(seen[key], largest) if key in seen else largest
-
-        return hook
-
     with ExitStack() as hooks:
-        for name, m in projections(model).items():
-            hooks.enter_context(m.register_forward_hook(watch(name)))
+        for name, layer in projections(model).items():
+            seen = maxima[name] = {}
+
+            def watch(_: nn.Module, args: tuple[Tensor], out: Tensor, seen: dict[str, Tensor] = seen) -> None:
+                for key, x in (("in_max", args[0]), ("out_max", out)):
+                    # of (1, channels, h, w), or (1, tokens, channels)
+                    largest = x.abs().amax((0, 2, 3) if x.dim() == 4 else (0, 1))
+                    seen[key] = torch.maximum(seen[key], largest) if key in seen else largest
+
+            hooks.enter_context(layer.register_forward_hook(watch))
         for x in inputs:
             model(*x)
     return {name: {key: t.clone() for key, t in seen.items()} for name, seen in maxima.items()}
-
-
-def _all_but_channels(x: Tensor) -> tuple[int, ...]:
-    """The axes of (1, channels, h, w), or (1, tokens, channels), that are not its channels."""
-    return (0, 2, 3) if x.dim() == 4 else (0, 1)
 
 
 def apply_channel_scales(model: ACT, maxima: Maxima, smooth: float) -> None:
@@ -69,27 +61,27 @@ def apply_channel_scales(model: ACT, maxima: Maxima, smooth: float) -> None:
 def _scale_memory(model: ACT, maxima: Maxima, smooth: float) -> None:
     """All cross-attentions take the memory by the same scales, so that it is quantized once."""
     crosses = {name: m for name, m in model.named_modules() if isinstance(m, Attention) and m.cross}
-    first = next(iter(crosses))
     for p in "kv":
         even = []
         for name, cross in crosses.items():
-            even.append(_matrix(getattr(cross, p)) / _output_scale(maxima[f"{name}.{p}"]["out_max"])[:, None])
-        setattr(model.memory, f"{p}_in", _input_scale(maxima[f"{first}.{p}"]["in_max"], even, smooth))
+            seen = maxima[f"{name}.{p}"]
+            even.append(_matrix(getattr(cross, p)) / _output_scale(seen["out_max"])[:, None])
+        setattr(model.memory, f"{p}_in", _input_scale(seen["in_max"], even, smooth))
 
 
-def _scale_attention(name: str, part: Attention, memory: Memory, maxima: Maxima, smooth: float) -> None:
+def _scale_attention(name: str, part: Any, memory: Any, maxima: Maxima, smooth: float) -> None:
+    out, even = {}, {}
+    for p in "kvo" if part.constant_q is not None else "qkvo":
+        out[p] = _output_scale(maxima[f"{name}.{p}"]["out_max"])
+        even[p] = _matrix(getattr(part, p)) / out[p][:, None]
+
     def input_scale(p: str, *matrices: Tensor) -> Tensor:
         return _input_scale(maxima[f"{name}.{p}"]["in_max"], list(matrices), smooth)
 
-    fixed_query = part.constant_q is not None
-    out = {p: _output_scale(maxima[f"{name}.{p}"]["out_max"]) for p in ("kvo" if fixed_query else "qkvo")}
-    even = {p: _matrix(getattr(part, p)) / out[p][:, None] for p in out}
     if part.cross:
         k_in, v_in = memory.k_in, memory.v_in
-        assert k_in is not None and v_in is not None
     else:  # self-attention: one input for Q and K
-        k_in, v_in = input_scale("k", even["q"], even["k"]), input_scale("v", even["v"])
-        part.k_in, part.v_in = k_in, v_in
+        k_in, v_in = part.k_in, part.v_in = input_scale("k", even["q"], even["k"]), input_scale("v", even["v"])
     o_in = input_scale("o", even["o"])
     if part.constant_q is not None:
         part.constant_q = part.constant_q * out["k"]
@@ -99,22 +91,18 @@ def _scale_attention(name: str, part: Attention, memory: Memory, maxima: Maxima,
             q_in = part.q_in = input_scale("q", even["q"])
         _rescale(part.q, 1 / out["q"], 1 / q_in)
         part.q_out = out["q"] * out["k"]
-    _rescale(part.k, 1 / out["k"], 1 / k_in)
-    _rescale(part.v, 1 / out["v"], 1 / v_in)
-    part.v_out = out["v"] * o_in
-    _rescale(part.o, 1 / out["o"], 1 / o_in)
-    part.o_out = out["o"]
+    for p, columns in (("k", k_in), ("v", v_in), ("o", o_in)):
+        _rescale(getattr(part, p), 1 / out[p], 1 / columns)
+    part.v_out, part.o_out = out["v"] * o_in, out["o"]
 
 
 def _scale_feed_forward(name: str, part: FeedForward, maxima: Maxima, smooth: float) -> None:
     part.down_out = _output_scale(maxima[f"{name}.down"]["out_max"])
     middle = _input_scale(maxima[f"{name}.down"]["in_max"], [_matrix(part.down) / part.down_out[:, None]], smooth)
     _rescale(part.down, 1 / part.down_out, 1 / middle)
-    if isinstance(part.act, nn.ReLU):
-        rows = middle
-    else:
-        rows = torch.ones(len(middle))
-        part.down_in = middle
+    rows = middle
+    if not isinstance(part.act, nn.ReLU):
+        rows, part.down_in = torch.ones(len(middle)), middle
     part.up_in = _input_scale(maxima[f"{name}.up"]["in_max"], [_matrix(part.up) * rows[:, None]], smooth)
     _rescale(part.up, rows, 1 / part.up_in)
 

@@ -45,17 +45,11 @@ class Scheme:
         return cls(**{**stored, "float_blocks": tuple(stored["float_blocks"]), "wider": wider})
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("mode", self.mode, MODES),
-            ("kind", self.kind, tuple(KINDS)),
-            ("observer", self.observer, OBSERVERS),
-        ):
-            if value not in known:
-                raise ArtifactError(f"scheme: {name} {value!r} is not known", remedy=f"known are {list(known)}")
-        if self.smooth is not None and not 0 <= self.smooth <= 1:
-            raise ArtifactError("scheme: smooth must be in [0, 1]", found=self.smooth)
-        if not 50 < self.percentile <= 100:
-            raise ArtifactError("scheme: percentile must be in (50, 100]", found=self.percentile)
-        if not 0 < self.usual_pct <= 100 or any(not 0 <= share <= 1 for _, share in self.wider):
-            found = f"{self.usual_pct} and {[share for _, share in self.wider]}"
-            raise ArtifactError("scheme: usual_pct must be in (0, 100], shares of wider in [0, 1]", found=found)
+        known = {"mode": MODES, "kind": tuple(KINDS), "observer": OBSERVERS}
+        for name, values in known.items():
+            if (value := getattr(self, name)) not in values:
+                raise ArtifactError(f"scheme: {name} {value!r} is not known", remedy=f"known are {list(values)}")
+        shares = {"smooth": self.smooth or 0, "usual_pct": self.usual_pct / 100, **dict(self.wider)}
+        if not 50 < self.percentile <= 100 or not all(0 <= share <= 1 for share in shares.values()):
+            what = "scheme: percentile must be in (50, 100], usual_pct in [0, 100], smooth and wider in [0, 1]"
+            raise ArtifactError(what, found=f"{self.percentile} and {shares}")

@@ -53,29 +53,25 @@ class Names:
 
     @property
     def name(self) -> str:
-        return self.run.rstrip("/").rpartition("/")[2]
+        return Path(self.run).name
 
     def artifact(self, mode: str) -> str:
         return f"{self.run.rstrip('/')}/policy_{mode}.pt"
 
-    def distill(self, *options: str, name: str) -> str:
-        """A `rover distill` command on the same files, with the name of what it makes."""
-        return shlex.join(["rover", "distill", self.checkpoint, self.episodes, *options, "--name", name])
+    def distill(self, *options: str, kind: str) -> str:
+        """A `rover distill` command on the same files. kind: what is added to the name of what it makes."""
+        made = f"{self.name}-{kind}"
+        return shlex.join(["rover", "distill", self.checkpoint, self.episodes, *options, "--name", made])
 
 
 def gate_in_words(gate: str) -> str:
-    """Return any gate's name as people read it: of a comparison, a benchmark, a drive, a count or a student.
-
-    A name that is already in words stays as it is.
-    """
+    """Return any gate's name as people read it; a name that is already in words stays as it is."""
     subject, _, key = gate.removeprefix("policy_").partition(" ")
     mode = subject.partition("_")[0].partition(".")[0]
     if mode in CALLED and key:
         gate = f"{subject.replace(mode, CALLED[mode], 1)}: {key}"
-    for known, words in PHRASES.items():
-        if known in gate:
-            gate = gate.replace(known, words)
-            break
+    for known in [known for known in PHRASES if known in gate][:1]:
+        gate = gate.replace(known, PHRASES[known])
     return gate.replace("_", " ")
 
 
@@ -126,7 +122,7 @@ def list_remedies(
         gate=gate,
         key=key,
         smaller=_smaller(stages, names),
-        qat=_qat(names),
+        qat=names.distill("--qat", kind="qat"),
         mixed=rows.get("mixed", {}),
         most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
         odd=quantized.get("odd"),
@@ -136,16 +132,8 @@ def list_remedies(
     )
 
 
-def _qat(names: Names) -> str:
-    return names.distill("--qat", name=f"{names.name}-qat")
-
-
 def _smaller(stages: Stages, names: Names) -> str:
-    """Return a `rover distill` command for a smaller policy.
-
-    It halves the picture's sides if they are known, and asks for two decoder layers if there are more. If neither
-    applies, it asks for a narrower feed-forward layer.
-    """
+    """Return a `rover distill` command for half the picture's sides and two decoder layers, or a narrower policy."""
     report = stages["load"]["checkpoint"]
     config = report.get("trainer_config") or {}
     width, height = config.get("image_width"), config.get("image_height")
@@ -153,15 +141,14 @@ def _smaller(stages: Stages, names: Names) -> str:
     layers = len({block.split(".")[1] for block in report["macs_by_block"] if block.startswith("decoder.")})
     if layers > 2:
         shape += ["--decoder-layers", "2"]
-    return names.distill(*(shape or ["--feedforward", "1600"]), name=f"{names.name}-small")
+    return names.distill(*(shape or ["--feedforward", "1600"]), kind="small")
 
 
 def list_cautions(
     stages: Stages, params: Mapping[str, Any], judged: Mapping[str, Any], best: Mapping[str, Any], busy: str
 ) -> list[str]:
-    """Say what weakens the verdict, such as numbers that do not fit, too few recordings, no trial drives, or times that
-    were not measured on a Pi: cautions.txt. best: the row of the mode that the rule takes. busy: what shows that the
-    machine was.
+    """Say what weakens the verdict: cautions.txt. best: the row of the mode that the rule takes. busy: what shows that
+    the machine was.
     """
     load, compared, quantized = stages["load"], stages["compare"], stages["quantize"]
     told = [stage.get("warnings", []) for stage in (compared, quantized)]
@@ -195,13 +182,11 @@ def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names
     if set(judged["refused"]) - set(MAY_DIFFER):
         commands.append((shlex.join(["rover", "benchmark", artifact]), "how long a plan takes, on any machine"))
     elif deploy is None:
+        inspect = shlex.join(["rover", "inspect", names.episodes])
         commands += [
             (notebooks, "look at notebook 01, what the car saw, and 04, what it plans"),
             ("rover record --max-seconds 30 episodes", "more drives, with corrections; on the car"),
-            (
-                shlex.join(["rover", "inspect", names.episodes]),
-                "what is in the recordings, and what is wrong with them",
-            ),
+            (inspect, "what is in the recordings, and what is wrong with them"),
         ]
     else:
         commands += _to_drive(judged, stages, names, artifact)
@@ -230,5 +215,8 @@ def _to_drive(judged: Mapping[str, Any], stages: Stages, names: Names, artifact:
         name = f"{names.name}-qat"
         left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"
         run = shlex.join(["rover", "run", f"runs/{name}/{left}", names.episodes, "--name", name])
-        commands += [(_qat(names), "train static INT8 to keep its gates"), (run, "and judge that")]
+        commands += [
+            (names.distill("--qat", kind="qat"), "train static INT8 to keep its gates"),
+            (run, "and judge that"),
+        ]
     return commands

@@ -50,16 +50,14 @@ class Looking:
 
     def table(self) -> Table:
         """Return the changes as a table for people."""
-        found, rows = self.summary(), []
-        for action in self.report.action_names:
-            pct = (format_pct(found[f"{action}_{name}_pct"]).strip() for name in ("by_picture", "by_state", "apart"))
-            rows.append((action, *pct))
+        moves = self.by_picture, self.by_state, self.apart
+        rows = [(a, *(self._pct(moved, i) for moved in moves)) for i, a in enumerate(self.report.action_names)]
         return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
-        units = [(i, a, self.report.pct(a)) for i, a in enumerate(self.report.action_names)]
-        judged = [(i, a, pct) for i, a, pct in units if pct is not None]
+        names = enumerate(self.report.action_names)
+        judged = [(i, a, pct) for i, a in names if (pct := self.report.pct(a)) is not None]
         if judged and all(self.apart[i] * pct < FLOOR_PCT for i, _, pct in judged):
             return ["this policy plans the same whatever it is shown, do not drive it"]
         blind = [(i, a) for i, a, pct in judged if not follows(self.by_picture[i] * pct, self.apart[i] * pct)]
@@ -68,13 +66,14 @@ class Looking:
         return [f"{action} hardly follows the camera: {self._moves([(i, action)])}" for i, action in blind]
 
     def _moves(self, actions: list[tuple[int, str]]) -> str:
-        def pct(moved: np.ndarray, i: int, action: str) -> str:
-            return format_pct(self.report.in_pct(float(moved[i]), action)).strip()
+        told = []
+        for i, a in actions:
+            by_picture, by_state = self._pct(self.by_picture, i), self._pct(self.by_state, i)
+            told.append(f"another picture moves {a} by {by_picture}, another state by {by_state}")
+        return ", ".join(told)
 
-        return ", ".join(
-            f"another picture moves {a} by {pct(self.by_picture, i, a)}, another state by {pct(self.by_state, i, a)}"
-            for i, a in actions
-        )
+    def _pct(self, moved: np.ndarray, i: int) -> str:
+        return format_pct(self.report.in_pct(float(moved[i]), self.report.action_names[i])).strip()
 
 
 def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress = silent) -> Looking:

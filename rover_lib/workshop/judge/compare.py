@@ -6,9 +6,8 @@
 
 Errors are absolute differences to the FP32 artifact, never to the recorded action: how well the policy
 imitates is another question, whose answer (`recorded_error`) is given beside it as a yardstick.
-Padding: a sample near its episode's end has fewer recorded actions than a chunk is long. Both policies plan
-the whole chunk all the same and the car would drive it, so every step counts in `mae`; `mae_recorded_steps`
-counts only the steps that were recorded, and the error against the recording knows no others.
+Padding: a sample near its episode's end has fewer recorded actions than a chunk is long. The car would drive the whole
+chunk all the same, so every step counts in `mae`; `mae_recorded_steps` and `recorded_error` count recorded steps only.
 An action that never changes in the recordings has no range to be a share of: it is not judged (see judge).
 """
 
@@ -43,7 +42,7 @@ RELATIONS = {"<=": operator.le, ">=": operator.ge}
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a policy saw somewhere else than in a recording, say in a driven world. state: (S,) float32."""
+    """What a policy saw in a driven world. state: (S,) float32."""
 
     frame: np.ndarray  # (h, w, 3) uint8 BGR
     state: np.ndarray
@@ -88,10 +87,7 @@ class Fidelity:
         return np.abs(self.chunks[mode].astype(np.float64) - self.reference)
 
     def spread(self) -> np.ndarray:
-        """(A,) float64: how far FP32's plans lie from their mean plan, as a mean over frames and steps.
-
-        It is the unit in which an error cannot be small only because all plans are nearly the same.
-        """
+        """(A,) float64: how far FP32's plans lie from their mean plan, as a mean over frames and steps."""
         reference = self.reference.astype(np.float64)
         return np.abs(reference - reference.mean(0)).mean((0, 1))
 
@@ -116,30 +112,26 @@ class Fidelity:
         except CarError:
             return math.nan
 
-    def warnings(self) -> list[str]:
-        """A sentence for each action that is not judged; its percentages are None."""
-        return judge.not_judged(self.action_range)
-
     def summary(self, mode: str) -> dict[str, Any]:
         """Everything about one mode, keys by action name and unit; percentages of an action not judged are None."""
         summary: dict[str, Any] = {}
         errors, spread = self.errors(mode), self.spread()
         for i, action in enumerate(self.action_names):
             e, us = errors[..., i], self.us(action)
-            summary[f"{action}_mae_pct"] = self.in_pct(e.mean(), action)
+            tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
+            found = {"mae": e.mean(), "p95": np.quantile(e, 0.95), "max": e.max()}
+            only_pct = {
+                "worst_tenth": tenth.mean(),
+                "mae_recorded_steps": e[~self.is_pad].mean(),
+                "mae_per_step": e.mean(0),
+            }
+            for name, error in (found | only_pct).items():
+                summary[f"{action}_{name}_pct"] = self.in_pct(error, action)
             # Of plans that are all the same, no error is a share.
             judged = self.pct(action) is not None and spread[i] > 0
             summary[f"{action}_of_spread_pct"] = 100 * e.mean() / spread[i] if judged else None
-            tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
-            summary[f"{action}_worst_tenth_pct"] = self.in_pct(tenth.mean(), action)
-            summary[f"{action}_p95_pct"] = self.in_pct(np.quantile(e, 0.95), action)
-            summary[f"{action}_max_pct"] = self.in_pct(e.max(), action)
-            summary[f"{action}_mae_recorded_steps_pct"] = self.in_pct(e[~self.is_pad].mean(), action)
-            summary[f"{action}_mae_per_step_pct"] = self.in_pct(e.mean(0), action)
             if math.isfinite(us):
-                summary[f"{action}_mae_us"] = e.mean() * us
-                summary[f"{action}_p95_us"] = np.quantile(e, 0.95) * us
-                summary[f"{action}_max_us"] = e.max() * us
+                summary |= {f"{action}_{name}_us": error * us for name, error in found.items()}
         return summary | self.recorded_error(self.chunks[mode])
 
     def recorded_error(self, chunks: np.ndarray) -> dict[str, float | None]:
@@ -154,28 +146,24 @@ class Fidelity:
         units = {i: pct for i, a in enumerate(self.action_names) if (pct := self.pct(a)) is not None}
         if not units:
             return []
-        judged = list(units)
-        per_frame = self.errors(mode).mean(1)[:, judged] * list(units.values())  # (n, judged actions)
-        order = np.argsort(-per_frame.max(1), kind="stable")[:count]
+        per_frame = self.errors(mode).mean(1)[:, list(units)] * list(units.values())  # (n, judged actions)
         found = []
-        for i in order:
-            action, error_pct = self.action_names[judged[int(per_frame[i].argmax())]], float(per_frame[i].max())
+        for i in np.argsort(-per_frame.max(1), kind="stable")[:count]:
+            action = self.action_names[list(units)[int(per_frame[i].argmax())]]
             plans = self.reference[i], self.chunks[mode][i]
-            found.append(WorstFrame(mode, action, int(i), error_pct, self.samples[i], *plans))
+            found.append(WorstFrame(mode, action, int(i), float(per_frame[i].max()), self.samples[i], *plans))
         return found
 
 
 class LerobotEager:
-    """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface: where a policy comes from, and the
-    yardstick of its speed. Downloads nothing.
+    """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface. Downloads nothing.
 
     car: the one whose actions it plans; None: this machine's.
     """
 
     def __init__(self, checkpoint: Checkpoint, car: Car | None = None):
-        c = checkpoint.config
-        self.config, self.chunk = c, c.chunk
-        self.action_names, self.state_names = c.action_names, c.state_names
+        c = self.config = checkpoint.config
+        self.chunk, self.action_names, self.state_names = c.chunk, c.action_names, c.state_names
         self._policy = lerobot_act(c, checkpoint.weights).eval()
         self.car = car or this_car()
         self._low, self._high = action_limits(c.action_names, self.car)
@@ -238,9 +226,8 @@ def fidelity(
     """Run every policy on every sample.
 
     reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names; the reference
-    also has car.
-    samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
-    action_range: name -> (least, most). progress: of the samples.
+    also has car. samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
+    action_range: name -> (least, most).
     Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
     """
     names = tuple(reference.action_names)
@@ -252,12 +239,11 @@ def fidelity(
             raise PolicyError(what, remedy="compare artifacts of one checkpoint")
     if missing := [n for n in names if n not in action_range]:
         raise PolicyError(f"no recorded range of action {missing}", remedy="use other recordings")
-    expected: list[np.ndarray] = []
-    planned: dict[str, list[np.ndarray]] = {mode: [] for mode in others}
+    policies = {"": reference, **others}
+    planned: dict[str, list[np.ndarray]] = {mode: [] for mode in policies}
     for sample in progress(samples, desc="comparing", total=len(samples)):
         frame = sample.frame_bgr()
-        expected.append(reference.predict_chunk(frame, sample.state))
-        for mode, policy in others.items():
+        for mode, policy in policies.items():
             planned[mode].append(policy.predict_chunk(frame, sample.state))
     recorded = all(getattr(s, "chunk", None) is not None for s in samples)
     pads = [s.is_pad for s in samples] if recorded else np.zeros((len(samples), reference.chunk), bool)
@@ -265,7 +251,7 @@ def fidelity(
         action_names=names,
         action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
         samples=tuple(samples),
-        reference=np.stack(expected),
+        reference=np.stack(planned.pop("")),
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
         recorded=np.stack([s.chunk for s in samples]) if recorded else None,
         is_pad=np.asarray(pads, bool),
@@ -285,12 +271,11 @@ def metrics(
     wilson); modes that were not driven have None, not 0. on_drives: fidelity on the frames of those drives.
     Sizes are artifact files on both sides, weights with weights: no optimizer state, no training-only part.
     """
-    trials = trials or {}
-
-    def common(mode: str) -> dict[str, Any]:
-        trial = trials.get(mode)
+    own = {}
+    for mode in ("fp32", *report.chunks):
+        trial = (trials or {}).get(mode)
         low, high = trial.wilson if trial else (None, None)
-        return {
+        own[mode] = {
             "hits": trial.hits if trial else None,
             "trials": trial.trials if trial else None,
             "hits_wilson_low": low,
@@ -298,18 +283,16 @@ def metrics(
             "size_mb": policies[mode].path.stat().st_size / 1e6,
             "weights_mb": policies[mode].manifest["weights_mb"],
         }
-
-    modes = {}
-    for mode in report.chunks:
-        modes[mode] = common(mode) | report.summary(mode)
-        modes[mode]["size_ratio"] = common("fp32")["size_mb"] / modes[mode]["size_mb"]
+    fp32, modes = own.pop("fp32"), {}
+    for mode, found in own.items():
+        modes[mode] = found | report.summary(mode) | {"size_ratio": fp32["size_mb"] / found["size_mb"]}
         if on_drives is not None:
             modes[mode]["driven"] = on_drives.summary(mode)
     return {
-        "fp32": common("fp32") | report.recorded_error(report.reference),
+        "fp32": fp32 | report.recorded_error(report.reference),
         "modes": modes,
         "action_range": report.action_range,
-        "warnings": report.warnings(),
+        "warnings": judge.not_judged(report.action_range),
         "frames": len(report.samples),
         "padded_steps_pct": 100 * report.is_pad.mean(),
         "driven_frames": len(on_drives.samples) if on_drives else 0,
@@ -318,15 +301,9 @@ def metrics(
 
 
 def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
-    return {
-        "mode": worst.mode,
-        "action": worst.action,
-        "error_pct": worst.error_pct,
-        "episode": getattr(worst.sample, "episode", None),
-        "frame": getattr(worst.sample, "frame_name", None),
-        "fp32": worst.reference,
-        "int8": worst.other,
-    }
+    sample = {"episode": getattr(worst.sample, "episode", None), "frame": getattr(worst.sample, "frame_name", None)}
+    found = {"mode": worst.mode, "action": worst.action, "error_pct": worst.error_pct}
+    return found | sample | {"fp32": worst.reference, "int8": worst.other}
 
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
@@ -346,11 +323,10 @@ def hits_needed(limits: Mapping[str, Any], trials: int | None) -> int:
 def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
     """The gates of params.yml that a comparison can judge. compared: `metrics`; limits: params.yml's `gates`.
 
-    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`. Those of
-    speed are `onboard.care.limits.check_gates`.
+    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`.
     """
-    fp32, judged = compared["fp32"], compared["modes"][mode]
-    original, size_mb = limits["original"], judged["size_mb"]
+    fp32, judged, original = compared["fp32"], compared["modes"][mode], limits["original"]
+    size_mb = judged["size_mb"]
     errors = [key for key in judged if key.endswith("_mae_pct")]
     spreads = [key for key in judged if key.endswith("_of_spread_pct") and judged[key] is not None]
     lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]

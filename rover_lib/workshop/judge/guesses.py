@@ -29,7 +29,7 @@ SURE_PCT = 95
 class Guess:
     """One guess: its error by action, and by how much the policy is better: the mean, and the ends of the interval.
 
-    All in percent of the recorded range. The interval has SURE_PCT % of the draws. beaten: by the policy.
+    All in percent of the recorded range. The interval has SURE_PCT % of the draws.
     """
 
     name: str
@@ -94,10 +94,11 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     # At a step that no plan reaches, the last one that was reached stands.
     steps = np.ma.masked_array(acted, np.broadcast_to(pads[..., None], acted.shape)).mean(0).filled(every.mean(0))
 
+    judged = [i for i, a in enumerate(report.action_names) if a in units]
+
     def errors_of(plans: np.ndarray) -> np.ndarray:
         """(n, judged actions): each frame's mean error over its recorded steps, in percent of the recorded range."""
         e = np.abs(plans.astype(np.float64) - recorded) * known[..., None]
-        judged = [i for i, a in enumerate(report.action_names) if a in units]
         return (e.sum(1) / known.sum(1)[:, None])[:, judged] * list(units.values())
 
     own = errors_of(report.reference)
@@ -114,27 +115,24 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     for name, errors in found.items():
         gain = (errors - own).mean(1)
         sums = np.array([gain[p].sum() for p in pieces])
-        low, high = np.percentile(
-            sums[draws].sum(1) / counts[draws].sum(1), [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]
-        )
-        means = dict(zip(units, errors.mean(0).tolist(), strict=True))
-        beaten = bool(low > 0 and all(own_pct[action] < mean for action, mean in means.items()))
-        guesses.append(Guess(name, means, float(gain.mean()), float(low), float(high), beaten))
+        means = sums[draws].sum(1) / counts[draws].sum(1)
+        low, high = np.percentile(means, [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]).tolist()
+        errors_pct = dict(zip(units, errors.mean(0).tolist(), strict=True))
+        beaten = low > 0 and all(own_pct[action] < error for action, error in errors_pct.items())
+        guesses.append(Guess(name, errors_pct, float(gain.mean()), low, high, beaten))
     return Judged(own_pct, tuple(guesses), drawn)
 
 
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
     """Return what is drawn from, in words, and for each piece the numbers of its frames."""
-    episodes = [np.array(list(rows)) for _, rows in groupby(range(len(report.samples)), _episode_of(report.samples))]
+    samples = report.samples
+    groups = groupby(range(len(samples)), lambda row: samples[row].episode)
+    episodes = [np.array(list(rows)) for _, rows in groups]
     if len(episodes) >= LEAST_EPISODES:
         return f"{len(episodes)} episodes", episodes
     chunk = report.reference.shape[1]
     pieces = []
     for rows in episodes:
-        numbers = [report.samples[row].row // chunk for row in rows]
+        numbers = [samples[row].row // chunk for row in rows]
         pieces += [rows[np.array(numbers) == n] for n in dict.fromkeys(numbers)]
     return f"{len(pieces)} pieces of {len(episodes)} episode{'s' if len(episodes) > 1 else ''}", pieces
-
-
-def _episode_of(samples: Sequence[Sample]):
-    return lambda row: samples[row].episode

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.notebook_table import Table
@@ -27,8 +26,7 @@ NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows tempera
 class Benchmarks:
     """by_host: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each bad file.
 
-    Artifacts are named by their mode. A rover's artifact that is not byte for byte the run's is called "static,
-    another".
+    Artifacts are named by their mode, one that is not byte for byte the run's "static, another".
     """
 
     by_host: dict[str, dict[str, Any]]
@@ -41,7 +39,7 @@ class Benchmarks:
     def beside_clock(self, policies: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Rovers' own static artifacts, as rows of the clock's policies with `host` and `measured_ms`, the p50.
 
-        policies: those of clock.json. One is the rover's if it has as many multiply-accumulates, to 1 %, and threads.
+        policies: those of clock.json. One is the rover's if it has its multiply-accumulates, to 1 %, and threads.
         """
         rows = []
         for host, b in self.by_host.items():
@@ -56,7 +54,7 @@ class Benchmarks:
     def table(self) -> Table:
         """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
         header = ("host", "artifact", "p50 ms", "p95 ms", "p99 ms", "n", "C, most", "MHz, least", "throttled")
-        rows, notes = [], []
+        rows = []
         for host, b in self.by_host.items():
             m = b["metrics"]
             state = (_shown(m.get("temperature_c"), 1), _shown(m.get("clock_mhz"), 0), m.get("throttled") or "-")
@@ -64,14 +62,10 @@ class Benchmarks:
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
                 rows.append((host, name, *times, str(v["n"]), *state))
                 host, state = "", ("", "", "")  # shown only once for each host
+        notes = [f"left out: {sentence}" for sentence in self.unusable]
         rovers = self.by_host.keys() - {THIS}
-        if not rovers:
-            notes.append(NO_ROVER)
-        elif not rovers & self.soaks().keys():
-            notes.append(NO_SOAK)
-        if self.unusable:
-            count = len(self.unusable)
-            notes += [f"{count} {'files are' if count > 1 else 'file is'} left out:", *self.unusable]
+        if not rovers & self.soaks().keys():
+            notes.insert(0, NO_SOAK if rovers else NO_ROVER)
         return Table(header, rows, notes=notes)
 
 
@@ -83,8 +77,7 @@ def read_clock() -> dict[str, Any] | None:
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
     """Read all benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers.
 
-    A rover is named as in the inventory; the name is part of the file's name. If two benchmarks have the same name, the
-    fetched one is used. A file that cannot be used is left out and reported in `unusable`.
+    A rover is named as in the inventory, by the file's name. Of two with one name, the fetched one is used.
     """
     by_host: dict[str, dict[str, Any]] = {}
     unusable: list[str] = []
@@ -92,7 +85,8 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
         for path in sorted(folder.glob("benchmark-*.json")):
             try:
                 content = read_stage(path, "benchmark")
-                _check(path, content)
+                if content["metrics"].get("main") not in content["metrics"].get("artifacts", ()):
+                    raise RoverError(f"{path}: no figures of a benchmark in it", remedy="fetch it again")
             except RoverError as error:
                 unusable.append(str(error).replace(str(path), path.name))
                 continue
@@ -106,8 +100,7 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
 def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> Path | None:
     """Return the benchmark of a run's own artifacts, preferably of this machine; None if there is none.
 
-    made: quantize.json's modes. A run that is made again keeps the benchmarks of other hosts, which measured its
-    earlier artifacts. Raises RoverError for a damaged file.
+    made: quantize.json's modes. Others there measured earlier artifacts. Raises RoverError for a damaged file.
     """
     paths = sorted(Path(run_dir).glob("benchmark-*.json"))
     for path in sorted(paths, key=lambda p: p.stem != f"benchmark-{socket.gethostname()}"):
@@ -123,25 +116,6 @@ def is_of(inputs: Mapping[str, str], made: Mapping[str, Mapping[str, Any]]) -> b
     return bool(named) and all(ours[file] == digest for file, digest in named.items())
 
 
-def _check(path: Path, content: Mapping[str, Any]) -> None:
-    """Raise RoverError unless the file has everything that tables and figures read."""
-    try:
-        metrics, env = content["metrics"], content["env"]
-        points = [metrics, *(metrics.get("series") or [])]
-        numbers = [env["cores"], *(p["t_s"] for p in points[1:])]
-        numbers += [v[key] for p in points for v in p["artifacts"].values() for key in ("latency_p50_ms", "n")]
-        numbers += [v[f"latency_{p}_ms"] for v in metrics["artifacts"].values() for p in ("p95", "p99")]
-        numbers += [p[key] for p in points for key in ("temperature_c", "clock_mhz") if p.get(key) is not None]
-        for p in points:
-            int(p.get("throttled") or "0x0", 16)
-        usable = metrics["main"] in metrics["artifacts"] and all(map(is_number, numbers))
-        usable &= all(isinstance(v, str) for v in (env["host"], env["machine"], *content["inputs"].values()))
-    except (KeyError, TypeError, ValueError, AttributeError):
-        usable = False
-    if not usable:
-        raise RoverError(f"{path}: no figures of a benchmark in it", remedy="fetch it again")
-
-
 def _mode(name: str) -> str:
     return Path(name).stem.removeprefix("policy_")
 
@@ -154,18 +128,14 @@ def _name_by_mode(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[s
     metrics = content["metrics"]
     names: dict[str, str] = {}
     for name, v in metrics["artifacts"].items():
-        sha = content["inputs"].get(f"{name}.pt")
-        called = ours[sha] if sha in ours else f"{v.get('mode') or _mode(name)}, another"
-        names[name] = name if called in names.values() else called
-    series = metrics.get("series") and [
-        {**p, "artifacts": {names.get(n, n): v for n, v in p["artifacts"].items()}} for p in metrics["series"]
-    ]
-    renamed = {
-        "artifacts": {names[n]: v for n, v in metrics["artifacts"].items()},
-        "main": names.get(metrics.get("main"), metrics.get("main")),
-        "series": series,
-    }
-    return {**content, "metrics": {**metrics, **renamed}}
+        mode = ours.get(content["inputs"].get(f"{name}.pt"), f"{v.get('mode') or _mode(name)}, another")
+        names[name] = name if mode in names.values() else mode
+
+    def renamed(point: Mapping[str, Any]) -> dict[str, Any]:
+        return {**point, "artifacts": {names.get(n, n): v for n, v in point["artifacts"].items()}}
+
+    series = [renamed(point) for point in metrics.get("series") or ()]
+    return {**content, "metrics": {**renamed(metrics), "main": names[metrics["main"]], "series": series}}
 
 
 def _shown(value: float | None, digits: int) -> str:

@@ -29,7 +29,7 @@ LARGEST_STATE = 10.0  # standard deviations; in wrong units there are hundreds
 
 @dataclass(frozen=True)
 class Action:
-    """One action's recorded and predicted range, how often predictions lie beyond it, and the ratio of the spreads.
+    """One action's recorded and predicted range, and the ratio of the predictions' spread to the recorded one.
 
     beyond_pct: percentage of predicted values that lie outside the recorded range by more than BEYOND of that range.
     """
@@ -57,26 +57,27 @@ class Fit:
 
     def table(self) -> Table:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
-        spans = (
-            (a.name, *(f"{low:.3g} to {high:.3g}" for low, high in (a.recorded, a.predicted))) for a in self.actions
-        )
-        return Table(("", "recorded", "predicted"), list(spans))
+        rows = [
+            (a.name, *("{:.3g} to {:.3g}".format(*ends) for ends in (a.recorded, a.predicted))) for a in self.actions
+        ]
+        return Table(("", "recorded", "predicted"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit."""
-        remedy = "are these the recordings, and the statistics, that it was trained with?"
-        warnings = []
+        found = []
         for a in self.actions:
             if a.beyond_pct > MOST_BEYOND_PCT:
-                what = f"{a.beyond_pct:.0f} % of its predictions are far outside of what was recorded"
-                warnings.append(f"{a.name}: {what} ({a.predicted[0]:.3g} to {a.predicted[1]:.3g}); {remedy}")
+                ends = f"({a.predicted[0]:.3g} to {a.predicted[1]:.3g})"
+                found.append(
+                    f"{a.name}: {a.beyond_pct:.0f} % of its predictions are far outside of what was recorded {ends}"
+                )
             elif a.spread < LEAST_SPREAD:
-                what = f"its predictions vary {100 * a.spread:.0f} % as much as what was recorded"
-                warnings.append(f"{a.name}: {what}; {remedy}")
+                found.append(f"{a.name}: its predictions vary {100 * a.spread:.0f} % as much as what was recorded")
         for name, largest in (self.largest_state or {}).items():
             if not largest <= LARGEST_STATE:
-                what = f"the policy is told up to {largest:.3g} standard deviations"
-                warnings.append(f"state {name}: {what}; {remedy}")
+                found.append(f"state {name}: the policy is told up to {largest:.3g} standard deviations")
+        remedy = "are these the recordings, and the statistics, that it was trained with?"
+        warnings = [f"{what}; {remedy}" for what in found]
         if self.other_rates_hz:
             episode, found_hz = next(iter(self.other_rates_hz.items()))
             others = f" and {len(self.other_rates_hz) - 1} more" if len(self.other_rates_hz) > 1 else ""
@@ -86,10 +87,9 @@ class Fit:
 
     def summary(self) -> dict[str, Any]:
         """The same values as plain JSON types, for load.json."""
-        actions = {
-            a.name: {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
-            for a in self.actions
-        }
+        actions = {}
+        for a in self.actions:
+            actions[a.name] = {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
         return {"frames": self.frames, "actions": actions, "warnings": self.warnings()}
 
 
@@ -116,9 +116,9 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     if (norm := config.state_norm) is not None:
         states = np.stack([s.state for s in samples]) * np.asarray(norm.scale) + np.asarray(norm.shift)
         largest = dict(zip(config.state_names, np.abs(states).max(0).tolist(), strict=True))
-    return Fit(len(few), tuple(actions), largest, config.rate_hz, _other_rates_hz(samples, config.rate_hz))
-
-
-def _other_rates_hz(samples: Sequence[Sample], plans_hz: float) -> dict[str, float]:
-    rates = {name: frame_rate_hz(list(episode)) for name, episode in groupby(samples, key=lambda s: s.episode)}
-    return {name: found for name, found in rates.items() if found is not None and is_another_rate(found, plans_hz)}
+    others_hz = {}
+    for name, episode in groupby(samples, key=lambda s: s.episode):
+        found_hz = frame_rate_hz(list(episode))
+        if found_hz is not None and is_another_rate(found_hz, config.rate_hz):
+            others_hz[name] = found_hz
+    return Fit(len(few), tuple(actions), largest, config.rate_hz, others_hz)

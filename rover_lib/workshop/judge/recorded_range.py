@@ -30,10 +30,8 @@ def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
 
 def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     """A warning for each action that never changes in the recordings."""
-    return [
-        f"{name} never changes in these recordings, so its error has no range to be a share of and is not judged"
-        for name in constant_actions(action_range)
-    ]
+    why = "never changes in these recordings, so its error has no range to be a share of and is not judged"
+    return [f"{name} {why}" for name in constant_actions(action_range)]
 
 
 def follows(moved_pct: float, apart_pct: float) -> bool:

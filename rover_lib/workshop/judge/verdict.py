@@ -30,40 +30,39 @@ def verdict(
 
     stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and students if they were made.
     params: the content of params.yml. refusals: by mode, what a rover would refuse its artifact for, as
-    `release.Expected.refusals`. "ready" in the result: whether the policy drives; "deploy" is None if no artifact of it
-    should drive this car.
+    `Expected.refusals`. "ready" in the result: whether the policy drives; "deploy" is None if no artifact of it should
+    drive this car.
     """
+    limits, benchmark = params["verdict"], stages["benchmark"]
     rows = _rows(stages, params)
     failed = _list_failures(stages, params, names, rows)
     unfit = _list_unfit(stages, failed)
-    best = _best(list(rows.values()), params["verdict"])
+    best = _best(list(rows.values()), limits)
     slow = {} if best["mode"] in ("static", "mixed") else {"mode": "it is slow"}
     refused = (refusals or {}).get(best["mode"], slow)
-    other_robot = set(refused) - set(MAY_DIFFER)
+    other_robot = [kind for kind in refused if kind not in MAY_DIFFER]
     deploy = None if unfit or other_robot else best["mode"]
     for row in rows.values():
-        row["because"] = _because(row, best, params["verdict"])
+        row["because"] = _because(row, best, limits)
     if deploy is None:
         best["because"] = "the best of them"
     why = unfit or _why(best, rows["fp32"])
     if other_robot:
         robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
-        why.append(
-            f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in refused if kind in other_robot)}."
-        )
-    timing, busy = _timing(rows), _busy(stages["benchmark"], params["verdict"])
+        why.append(f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in other_robot)}.")
+    work = _work_key(_candidates(rows.values()))  # where the figures of speed come from
     judged = {
         "ready": not unfit,
         "deploy": deploy,
         "artifact": None if deploy is None else f"policy_{deploy}.pt",
         "why": why,
         "refused": dict(refused),
-        "timing": timing,
-        "compared": "least ms" if time_key(stages["benchmark"], params["verdict"]) == "latency_min_ms" else "p50 ms",
+        "timing": {"instructions_g": COUNTED, "time_ms": "measured here", None: "not measured"}[work],
+        "compared": "least ms" if time_key(benchmark, limits) == "latency_min_ms" else "p50 ms",
         "modes": list(rows.values()),
         "failed": failed,
     }
-    judged["cautions"] = advice.list_cautions(stages, params, judged, best, busy)
+    judged["cautions"] = advice.list_cautions(stages, params, judged, best, _busy(benchmark, limits))
     return judged | {"next": advice.list_next(judged, best["mode"], stages, names)}
 
 
@@ -98,32 +97,25 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
         }
     static, mixed = rows.get("static"), rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
-        # It does the same work and some of it in float, so that its shorter time is chance.
-        mixed["not_timed"] = (
-            f"its {mixed['time_ms']:.1f} ms are within the noise of static's time, which is used for it"
-        )
-        mixed |= {"time_ms": static["time_ms"], "times_faster": static["times_faster"]}
+        # It does the same work and some of it in float: its shorter time is chance.
+        noise = f"its {mixed['time_ms']:.1f} ms are within the noise of static's time, which is used for it"
+        mixed |= {"not_timed": noise, "time_ms": static["time_ms"], "times_faster": static["times_faster"]}
     return rows
 
 
 def _list_missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
-    """Return the gates that a mode misses, each once.
-
-    The original's general gates of accuracy and size are left out if a gate of our own for the same thing is missed.
-    """
+    """Return the gates that a mode misses, each once: the original's are left out where our own is missed too."""
     rows = [r for r in gates(compared, limits, mode) if r["passed"] is False and r["gate"].startswith(f"{mode} ")]
-    keys = {r["gate"].partition(" ")[2] for r in rows}
-    doubled = {"accuracy_loss_pct"} if any(k.endswith("_mae_pct") for k in keys) else set()
-    doubled |= {"model_size_mb"} if "size_mb" in keys else set()
-    return [_with_words(r) for r in rows if r["gate"].partition(" ")[2] not in doubled]
+    keys = " ".join(r["gate"] for r in rows)
+    doubled = {"accuracy_loss_pct": "_mae_pct", "model_size_mb": " size_mb"}
+    return [_with_words(r) for r in rows if doubled.get(r["gate"].partition(" ")[2], "no gate") not in keys]
 
 
 def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
     """Return the row that the rule takes. FP32 has no gates to miss, so there always is one."""
     same = 1 + limits["worth_pct"] / 100
     left = _candidates(rows)
-    key = _work_key(left)
-    if key:
+    if key := _work_key(left):
         fastest = min(row[key] for row in left)
         left = [row for row in left if row[key] <= fastest * same]
     truest = min(error_pct(row) for row in left)
@@ -134,7 +126,7 @@ def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str
 
 
 def _candidates(rows: Iterable[Mapping[str, Any]]) -> list[Any]:
-    """Return the modes that keep their gates, but not a mixed one with no block in float: that is static INT8 again."""
+    """Return the modes that keep their gates. A mixed one with no block in float is static INT8 again, and left out."""
     return [row for row in rows if not row["missed_gates"] and (row["mode"] != "mixed" or row["float_blocks"])]
 
 
@@ -143,17 +135,10 @@ def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
     return next((k for k in ("instructions_g", "time_ms") if all(row[k] for row in rows)), None)
 
 
-def _timing(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Say where the figures of speed come from."""
-    key = _work_key(_candidates(rows.values()))
-    return {"instructions_g": COUNTED, "time_ms": "measured here", None: "not measured"}[key]
-
-
 def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Return which time of a mode is compared: the median, or the smallest if the machine was busy with other things.
 
-    INT8's engine waits for all its threads at each layer, so another process that takes part of a core can make its
-    median slower than FP32's.
+    INT8's threads wait for each other at each layer, so another process can make its median slower than FP32's.
     """
     least = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
     return "latency_min_ms" if least and _busy(benchmark, limits) else "latency_p50_ms"
@@ -175,7 +160,6 @@ def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
 
 
 def _with_words(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row of `compare.gates` with its gate in words added."""
     return {**row, "words": gate_in_words(row["gate"])}
 
 
@@ -201,8 +185,10 @@ def _list_failures(
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared, lines = stages["compare"], []
-    unbeaten = compared.get("guesses", {}).get("warnings", [])
-    for warning in (*unbeaten, *stages["load"].get("fit", {}).get("warnings", [])):
+    for warning in (
+        *compared.get("guesses", {}).get("warnings", []),
+        *stages["load"].get("fit", {}).get("warnings", []),
+    ):
         lines.append(f"{warning[0].upper()}{warning[1:]}{'' if warning.endswith('?') else '.'}")
     looking = compared.get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
@@ -237,9 +223,9 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
         counts = f"{best['instructions_g']:.3g} G instructions instead of {fp32['instructions_g']:.3g}"
         size += f", and needs {counts} ({COUNTED})"
     elif best["times_faster"]:
-        times = f"{best['time_ms']:.1f} ms instead of {fp32['time_ms']:.1f}"
         which = "p50" if best["time_ms"] == best["latency_p50_ms"] else "the least of each"
-        size += f", and {best['times_faster']:.1f} times as fast ({times}, {which}, measured here)"
+        times = f"{best['time_ms']:.1f} ms instead of {fp32['time_ms']:.1f}, {which}, measured here"
+        size += f", and {best['times_faster']:.1f} times as fast ({times})"
     return [*lines, f"{size}."]
 
 

@@ -20,10 +20,7 @@ def sizes(metrics: Mapping[str, Any]) -> Figure:
     fig, axes = new_figure(1, height_in=1.3 + 0.34 * len(sizes_mb))
     ax = axes[0, 0]
     ax.barh(range(len(sizes_mb)), list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
-    for at, size_mb in enumerate(sizes_mb.values()):
-        text = f"{size_mb:.1f} MB" + (f", {sizes_mb['fp32'] / size_mb:.1f}x smaller" if at else "")
-        ax.annotate(text, (size_mb, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
-    ax.margins(x=0.25)
+    style.bar_values(ax, range(len(sizes_mb)), sizes_mb.values(), "{:.1f} MB")
     style.name_rows(ax, sizes_mb)
     ax.set_xlabel("artifact file (MB, 10^6 bytes)")
     return fig

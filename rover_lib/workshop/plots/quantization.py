@@ -107,7 +107,6 @@ def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure
     lower.axhline(clipped_warn_pct, color=RED, ls="--", lw=1.2, label="warning")
     lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data")
     lower.set_ylim(0, 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows)))
-    for part, colour in (*style.PARTS.items(), ("image_project", GREY)):
-        lower.bar(0, 0, color=colour, label=part)
+    style.label_parts(lower, style.PARTS | {"image_project": GREY})
     legend_below(fig, lower, 5)
     return fig

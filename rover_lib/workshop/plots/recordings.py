@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from rover_lib.workshop.act import block_of
 from rover_lib.workshop.int8 import frames
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver
-from rover_lib.workshop.int8.scheme import OBSERVERS
 from rover_lib.workshop.plots import style
 from rover_lib.workshop.plots.style import BLUE, GREY, MIST, OTHERS, RED, SLATE, Note, legend, legend_below, new_figure
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
@@ -28,7 +27,6 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
         "optimizer state": (report["optimizer_mb"], OTHERS[1]),
         "everything else": (other_mb, GREY),
     }
-    rows = ["checkpoint file", "FP32, only what acts", "INT8, a byte per weight"]
     fig, axes = new_figure(1, height_in=3.1)
     ax, left = axes[0, 0], 0.0
     for name, (size_mb, colour) in parts.items():
@@ -37,7 +35,7 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
             left += size_mb
     ax.barh([1, 2], [acting_mb, report["int8_floor_mb"]], color=[SLATE, BLUE])
     style.bar_values(ax, range(3), [report["file_mb"], acting_mb, report["int8_floor_mb"]], "{:.1f} MB")
-    style.name_rows(ax, rows)
+    style.name_rows(ax, ["checkpoint file", "FP32, only what acts", "INT8, a byte per weight"])
     ax.set_xlabel("size (MB, 10^6 bytes)")
     legend(ax, loc="lower right")
     return fig
@@ -47,19 +45,12 @@ def work_per_block(parameters: Mapping[str, int], macs: Mapping[str, int]) -> Fi
     """Draw parameters and multiply-accumulates of every block, in the order in which data passes them."""
     blocks = [b for b in macs if macs[b] or parameters.get(b)]
     fig, axes = new_figure(1, 2, height_in=1.5 + 0.21 * len(blocks), sharey=True)
-    left, right = axes[0]
-    y = np.arange(len(blocks))
-    colours = style.part_colours(blocks)
-    left.barh(y, [parameters.get(b, 0) / 1e6 for b in blocks], color=colours)
-    right.barh(y, [macs[b] / 1e6 for b in blocks], color=colours)
-    style.name_rows(left, blocks)
-    left.set_xlabel(f"parameters (10^6), {sum(parameters.values()) / 1e6:.2f} in all")
-    right.set_xlabel(f"multiply-accumulates (10^6), {sum(macs.values()) / 1e6:.0f} in all")
-    left.set_title("what must be stored", fontsize=11)
-    right.set_title("what must be computed", fontsize=11)
-    for part, colour in style.PARTS.items():
-        right.barh(0, 0, color=colour, label=part)
-    legend(right, loc="lower right")
+    for ax, counts, what in zip(axes[0], (parameters, macs), ("parameters", "multiply-accumulates"), strict=True):
+        ax.barh(range(len(blocks)), [counts.get(b, 0) / 1e6 for b in blocks], color=style.part_colours(blocks))
+        ax.set_xlabel(f"{what} (10^6), {sum(counts.values()) / 1e6:.1f} in all")
+    style.name_rows(axes[0, 0], blocks)
+    style.label_parts(ax, style.PARTS)
+    legend(ax, loc="lower right")
     return fig
 
 
@@ -110,18 +101,18 @@ def faults(recordings: Recordings) -> Figure | Note:
     counted = recordings.faults_by_kind()
     bars = [(kind, count, handled) for handled, kinds in counted.items() for kind, count in kinds.items()]
     bars.sort(key=lambda bar: -bar[1])
+    kinds, counts, _ = zip(*bars, strict=True) if bars else ((), (), ())
     used = f"{len(recordings.episodes)} episodes give {len(recordings.samples)} samples"
     if not bars:
         return Note(f"{used}; no fault was found in them")
     colours = dict(zip(HANDLED, (BLUE, SLATE, OTHERS[1], RED), strict=True))
     fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(bars))
     ax = axes[0, 0]
-    ax.barh(range(len(bars)), [count for _, count, _ in bars], color=[colours[handled] for *_, handled in bars])
-    style.bar_values(ax, range(len(bars)), [count for _, count, _ in bars], "{:d}")
-    style.name_rows(ax, [kind.replace("_", " ") for kind, *_ in bars])
+    ax.barh(range(len(bars)), counts, color=[colours[handled] for *_, handled in bars])
+    style.bar_values(ax, range(len(bars)), counts, "{:d}")
+    style.name_rows(ax, [kind.replace("_", " ") for kind in kinds])
     ax.set_xlabel("times")
-    for handled in counted:
-        ax.barh(0, 0, color=colours[handled], label=handled)
+    style.label_parts(ax, {handled: colours[handled] for handled in counted})
     legend(ax, loc="lower right")
     totals = ", ".join(f"{sum(kinds.values())} {handled}" for handled, kinds in counted.items())
     ax.set_title(f"{used}; faults: {totals}", fontsize=11)
@@ -161,10 +152,13 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
     """
     rows = []
     styles = {"minmax": ":", "percentile": "--", "histogram": "-"}
-    for layer, observers in _observers(calibration).items():
-        ranges = {name: observers[name].range() for name in styles}
+    for layer, seen in _observers(calibration).items():
+        ranges = {}
+        for choice in styles:
+            seen.choice = choice
+            ranges[choice] = seen.range()
         widths = [high - low for low, high in ranges.values()]
-        rows.append((max(widths) / max(min(widths), 1e-12), layer, observers["minmax"], ranges))
+        rows.append((max(widths) / max(min(widths), 1e-12), layer, seen, ranges))
     rows.sort(key=lambda row: -row[0])
     worst_of_part: dict[str, Any] = {}
     for row in rows:
@@ -214,22 +208,18 @@ def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int =
     return fig
 
 
-def _observers(calibration: Calibration) -> dict[str, dict[str, Any]]:
-    """Return for each layer with a recorded range an observer of each choice, with what calibration saw there."""
+def _observers(calibration: Calibration) -> dict[str, RangeObserver]:
+    """Return for each layer with a recorded range an observer with what calibration saw there."""
     states: dict[str, dict[str, torch.Tensor]] = {}
     for key, tensor in calibration.observers.items():
         name, _, buffer = key.rpartition(".")
         states.setdefault(name, {})[buffer] = tensor
     by_range = {(s["min_val"].item(), s["max_val"].item()): s for s in states.values() if "histogram" in s}
-    observers: dict[str, dict[str, Any]] = {}
+    observers = {}
     for layer, ends in calibration.ranges.items():
-        state = by_range.get((ends["min"], ends["max"]))
-        if state is None:
-            continue
-        observers[layer] = {}
-        for choice in OBSERVERS:
-            o = RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice=choice, percentile=99.99)
+        if state := by_range.get((ends["min"], ends["max"])):
+            o = RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice="minmax", percentile=99.99)
             for buffer in ("min_val", "max_val", "limit", "histogram"):
                 getattr(o, buffer).copy_(state[buffer])
-            observers[layer][choice] = o
+            observers[layer] = o
     return observers

@@ -72,7 +72,7 @@ class Drawn(Figure):
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence that takes the place of a figure that would show nothing."""
+    """A sentence in the place of a figure that would show nothing."""
 
     text: str
 
@@ -102,10 +102,7 @@ def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any
 
 
 def picture_of(sample: Any) -> np.ndarray:
-    """Return what a sample saw, (h, w, 3) uint8 RGB.
-
-    The pictures of several cameras are side by side, all as high as the highest.
-    """
+    """Return what a sample saw, (h, w, 3) uint8 RGB, the pictures of several cameras side by side."""
     seen = sample.frame_bgr()
     frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
     height = max(len(frame) for frame in frames)
@@ -165,10 +162,7 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
 
 
 def few_actions(table: Mapping[str, Mapping[str, float | None]]) -> tuple[dict[str, dict[str, float | None]], str]:
-    """Return a table of <action>_mae_pct as it can be drawn, and what it then has, in words.
-
-    If there are more than MOST_ACTIONS actions, only the worst of each row is kept.
-    """
+    """Return a table of <action>_mae_pct, of many actions only the worst of each row, and what it has, in words."""
     keys = [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
     if len(keys) <= MOST_ACTIONS:
         return {name: {k: row[k] for k in keys} for name, row in table.items()}, "mean error"
@@ -188,10 +182,7 @@ def draw_errors(ax: Axes, table: Mapping[str, Mapping[str, Any]], keys: list[str
 
 
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
-    """Write run_dir/figures/<name>.png and return the figure, so that a cell that ends with this also shows it.
-
-    For a Note no file is written, and an existing one is removed, because it would be of an earlier run.
-    """
+    """Write run_dir/figures/<name>.png, or remove an earlier one if nothing is drawn. Returns what a cell shows."""
     path = Path(run_dir) / "figures" / f"{name}.png"
     if isinstance(shown, Note):
         path.unlink(missing_ok=True)
@@ -209,11 +200,14 @@ def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> N
 
 
 def action_colour(key: str, index: int) -> str:
-    """Return the colour of an action, or of a key that begins with one, such as steering_mae_pct.
-
-    index: chooses a colour for an action that has none of its own.
-    """
+    """Return the colour of an action, or of a key such as steering_mae_pct. index: chooses one for other actions."""
     return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])
+
+
+def label_parts(ax: Axes, colours: Mapping[str, str]) -> None:
+    """Give the legend of a bar chart an entry for each of these."""
+    for name, colour in colours.items():
+        ax.barh(0, 0, color=colour, label=name)
 
 
 def part_colours(blocks: Iterable[str]) -> list[str]:

@@ -15,9 +15,7 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
 
     rows: from `compare.gate` or `check_gates`.
     """
-    kept = sum(row["passed"] is True for row in rows)
-    missed = sum(row["passed"] is False for row in rows)
-    unknown = len(rows) - kept - missed
+    kept, missed, unknown = (sum(row["passed"] is passed for row in rows) for passed in (True, False, None))
     caption = f"{kept} of {len(rows)} promises kept"
     caption += f", {missed} missed" if missed else ""
     caption += f", {unknown} not measured" if unknown else ""

@@ -1,6 +1,5 @@
 """Artifacts that somebody made to do harm: the archive is checked before use, and its program only runs confined."""
 
-import json
 import os
 import struct
 import subprocess
@@ -100,16 +99,15 @@ MANIFESTS = [
     ({"cameras": [CAMERA] * 2}, "cameras"),
     ({"cameras": [CAMERA | {"width": 256}]}, "another shape"),
     ({"state_names": ["steering\x1b[2J", "throttle"]}, "unprintable"),
-    ({"checkpoint": {"sha256": json.loads("[" * 900 + "]" * 900)}}, "nested"),
     ({"parity": {"tolerance": {"steering": 1e9, "throttle": 0}}}, "tolerance of steering"),
     ({"parity": {"tolerance": {"steering": 0}}}, "cover"),
     ({"engine": "onnxruntime"}, "another engine"),
 ]
 
 
-@pytest.mark.parametrize(("values", "message"), MANIFESTS)
-def test_no_impossible_manifest_is_believed(artifacts, tmp_path, values, message):
-    refused(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(**values)}), message)
+def test_no_impossible_manifest_is_believed(artifacts, tmp_path):
+    for values, message in MANIFESTS:
+        refused(hostile(artifacts, tmp_path, {"manifest.json": manifest_with(**values)}), message)
 
 
 @pytest.mark.parametrize("raw", [b"[" * 50_000, b"[]", b"\xff"])
@@ -127,10 +125,9 @@ VECTORS = {
 }
 
 
-@pytest.mark.parametrize("what", VECTORS)
-def test_no_other_parity_vectors_are_read(artifacts, tmp_path, what):
-    change, message = VECTORS[what]
-    refused(hostile(artifacts, tmp_path, {"parity.npz": vectors_with(change)}), message)
+def test_no_other_parity_vectors_are_read(artifacts, tmp_path):
+    for change, message in VECTORS.values():
+        refused(hostile(artifacts, tmp_path, {"parity.npz": vectors_with(change)}), message)
 
 
 def test_names_that_look_like_torchs_counter_are_kept_in_the_content_hash(artifacts, tmp_path):

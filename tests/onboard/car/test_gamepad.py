@@ -19,6 +19,7 @@ from rover_lib.onboard.car.gamepad import (
     STEERING,
     SYN,
     THROTTLE,
+    CarError,
     Found,
     Gamepad,
 )

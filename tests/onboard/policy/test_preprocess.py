@@ -47,6 +47,6 @@ def test_any_size_keeps_a_flat_colour(h, w, height, width, value):
 
 
 @pytest.mark.parametrize("bad", [None, np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
-def test_refuses_what_is_no_picture(bad):
+def test_refuses_what_is_not_a_picture(bad):
     with pytest.raises(PolicyError):
         prepare_frame(bad, 360, 640)

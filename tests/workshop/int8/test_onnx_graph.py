@@ -73,12 +73,8 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
-    [
-        pytest.param(Scheme(), id="static"),
-        pytest.param(Scheme(kind="affine"), id="affine"),
-        pytest.param(Scheme(observer="frames", usual_pct=75, wider=(("image_project", 0.4),)), id="frames"),
-        pytest.param(Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward")), id="mixed"),
-    ],
+    [Scheme(), Scheme(kind="affine"), Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward"))],
+    ids=["static", "affine", "mixed"],
 )
 def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibration):
     quantized = quantize(tiny, scheme, calibration)
@@ -113,7 +109,8 @@ def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
     inputs = [inputs_of(s, checkpoint.config) for s in samples[8:]]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], checkpoint.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
-    tried = Rangeable(graph := restore_observed(checkpoint, Scheme(), calibration), checkpoint.config, Scheme())
+    graph = restore_observed(checkpoint, Scheme(), calibration)
+    tried = Rangeable(graph, checkpoint.config, Scheme())
     set_ranges(graph, Scheme(), calibration)
     tried.take()
     assert np.array_equal(predictions(tried.module, inputs).numpy(), torchs)
@@ -131,8 +128,5 @@ def test_part_with_two_outputs():
     written = onnx_model(graph_of(Part()), {"x": x}, ("turned", "twice"))
     turned, twice = session(written).run(None, {"x": x.numpy()})
     assert np.array_equal(turned, x.transpose(1, 2).numpy()) and np.array_equal(twice, 2 * x.numpy())
-
-
-def test_what_has_no_form_is_named():
     with pytest.raises(ArtifactError, match="Tanh has no form in ONNX"):
         onnx_model(graph_of(nn.Sequential(nn.Tanh())), {"x": torch.zeros(1, 2)}, ("y",))

@@ -76,13 +76,44 @@ def test_only_a_policy_that_sees_beats_the_guesses(plan, unbeaten, episodes):
     assert judged.summary()["guesses"].keys() == set(GUESSES) and "points" in str(judged.table())
 
 
-def test_errors_by_hand():
-    judged = judge(lambda s: s.chunk + np.float64([0.02, 0.001]))
-    assert judged.errors_pct == pytest.approx({"steering": 1, "throttle": 1}, rel=1e-3)
-    assert judged.errors_pct.keys() == judged.guesses[0].errors_pct.keys()
+@pytest.mark.parametrize("far", [[0.6, 0], [0, 0.03]])
+def test_a_guess_is_beaten_only_in_every_action(far):
+    """Perfect in one action and so better in the mean, but in the other one further off than some guesses."""
+    judged = judge(lambda s: s.chunk + np.float64(far))
+    assert [g.low > 0 for g in judged.guesses] == [True, False, True] and not any(g.beaten for g in judged.guesses)
+
+
+def test_the_guesses_know_only_what_could_be_learned_from():
+    """By hand: the mean action, and the mean plan, of four other drives, and the state, which is the last action."""
+    judged, seen = judge(lambda s: s.chunk), [s for e in range(6) for s in drive(e)]
+    learned = [s for e in range(10, 14) for s in drive(e)]
+    every = np.concatenate([s.chunk[~s.is_pad] for s in learned])
+    steps = np.stack([np.mean([s.chunk[i] for s in learned if not s.is_pad[i]], 0) for i in range(CHUNK)])
+
+    def off(plan_of):
+        errors = [np.abs(plan_of(s) - s.chunk)[~s.is_pad].mean(0) for s in seen]
+        return dict(zip(RANGE, 100 * np.mean(errors, 0) / [2, 0.1], strict=True))
+
+    constants = [off(lambda s, c=c: np.tile(c, (CHUNK, 1))) for c in (every.mean(0), np.median(every, 0))]
+    expected = [min(constants, key=lambda e: sum(e.values())), off(lambda s: s.state), off(lambda s: steps)]
+    assert [g.errors_pct for g in judged.guesses] == [pytest.approx(e, rel=1e-4) for e in expected]
+
+
+def test_the_interval_has_95_percent_of_the_draws():
+    """Of whole episodes, drawn with replacement: the oracle draws by itself, and many more."""
+    guess, rng, gains = judge(noisy).guesses[1], np.random.default_rng(1), []
+    for samples in map(drive, range(6)):
+        plans = np.stack([[np.tile(s.state, (CHUNK, 1)), np.float32(noisy(s))] for s in samples])
+        errors = np.abs(plans - np.stack([s.chunk for s in samples])[:, None]) / [0.02, 0.001]
+        known = ~np.stack([s.is_pad for s in samples])[:, None, :, None]
+        by_frame = (errors * known).sum(2) / known.sum(2)
+        gains.append((by_frame[:, 0] - by_frame[:, 1]).mean())
+    means = np.float64(gains)[rng.integers(0, 6, (100_000, 6))].mean(1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    assert (guess.low, guess.high) == pytest.approx((low, high), abs=0.05 * (high - low))
 
 
 def test_what_is_not_judged_counts_for_nothing():
     judged = judge(noisy, action_range=RANGE | {"throttle": (0.1, 0.1)})
-    assert judged.errors_pct.keys() == {"steering"}
+    assert judged.errors_pct.keys() == judged.guesses[0].errors_pct.keys() == {"steering"}
     assert judge(noisy, action_range={name: (0.0, 0.0) for name in RANGE}) is None

@@ -81,23 +81,16 @@ def test_this_machine_alone_is_a_sentence(folders):
     assert socket.gethostname() not in str(benchmarks.table()).split()
 
 
-def test_rovers_are_called_what_the_inventory_calls_them(folders):
-    """Two whose system is called the same, as every new card's is."""
-    for name in ("rover2", "rover1"):
-        written(folders[1], name, 60.0, host="raspberrypi")
+def test_rovers_go_by_the_inventory_and_artifacts_by_their_mode(folders):
+    """Two whose system is called the same, as every new card's is; one has another artifact than the run's."""
+    written(folders[1], "rover2", 60.0, soak_s=20, inputs={"policy.pt": "0f"}, host="raspberrypi")
+    written(folders[1], "rover1", 60.0, host="raspberrypi")
     benchmarks = hosts.read_benchmarks(*folders)
     assert list(benchmarks.by_host) == [hosts.THIS, "rover1", "rover2"]
-    assert str(benchmarks.table()).endswith(hosts.NO_SOAK)
-
-
-def test_an_artifact_goes_by_its_mode_and_another_one_is_called_that(folders):
-    written(folders[1], "rover1", 60.0)
-    written(folders[1], "rover2", 60.0, soak_s=20, inputs={"policy.pt": "0f"})
-    found = hosts.read_benchmarks(*folders).by_host
-    assert list(found["rover1"]["metrics"]["artifacts"]) == ["static"]
-    metrics = found["rover2"]["metrics"]
-    assert list(metrics["artifacts"]) == ["static, another"] == list(metrics["series"][3]["artifacts"])
-    assert metrics["main"] == "static, another"
+    ours, another = (benchmarks.by_host[name]["metrics"] for name in ("rover1", "rover2"))
+    assert list(ours["artifacts"]) == ["static"] and list(benchmarks.soaks()) == ["rover2"]
+    assert list(another["artifacts"]) == ["static, another"] == list(another["series"][3]["artifacts"])
+    assert another["main"] == "static, another"
 
 
 def test_the_table_says_how_hot_and_how_fast(folders):
@@ -110,29 +103,16 @@ def test_the_table_says_how_hot_and_how_fast(folders):
 
 @pytest.mark.parametrize(
     "spoil",
-    [
-        lambda c: "{",
-        lambda c: json.dumps({**c, "schema": 9}),
-        lambda c: json.dumps({**c, "metrics": {}}),
-        lambda c: json.dumps({**c, "metrics": {**c["metrics"], "throttled": "hot"}}),
-        lambda c: json.dumps({**c, "metrics": {**c["metrics"], "series": [{"t_s": 1}]}}),
-        lambda c: json.dumps({**c, "env": None}),
-    ],
+    [lambda c: "{", lambda c: json.dumps({**c, "schema": 9}), lambda c: json.dumps({**c, "metrics": {}})],
 )
-def test_a_damaged_or_foreign_file_is_counted_and_named(folders, spoil):
+def test_a_damaged_or_foreign_file_is_named(folders, spoil):
     written(folders[1], "rover1", 60.0)
     bad = written(folders[1], "rover2", 60.0)
     bad.write_text(spoil(json.loads(bad.read_text())))
     benchmarks = hosts.read_benchmarks(*folders)
     assert list(benchmarks.by_host) == [hosts.THIS, "rover1"]
-    *_, count, sentence = str(benchmarks.table()).splitlines()
-    assert count == "1 file is left out:" and sentence.startswith("benchmark-rover2.json: ")
+    assert str(benchmarks.table()).splitlines()[-1].startswith("left out: benchmark-rover2.json: ")
     assert str(folders[1]) not in str(benchmarks.table())  # a published notebook holds no path
-
-
-def drawn(figure):
-    figure.canvas.draw()
-    return [ax.get_ylabel().replace("\n", " ") or ax.get_title() for ax in figure.axes]
 
 
 def test_a_soak_over_time(folders):
@@ -141,9 +121,7 @@ def test_a_soak_over_time(folders):
     soaks = hosts.read_benchmarks(*folders).soaks()
     assert list(soaks) == ["rover1", "rover2"]
     figure = plots.soak(soaks)
-    latency, temperature, clock, held = drawn(figure)
-    assert latency == "latency of one inference (ms)" and temperature == "temperature (°C)" and "MHz" in clock
-    assert held.startswith("held back by the firmware")
+    figure.canvas.draw()
     hot, cool = (collection.get_paths() for collection in figure.axes[3].collections)
     assert hot and not cool
     first_hot_min = min(path.vertices[:, 0].min() for path in hot)

@@ -61,11 +61,31 @@ def test_the_demo_deploys_static(demo):
     assert "rover_artifact=runs/mine/policy_static.pt" in commands(judged)[1]
 
 
-def test_of_two_that_are_as_good_the_smaller_is_deployed(monkeypatch):
-    for name, value in (("_candidates", list), ("_work_key", lambda rows: None), ("error_pct", lambda row: 1.0)):
-        monkeypatch.setattr(v, name, value)
-    rows = [{"mode": mode, "size_mb": size} for mode, size in zip(v.PREFERRED, (100, 20), strict=False)]
-    assert v._best(rows, {"worth_pct": 10, "better_points": 0.1})["size_mb"] == 20
+def row(mode, time_ms=10.0, error=0.1, size_mb=20.0, missed=()):
+    errors = {"steering": error, "throttle": error / 2}
+    blocks = ["decoder.0.feed_forward"] if mode == "mixed" else []
+    return {
+        "mode": mode, "time_ms": time_ms, "instructions_g": None, "errors_pct": errors, "size_mb": size_mb,
+        "missed_gates": list(missed), "float_blocks": blocks,
+    }  # fmt: skip
+
+
+FP32 = row("fp32", 30.0, 0.0, 80.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "deployed"),
+    [
+        ([FP32, row("static", 10), row("dynamic", 20)], "static"),  # the fastest
+        ([FP32, row("static", 10.5, 0.1), row("mixed", 10, 0.1)], "static"),  # as fast: the simplest
+        ([FP32, row("static", 10.5, 0.9), row("mixed", 10, 0.1)], "mixed"),  # as fast, and truer
+        ([FP32, row("static", size_mb=30.0), row("dynamic")], "dynamic"),  # as fast and as true: the smaller
+        ([FP32, row("static", missed=["a gate"]), row("dynamic", 20)], "dynamic"),
+        ([FP32, row("static", missed=["a gate"]), row("mixed") | {"float_blocks": []}], "fp32"),  # static again
+    ],
+)
+def test_the_rule_takes_the_fastest_then_the_truest_then_the_smallest(rows, deployed):
+    assert v._best(rows, PARAMS["verdict"])["mode"] == deployed
 
 
 def test_what_a_workstation_measures_of_memory_fails_nothing(demo):

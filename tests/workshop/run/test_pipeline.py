@@ -1,5 +1,6 @@
 """The pipeline once: what the command line makes is what a run makes."""
 
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,8 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.int8.scheme import Scheme
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
 from rover_lib.workshop.run.session import Opened
@@ -43,12 +46,31 @@ def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
     assert modes["static"]["scheme"]["mode"] == "static" and modes["static"]["int8_modules"] > 0
 
 
-def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(loaded, calibration, tmp_path, monkeypatch):
+def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibration):
+    unseen, action_range = tuple(memory_samples(5, seed=1)), {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
+    recordings = SimpleNamespace(action_range=lambda: action_range)
+    for choosing in (unseen, ()):  # of a single episode nothing is left
+        parts = SimpleNamespace(calibration=tuple(memory_samples(12)), choosing=choosing)
+        chooser = pipeline.prepare_chooser(tiny, Opened(tiny, recordings, parts), calibration, frames=3)
+        expected = pick_evenly(choosing or parts.calibration, 3)
+        states = [state.tolist() for state, _ in chooser.inputs]
+        assert states == [[s.state.tolist()] for s in expected]
+
+
+@pytest.mark.parametrize("another", ["artifact", "calibration"])
+def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(
+    artifacts, thin, loaded, tmp_path, monkeypatch, another
+):
     """Not even the FP32 one, which would lie there beside a static policy that is another."""
-    monkeypatch.setattr(pipeline, "open_run", lambda *_: loaded)
+    policy, calibration = thin
+    monkeypatch.setattr(pipeline, "open_run", lambda *_: Opened(policy, None, loaded.parts))
     calibration.save(tmp_path / "calibration.pt")
-    (tmp_path / "policy_static.pt").write_bytes(b"of another run")
-    write_quantize(tmp_path, loaded.checkpoint, {"modes": {"static": {"content_hash": "of this run"}}})
+    made = artifacts["static"] if another == "calibration" else artifacts["mixed"]
+    (tmp_path / "policy_static.pt").write_bytes(made.read_bytes())
+    described = {"content_hash": content_hash(artifacts["static"]), "scheme": asdict(Scheme())}
+    write_quantize(tmp_path, loaded.checkpoint, {"modes": {"static": described}})
+    if another == "calibration":
+        replace(calibration, seconds=0.0).save(tmp_path / "calibration.pt")
     before = sorted(tmp_path.iterdir())
     with pytest.raises(RoverError):
         export_onnx(tmp_path)
