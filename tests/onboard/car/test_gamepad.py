@@ -19,7 +19,6 @@ from rover_lib.onboard.car.gamepad import (
     STEERING,
     SYN,
     THROTTLE,
-    CarError,
     Found,
     Gamepad,
 )
