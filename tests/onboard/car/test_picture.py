@@ -26,6 +26,7 @@ def test_what_is_not_all_of_a_cameras_picture_is_refused_cheaply(tmp_path):
     code = f"""
 import resource, sys, time
 from pathlib import Path
+from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.car.picture import read_jpeg
 def most_mb(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 before = most_mb()
