@@ -181,7 +181,7 @@ class Eyes:
 
     def __init__(self, world: World):
         self._world = world
-        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
+        self.camera = Camera("the virtual camera", clock=world.clock)
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
         self._next: tuple[np.ndarray | bytes, float] | None = None
         self._failure: Exception | None = None

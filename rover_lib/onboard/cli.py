@@ -83,7 +83,7 @@ drive_options = with_options(  # on the rover and in the balloon world
         callback=_check_json_file,
         help="Write a summary of the drive to this file; - prints it.",
     ),
-    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
+    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
     click.option(
         "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
     ),
