@@ -251,7 +251,7 @@ class World:
         self.written: list[bytes] = []
         self._unread: list[bytes] = []
         self._boot = 0
-        self._due: list[tuple[int, int, Callable[[], None]]] = []
+        self._due: list[tuple[int, int, Callable[[], object]]] = []
         self._count = 0
         self._started_ms = self._hung_ms = 0
         self.view_stop = self.operator_gone = False
@@ -274,7 +274,7 @@ class World:
         """Return the time in seconds, in place of host.boottime()."""
         return self.now_ms / 1e3
 
-    def at(self, at_ms: int, what: Callable[[], None]) -> None:
+    def at(self, at_ms: int, what: Callable[[], object]) -> None:
         """Do something at a time; it must not let time pass itself."""
         self._count += 1
         heapq.heappush(self._due, (max(at_ms, self.now_ms), self._count, what))

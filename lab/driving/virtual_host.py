@@ -196,7 +196,7 @@ class Eyes:
 
     def __init__(self, world: World):
         self._world = world
-        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
+        self.camera = Camera("the virtual camera", clock=world.clock)
         condition: Any = _Waiting(world)
         self.camera._changed = condition
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
