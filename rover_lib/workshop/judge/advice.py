@@ -126,7 +126,6 @@ def list_remedies(
         gate=gate,
         key=key,
         smaller=_smaller(stages, names),
-        qat=_qat(names),
         mixed=rows.get("mixed", {}),
         most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
         odd=quantized.get("odd"),
@@ -134,10 +133,6 @@ def list_remedies(
         clipped=[row["name"] for row in quantized.get("layers", []) if (row.get("clipped_pct") or 0) > limit],
         episodes=list(dict.fromkeys(str(w["episode"]) for w in worst if w["episode"])),
     )
-
-
-def _qat(names: Names) -> str:
-    return names.distill("--qat", name=f"{names.name}-qat")
 
 
 def _smaller(stages: Stages, names: Names) -> str:
@@ -226,9 +221,4 @@ def _to_drive(judged: Mapping[str, Any], stages: Stages, names: Names, artifact:
         ]
     if judged["deploy"] == "mixed":
         commands.append((deploying, "put it on the rover"))
-    if not stages["quantize"].get("odd"):
-        name = f"{names.name}-qat"
-        left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"
-        run = shlex.join(["rover", "run", f"runs/{name}/{left}", names.episodes, "--name", name])
-        commands += [(_qat(names), "train static INT8 to keep its gates"), (run, "and judge that")]
     return commands
