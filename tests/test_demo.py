@@ -66,7 +66,7 @@ def test_late_plans_are_drawn(demo_run):
     text = shown(demo_run / "07_drive.ipynb")
     assert str(latency.table(stage_of(demo_run, "drive"))) in text and "ensembling, 0.01" in text
     figures = {p.stem for p in (demo_run / "figures").glob("07_*.png")}
-    assert figures == {f"07_{figure}" for figure in ("hits", "path", "above")}
+    assert figures == {f"07_{figure}" for figure in ("hits", "path")}
 
 
 @pytest.mark.release
