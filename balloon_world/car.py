@@ -21,25 +21,20 @@ import tempfile
 import termios
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from balloon_world.child_process import Child
 from balloon_world.record import JPEG_QUALITY
-from balloon_world.simulated_arduino import PinEvent
 from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import TrainingError
 
 HOLD_S = 1.0
-STEPS_PER_S = 100  # steps of the physics a second, at least
-KEEP_OUTCOMES = 1000
 STANDSTILL_S = 0.5  # if the machine stopped for longer than this, the world stopped too for the time beyond it
 NOISE = 3  # the noise's grey levels, 0 to 2; with noise, two frames of a car that stands still are never the same
 SHIFTS = 256  # by how many pixels the noise may be shifted, in both directions, so that one shift rarely comes again
@@ -121,10 +116,7 @@ class CameraFeed:
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
         self.written = 0
         self._pipe, self._period_s = FramePipe(path), 1 / rate_hz
-        self._pictures: tuple[bytes, ...] = ()
-        self._next = -1
-        self._frozen = self._paused = False
-        self._closing = threading.Event()
+        self._next, self._closing = -1, threading.Event()
         self.show(*pictures)
         self._thread = threading.Thread(target=self._run, name=f"camera feed {path}", daemon=True)
         self._thread.start()
@@ -165,14 +157,13 @@ class CameraFeed:
                 self.written += 1
 
 
-@dataclass(frozen=True)
-class CarReport:
+class CarReport(NamedTuple):
     """What a virtual car has done so far.
 
-    trials, hits: how many worlds have ended, and how many of them with a hit. outcomes: (seed, outcome) of the last
-    1000 worlds, 'hit', 'left' or 'timeout'. frames: how many were written to the camera; dropped: how many were not,
-    because the reader was too slow; late: how many were left out, because this machine was too slow.
-    seed, held, speed_mps: the present world's seed, whether the car is held, and its speed.
+    trials, hits: how many worlds have ended, and how many of them with a hit. outcomes: (seed, outcome) of those
+    worlds, 'hit', 'left' or 'timeout'. frames: how many were written to the camera; dropped: how many were not, because
+    the reader was too slow; late: how many were left out, because this machine was too slow. seed, held, speed_mps: the
+    present world's seed, whether the car is held, and its speed.
     """
 
     hits: int
@@ -199,14 +190,14 @@ class VirtualCar:
     def __init__(self, *, seed: int = 10_000, board: str = STAND_IN, hold_s: float = HOLD_S):
         """Start the process.
 
-        board: 'module:function' that makes the car's Arduino in that process, with a port and pulses() as StandIn has.
-        Raises TrainingError for numbers outside their ranges, or if the process does not start.
+        board: 'module:function' that makes the car's Arduino in that process, a context manager with a port and
+        pulses() as StandIn has. Raises TrainingError for a negative seed, or if the process does not start.
         """
-        if seed < 0 or hold_s < 0:
-            raise TrainingError("a car needs a seed and a hold from 0", found=f"{seed} and {hold_s}")
+        if seed < 0:
+            raise TrainingError("a car needs a seed from 0", found=seed)
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
-        self._talking, self._answers, self._asked = threading.Lock(), b"", 0
+        self._talking, self._answers = threading.Lock(), b""
         options = {"seed": seed, "board": board, "hold_s": hold_s, "folder": str(self._folder), "parent": os.getpid()}
         command = (sys.executable, "-m", "balloon_world.car", json.dumps(options))
         env = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where the board's module is
@@ -234,12 +225,10 @@ class VirtualCar:
         Raises TrainingError if the process has ended or hangs.
         """
         with self._talking:
-            self._asked += 1
-            self._process.send_line(f"report {self._asked}")
-            while (answer := self._answer(ANSWER_S))["asked"] != self._asked:
-                pass  # this answers an earlier call, which did not wait long enough
-        outcomes = [(seed, outcome) for seed, outcome in answer["report"].pop("outcomes")]
-        return CarReport(outcomes=outcomes, **answer["report"])
+            self._process.send_line("report")
+            found = self._answer(ANSWER_S)
+        outcomes = [(seed, outcome) for seed, outcome in found.pop("outcomes")]
+        return CarReport(outcomes=outcomes, **found)
 
     def summary(self) -> dict[str, Any]:
         """Return what the report of a drive says about this car: hits, trials and camera_late. Raises as report()."""
@@ -261,12 +250,10 @@ class VirtualCar:
     def _answer(self, within_s: float) -> dict[str, Any]:
         deadline = time.monotonic() + within_s
         while b"\n" not in self._answers:
-            data = self._process.read(max(0.0, deadline - time.monotonic()))
-            if not data:
-                raise TrainingError(
-                    "the virtual car did not answer", found=f"{within_s:g} s", remedy="is it too busy here?"
-                )
-            self._answers += data
+            if time.monotonic() > deadline:
+                remedy = "is it too busy here?"
+                raise TrainingError("the virtual car did not answer", found=f"{within_s:g} s", remedy=remedy)
+            self._answers += self._process.read(0.1)
         line, _, self._answers = self._answers.partition(b"\n")
         return json.loads(line)
 
@@ -274,95 +261,44 @@ class VirtualCar:
 # ---- what runs in the process
 
 
-class Board(Protocol):
-    """A virtual car's Arduino: a context manager that knows its serial port and what happened on its pins."""
+class _Car:
+    """A car that the pulses on a board's pins drive through one world after the other."""
 
-    port: str
-
-    def __enter__(self) -> "Board": ...
-    def __exit__(self, *exc: object) -> None: ...
-    def pulses(self) -> list[PinEvent]:
-        """Return what happened on the pins since the last call."""
-
-
-class _Pins:
-    """Which actions the pulses on the servo pins stand for, over time."""
-
-    def __init__(self, board: Board):
-        self._board = board
-        self._calibration = this_car().pwm
-        self._coming: deque[PinEvent] = deque()
+    def __init__(self, board: Any, seed: int, hold_s: float):
+        self._board, self._pwm, self._hold_ticks = board, this_car().pwm, round(hold_s * RATE_HZ)
         self._action = dict(zip(("steering", "throttle"), NEUTRAL, strict=True))
-        self.asked_for_motion = False
+        self._held_ticks = math.inf  # until the pins first ask for motion
+        self.world = World(seed)
+        self.hits, self.outcomes = 0, list[tuple[int, str]]()
 
-    def collect(self) -> None:
-        self._coming.extend(event for event in self._board.pulses() if event.kind in ("pulse", "reset"))
-
-    def action(self, at_s: float) -> tuple[float, float]:
-        """Return the (steering, throttle) of the last pulses that had ended by at_s; neutral if there were none."""
-        while self._coming and self._coming[0].end_s <= at_s:
-            event = self._coming.popleft()
+    def tick(self) -> None:
+        """Drive for a frame's time by the newest pulses; the car stands where a reset has ended them."""
+        for event in self._board.pulses():
             if event.kind == "reset":
                 self._action = dict(zip(self._action, NEUTRAL, strict=True))
-            else:
-                # Computed with the nominal period: the first pulse after a reset has no period, and a servo only
-                # measures the pulse.
-                self._action[event.pin] = self._calibration.channel(event.pin).action(event.pulse_us) or 0.0
-                self.asked_for_motion |= event.pin == "throttle" and self._calibration.throttle.moves(event.pulse_us)
-        return self._action["steering"], self._action["throttle"]
-
-
-class _Car:
-    """A car that the pins drive through one world after the other."""
-
-    def __init__(self, pins: _Pins, seed: int, hold_s: float):
-        self._pins = pins
-        self._dt = 1 / (RATE_HZ * math.ceil(STEPS_PER_S / RATE_HZ))
-        self._hold_s = hold_s
-        self.world = World(seed)
-        self._now = time.monotonic()  # the time up to which the car was moved
-        self._release_s = math.inf
-        self.held = True
-        self.hits = self.trials = 0
-        self.outcomes: deque[tuple[int, str]] = deque(maxlen=KEEP_OUTCOMES)
-
-    def move(self, until_s: float) -> None:
-        """Move the car on to the time until_s."""
-        if until_s - self._now > STANDSTILL_S:
-            self._now = until_s - STANDSTILL_S
-        self._pins.collect()
-        while self._now + self._dt <= until_s:
-            self._step()
-            self._now += self._dt
-
-    def _step(self) -> None:
-        action = self._pins.action(self._now)
-        if self.held:
-            if self.trials == 0 and self._pins.asked_for_motion:
-                self._release_s = self._now
-            if self._now < self._release_s:
-                return
-            self.held = False
-        self.world.step(*action, self._dt)
+            elif event.kind == "pulse":
+                # By the nominal period: the first pulse after a reset has none, and a servo only measures the pulse.
+                self._action[event.pin] = self._pwm.channel(event.pin).action(event.pulse_us) or 0.0
+                if (
+                    self._held_ticks == math.inf
+                    and event.pin == "throttle"
+                    and self._pwm.throttle.moves(event.pulse_us)
+                ):
+                    self._held_ticks = 0
+        if self._held_ticks > 0:
+            self._held_ticks -= 1
+            return
+        self.world.step(self._action["steering"], self._action["throttle"])
         if self.world.done:
-            self._end()
+            self.hits += self.world.hit
+            self.outcomes.append((self.world.seed, str(self.world.outcome)))
+            self.world, self._held_ticks = World(self.world.seed + 1), self._hold_ticks
 
-    def _end(self) -> None:
-        self.trials += 1
-        self.hits += self.world.hit
-        self.outcomes.append((self.world.seed, str(self.world.outcome)))
-        self.world = World(self.world.seed + 1)
-        self.held, self._release_s = True, self._now + self._hold_s
-
-    def report(self) -> dict[str, Any]:
-        return {
-            "hits": self.hits,
-            "trials": self.trials,
-            "outcomes": list(self.outcomes),
-            "seed": self.world.seed,
-            "held": self.held,
-            "speed_mps": self.world.state.speed_mps,
-        }
+    def report(self, **counts: int) -> str:
+        """Return a CarReport as JSON. counts: of the camera's frames."""
+        speed_mps, held, trials = self.world.state.speed_mps, self._held_ticks > 0, len(self.outcomes)
+        done = {"hits": self.hits, "trials": trials, "outcomes": self.outcomes, "seed": self.world.seed}
+        return json.dumps({**done, **counts, "held": held, "speed_mps": speed_mps})
 
 
 class _Sensor:
@@ -370,8 +306,7 @@ class _Sensor:
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng()
-        shape = (FRAME_HEIGHT + SHIFTS, FRAME_WIDTH + SHIFTS, 3)
-        self._noise = self._rng.integers(0, NOISE, shape, np.uint8)
+        self._noise = self._rng.integers(0, NOISE, (FRAME_HEIGHT + SHIFTS, FRAME_WIDTH + SHIFTS, 3), np.uint8)
 
     def see(self, frame: np.ndarray) -> np.ndarray:
         row, column = self._rng.integers(0, SHIFTS, 2)
@@ -381,28 +316,25 @@ class _Sensor:
 def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
     """Move the car and write frames at absolute deadlines, until the parent closes standard input or has ended."""
     frames = dropped = late = 0
-    sensor = _Sensor()
-    asked = b""
-    due = time.monotonic()
+    sensor, due = _Sensor(), time.monotonic()
     # Standard input alone does not tell that the parent has ended: another child of it may hold the other end open.
     while os.getppid() == parent:
         while select.select([0], [], [], max(0.0, due - time.monotonic()))[0]:
-            data = os.read(0, 4096)
-            if not data:
+            asked = os.read(0, 4096)
+            if not asked:
                 return
-            *lines, asked = (asked + data).split(b"\n")
-            for line in lines:
-                report = car.report() | {"frames": frames, "dropped": dropped, "late": late}
-                print(json.dumps({"asked": int(line.split()[1]), "report": report}), flush=True)
-        car.move(due)
+            for _ in range(asked.count(b"\n")):
+                print(car.report(frames=frames, dropped=dropped, late=late), flush=True)
+        car.tick()
         if pipe.read:
             # Do not draw what nobody would see.
             if pipe.empty and pipe.write(jpeg_of(sensor.see(car.world.render()))):
                 frames += 1
             else:
                 dropped += 1
-        due += 1 / RATE_HZ
+        due = max(due + 1 / RATE_HZ, time.monotonic() - STANDSTILL_S)
         while due < time.monotonic():
+            car.tick()
             due += 1 / RATE_HZ
             late += 1
 
@@ -417,13 +349,12 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
     try:
         module, _, name = options["board"].partition(":")
-        board: Board = getattr(importlib.import_module(module), name)()
+        board: Any = getattr(importlib.import_module(module), name)()
         with board, contextlib.closing(FramePipe(Path(options["folder"]) / "camera")) as pipe:
             # This concerns only the present thread: the stand-in's thread and the emulator's process keep their turn.
             os.nice(NICE)
-            car = _Car(_Pins(board), options["seed"], options["hold_s"])
             print(json.dumps({"port": board.port}), flush=True)
-            _run(car, pipe, options["parent"])
+            _run(_Car(board, options["seed"], options["hold_s"]), pipe, options["parent"])
     finally:
         shutil.rmtree(options["folder"], ignore_errors=True)  # in case the parent was killed and cannot do it
 

@@ -7,9 +7,8 @@ import select
 import signal
 import subprocess
 import tempfile
-import time
 from collections.abc import Mapping
-from typing import IO, Any
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import last_words
@@ -33,16 +32,14 @@ class Child:
     ):
         """Start the command.
 
-        name: for errors, such as 'the virtual car'. error: the class to raise. talks: whether it talks by lines on its
-        standard input and output; then the end of its input tells it to end. Otherwise it has neither, and SIGTERM
-        tells it. env: variables in addition to this process's own.
+        name: for errors, such as 'the virtual car'. error: the class to raise. talks: by its standard input, whose end
+        tells it to end, and output; otherwise it has neither, and SIGTERM tells it. env: further variables.
         """
         self.name, self._error = name, error
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115, open until close()
         words, stream = [str(part) for part in command], subprocess.PIPE if talks else subprocess.DEVNULL
         streams: dict[str, Any] = {"stdin": stream, "stdout": stream, "stderr": self._errors, "bufsize": 0}
-        environment = {**os.environ, **(env or {})}
-        self.process = subprocess.Popen(words, env=environment, start_new_session=True, **streams)
+        self.process = subprocess.Popen(words, env={**os.environ, **(env or {})}, start_new_session=True, **streams)
         self.pid = self.process.pid
 
     @property
@@ -65,7 +62,8 @@ class Child:
     def send_line(self, text: str) -> None:
         """Write a line to its standard input. Raises the error of ended() if nobody reads that any more."""
         try:
-            self._pipe(self.process.stdin).write(f"{text}\n".encode())
+            assert self.process.stdin
+            self.process.stdin.write(f"{text}\n".encode())
         except (OSError, ValueError):
             raise self.ended() from None
 
@@ -74,30 +72,21 @@ class Child:
 
         Raises the error of ended() if the process has ended and everything it printed has been read.
         """
-        output = self._pipe(self.process.stdout)
+        assert self.process.stdout
         try:
-            if not select.select([output], [], [], within_s)[0]:
+            if not select.select([self.process.stdout], [], [], within_s)[0]:
                 return b""
-            data = os.read(output.fileno(), 1 << 16)
+            data = os.read(self.process.stdout.fileno(), 1 << 16)
         except (OSError, ValueError):  # closed meanwhile
             data = b""
         if not data:
             raise self.ended()
         return data
 
-    def read_line(self, within_s: float) -> str:
-        """Return the next line that it prints; what comes of it within that time, if its end does not.
-
-        An unbuffered Python writes a line and its end apart, so read() may return them one after the other.
-        """
-        line, end_s = b"", time.monotonic() + within_s
-        while not line.endswith(b"\n") and (left_s := end_s - time.monotonic()) > 0:
-            line += self.read(left_s)
-        return line.decode()
-
     def keep_unread(self, size: int) -> None:
         """Let its standard output hold up to `size` bytes that nobody has read yet."""
-        fcntl.fcntl(self._pipe(self.process.stdout), fcntl.F_SETPIPE_SZ, size)
+        assert self.process.stdout
+        fcntl.fcntl(self.process.stdout, fcntl.F_SETPIPE_SZ, size)
 
     def errors(self) -> list[str]:
         """Return the lines that it has printed on standard error."""
@@ -121,16 +110,11 @@ class Child:
             with contextlib.suppress(OSError):
                 self.process.stdin.close()
         elif self.running:
-            with contextlib.suppress(ProcessLookupError):
-                self.process.send_signal(signal.SIGCONT)  # a stopped process would not notice SIGTERM
-                self.process.terminate()
+            self.process.send_signal(signal.SIGCONT)  # a stopped process would not notice SIGTERM
+            self.process.terminate()
         if self.wait(STOP_S) is None:
             self.process.kill()
             self.process.wait()
         if self.process.stdout:
             self.process.stdout.close()
         self._errors.close()
-
-    def _pipe(self, stream: IO[bytes] | None) -> IO[bytes]:
-        assert stream is not None, f"{self.name} was not started with talks=True"
-        return stream

@@ -10,7 +10,6 @@ planner's thread are replaced. Nothing waits, and no result depends on how fast 
 import json
 import math
 import os
-import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -37,9 +36,20 @@ ROUNDING = 1e-6  # how far times may be rounded, in ticks
 SEED = 10_000  # of the first world that judges a policy
 
 K = TypeVar("K")
-P = TypeVar("P")
 V = TypeVar("V")
 Watch = Callable[[Order], bool]
+
+
+class NoLog:
+    """A flight log that keeps nothing but the last tick's row."""
+
+    start_s = 0.0
+    row: Any = None
+
+    def tick(self, row: Any) -> None:
+        self.row = row
+
+    def event(self, text: str, **fields: Any) -> None: ...
 
 
 class TimedCar:
@@ -50,14 +60,25 @@ class TimedCar:
 
     wanted_hz = RATE_HZ
 
-    def __init__(self, world: World, policy: Any, latency_s: float, commanded: Commanded):
-        self.world, self.stop = world, threading.Event()
+    def __init__(self, world: World, policy: Any, latency_s: float):
+        self.world, self.policy, self.stop = world, policy, threading.Event()
         self.command: Order | None = None
         self.plans: list[tuple[Plan, CarState]] = []
-        self._policy, self._latency_s, self._commanded = policy, latency_s, commanded
+        self._latency_s, self._commanded = latency_s, Commanded()
         self._tick, self._looked_at = 0, -1  # the present tick, and the tick of the last frame that was planned from
         self._coming: tuple[Plan, CarState] | None = None
         self._think(ROUNDING)
+
+    def drive(self, settings: Settings, log: NoLog, watch: Watch | None = None) -> tuple[list[Order], str]:
+        """Drive by the car's own loop until the world ends or `stop` is set; return all orders and the outcome."""
+        pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
+        try:
+            drive(pilot, None, log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep)
+        except DriveFault as fault:
+            if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
+                raise fault.__cause__ from None
+            return pilot.orders, "stopped"
+        return pilot.orders, self.world.outcome or "taken over"
 
     def clock(self) -> float:
         return self._tick / RATE_HZ
@@ -101,8 +122,8 @@ class TimedCar:
             if self._looked_at == self._tick:
                 return  # the planner waits for another frame
             self._looked_at = self._tick
-            state = self._commanded.state(self.clock(), self._policy.rate_hz)
-            actions = self._policy.predict_unclipped(self.world.render(), state)
+            state = self._commanded.state(self.clock(), self.policy.rate_hz)
+            actions = self.policy.predict_unclipped(self.world.render(), state)
             plan = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
             self._coming = plan, self.world.state
 
@@ -122,16 +143,6 @@ class WorldPilot(PolicyPilot):
         self.orders.append(order)
         if self._watch and self._watch(order):
             self._car.stop.set()  # the drive ends after this tick
-
-
-class NoLog:
-    """A flight log that keeps nothing."""
-
-    start_s = 0.0
-
-    def tick(self, row: Any) -> None: ...
-
-    def event(self, text: str, **fields: Any) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -159,48 +170,28 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     """
     if not 0 <= latency_s <= LATENCY_MOST_S:
         raise TrainingError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=latency_s)
-    commanded = Commanded()
-    car = TimedCar(world, policy, latency_s, commanded)
-    pilot = WorldPilot(car, commanded, settings, policy.rate_hz, watch)
-    try:
-        drive(pilot, None, NoLog(), rate_hz=RATE_HZ, until=Until(stop=car.stop), clock=car.clock, sleep=car.sleep)
-        outcome = str(world.outcome) if world.done else "taken over"
-    except DriveFault as fault:
-        if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
-            raise fault.__cause__ from None
-        outcome = "stopped"
-    return Driven(outcome, world.state.time_s, Trajectory.of(world), pilot.orders, car.plans)
+    car = TimedCar(world, policy, latency_s)
+    orders, outcome = car.drive(settings, NoLog(), watch)
+    return Driven(outcome, world.state.time_s, Trajectory.of(world), orders, car.plans)
 
 
 # --- many drives ------------------------------------------------------------------------------------------------------
 
 
-def load_for_cores(artifact: Path, most: int) -> list[Policy]:
-    """Load a policy of one thread for each core, `most` at most.
+def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V]) -> Iterator[tuple[K, V]]:
+    """Call do(policy, question) for each question on a thread for each core; yield (question, answer) when ready.
 
-    One policy on all cores would be slower: once torch has a second thread, it spins between inferences, which costs
-    several times what it gains for a small policy.
+    Each thread loads the policy for itself, to be run by that thread alone: once torch has a second thread, it spins
+    between inferences, which costs several times what it gains for a small policy. Answers do not depend on it.
     """
-    return [load_policy(artifact, threads=1) for _ in range(min(os.cpu_count() or 1, most))]
-
-
-def everywhere(policies: Sequence[P], asked: Sequence[K], do: Callable[[P, K], V]) -> Iterator[tuple[K, V]]:
-    """Call do(policy, question) for each question on a thread for each policy; yield (question, answer) when ready.
-
-    policies: the same policy, loaded once for each thread. Answers do not depend on how many there are.
-    """
-    free: queue.SimpleQueue[P] = queue.SimpleQueue()
-    for policy in policies:
-        free.put(policy)
+    own = threading.local()
 
     def one(question: K) -> tuple[K, V]:
-        policy = free.get()
-        try:
-            return question, do(policy, question)
-        finally:
-            free.put(policy)
+        if not hasattr(own, "policy"):
+            own.policy = load_policy(artifact, threads=1)
+        return question, do(own.policy, question)
 
-    with ThreadPoolExecutor(max(len(policies), 1)) as pool:
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(asked))) as pool:
         running = [pool.submit(one, question) for question in asked]
         try:
             for future in as_completed(running):
@@ -241,7 +232,7 @@ def drive_missing(
     kept = {(row["how"], row["seed"]): row for row in read_rows(path)}
     missing = [each for each in asked if each not in kept]
     if missing:
-        driven = everywhere(load_for_cores(artifact, len(missing)), missing, one)
+        driven = everywhere(artifact, missing, one)
         for (how, seed), found in progress(driven, desc=desc, total=len(missing)):
             kept[how, seed] = {"how": how, "seed": seed, **found}
             append_row(path, kept[how, seed])

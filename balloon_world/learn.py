@@ -3,14 +3,12 @@
     content = run_experiment("runs/demo", "runs/demo-learn")
 
 In each round the policy drives with late plans and is pushed. An expert takes over where a human would, and drives on
-to the end. Then the first checkpoint is trained further on everything recorded so far. The other arm learns the same
-way, but from as many seconds of whole drives by the same expert in such worlds. Both are judged in worlds in which
-neither learned.
-
-Every policy drives as its static INT8 artifact, which is what would drive the car.
+to the end. Then the first checkpoint is trained further on everything recorded so far. The other arm learns from as
+many seconds of whole drives by the same expert. Both are judged in worlds in which neither learned, as static INT8
+artifacts, which are what would drive the car.
 """
 
-import json
+import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -40,8 +38,8 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
-from rover_lib.onboard.stage import atomic_path, find_stage, plain, read_stage, sha256_of, write_stage
-from rover_lib.workshop.cache import car_in_key
+from rover_lib.onboard.stage import find_stage, plain, read_stage, sha256_of, write_stage
+from rover_lib.workshop.cache import car_in_key, key_of
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
@@ -52,7 +50,6 @@ from rover_lib.workshop.run.session import load
 CORRECTED, DEMONSTRATED = ARMS = ("corrected", "demonstrated")
 BEFORE = "before"  # the policy that both arms begin with
 PUSHED, ALONE, DECOY = "pushed", "alone", "decoy"
-ROUNDS, DRIVES, WORLDS, OTHER_WORLDS = 3, 20, 200, 100
 FIRST_LEARNED = 2_000_000  # seeds of the worlds to learn in, far from those of recordings and trials
 FIRST_DEMONSTRATED = 3_000_000
 FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # invented, so that a seed's recording always has the same bytes
@@ -65,7 +62,7 @@ CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt
 JUDGING = ("worlds", "other_worlds")
 HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
 NOTHING = "Nothing is here yet: `rover world learn runs/demo` drives, corrects and learns."
-BEGUN, DRIVES_FILE = "experiment.json", "drives.jsonl"
+DRIVES_FILE = "drives.jsonl"
 
 
 @dataclass(frozen=True)
@@ -132,21 +129,16 @@ class Experiment:
     the recipe's if None.
     """
 
-    rounds: int = ROUNDS
-    drives: int = DRIVES
-    worlds: int = WORLDS
-    other_worlds: int = OTHER_WORLDS
+    rounds: int = 3
+    drives: int = 20
+    worlds: int = 200
+    other_worlds: int = 100
     latency_ms: float = 300.0
     pushes: int = 4
     decoys: int = 1
     human: Human = Human()
     samples: int = 700
     steps: int | None = None
-
-    def __post_init__(self):
-        if min(self.rounds, self.drives, self.worlds, self.other_worlds) < 1:
-            found = f"{self.rounds}, {self.drives}, {self.worlds} and {self.other_worlds}"
-            raise TrainingError("learning needs at least one round, drive and world", found=found)
 
     def drive(self, policy: Policy, world: World, watch: Watch | None = None) -> Driven:
         return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch)
@@ -155,17 +147,10 @@ class Experiment:
         """Return the world of a round's drive by its number."""
         return World(seed, self.pushes, self.decoys if number % 2 else 0)
 
-    def judged_in(self, how: str, seed: int) -> World:
-        return World(seed, self.pushes if how == PUSHED else 0, self.decoys if how == DECOY else 0)
-
-    def seeds(self, how: str) -> range:
-        """Return the seeds of the worlds that judge a policy that is pushed, left alone or beside a decoy."""
-        return range(SEED, SEED + (self.worlds if how == PUSHED else self.other_worlds))
-
     def recipe(self) -> FinetuneRecipe:
         """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
         alike: dict[str, Any] = {"correction_weight": 1.0, "held_out_share": 0.0, "judged_frames": JUDGED_FRAMES}
-        return FinetuneRecipe.of(params(), steps=self.steps, samples=self.samples, **alike)
+        return FinetuneRecipe.of(steps=self.steps, samples=self.samples, **alike)
 
 
 def run_experiment(
@@ -174,9 +159,9 @@ def run_experiment(
     """Run both arms, round by round; write and return learn.json in the run's folder, stage 'learn'.
 
     run_dir: has best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: keeps what is
-    recorded, learned and driven on the way; after an end at any moment, the same call goes on from there. A learn.json
-    that was made from the same files and parameters is read, not made again.
-    Raises TrainingError if the run lacks a file or out_dir belongs to another experiment.
+    recorded, learned and driven on the way, by experiment; after an end at any moment, the same call goes on from
+    there. A learn.json that was made from the same files and parameters is read, not made again.
+    Raises TrainingError if the run lacks a file.
     """
     experiment = experiment or Experiment()
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
@@ -190,8 +175,7 @@ def run_experiment(
     if there := find_stage(path, "learn", params=given, inputs=inputs):
         return there
     learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
-    _begin(out_dir, {"params": learned, "inputs": inputs, "format": 2})
-    lab = _Lab(experiment, run_dir, out_dir, progress)
+    lab = _Lab(experiment, run_dir, out_dir / key_of({"params": learned, "inputs": inputs}), progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
     rows = lab.judge(rounds)
     content = {"rounds": rounds, "policies": rows, "pairs": _pairs(rows)}
@@ -200,22 +184,9 @@ def run_experiment(
 
 
 def read_experiment(run_dir: Path | str) -> dict[str, Any] | None:
-    """Read what `measured` left in a run's folder; None if there is nothing."""
+    """Read what `run_experiment` left in a run's folder; None if there is nothing."""
     path = Path(run_dir) / "learn.json"
     return read_stage(path, "learn") if path.is_file() else None
-
-
-def _begin(out_dir: Path, made_of: dict[str, Any]) -> None:
-    """Note in out_dir which experiment it belongs to. Raises TrainingError if it holds another one or other files."""
-    path = out_dir / BEGUN
-    if path.is_file() and json.loads(path.read_text()) == made_of:
-        return
-    if out_dir.is_dir() and any(out_dir.iterdir()):
-        remedy = "remove it, or name another folder with --out"
-        raise TrainingError(f"{out_dir}: exists, and is not of this experiment", remedy=remedy)
-    out_dir.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(made_of, indent=2) + "\n")
 
 
 class _Lab:
@@ -234,10 +205,8 @@ class _Lab:
         drives = self._drive(before, number)
         human_s = sum(d["human_s"] for d in drives)
         if not human_s and number == 1:
-            remedy = "drive more, later, or with more pushes"
-            raise TrainingError(
-                "nobody had to take over: there is nothing to learn from", found=len(drives), remedy=remedy
-            )
+            what, remedy = "nobody had to take over: nothing to learn from", "drive more, later, or with more pushes"
+            raise TrainingError(what, found=f"{len(drives)} drives", remedy=remedy)
         self._demonstrate(number, human_s)
         for arm in ARMS:
             if not self._learned(arm, number).is_file():
@@ -253,17 +222,11 @@ class _Lab:
 
     def _learn(self, arm: str, number: int, recorded: Sequence[Path]) -> None:
         """Train the first checkpoint further on these recordings too, and make the artifact."""
-        target = self._learned(arm, number)
+        target, runs_dir = self._learned(arm, number), self.folder / "learned"
         if not (target.parent / "finetune.json").is_file():
-            finetune(
-                self.run_dir / CHECKPOINT,
-                [self.run_dir / EPISODES, *recorded],
-                _name(arm, number),
-                runs_dir=self.folder / "learned",
-                recipe=self.experiment.recipe(),
-                device="cpu",
-                progress=self.progress,
-            )
+            episodes, recipe = [self.run_dir / EPISODES, *recorded], self.experiment.recipe()
+            how: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "device": "cpu", "progress": self.progress}
+            finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), **how)
         learned = load(target.parent / CHECKPOINT, self.run_dir / EPISODES, self.progress)
         make_artifact(learned, target, pipeline.Recipe.of(params()), progress=self.progress)
 
@@ -280,19 +243,19 @@ class _Lab:
         desc = f"driving, round {number}"
         return list(drive_missing(artifact, asked, one, folder / DRIVES_FILE, self.progress, desc).values())
 
-    def _demonstrate(self, number: int, most_s: float) -> None:
-        """Record most_s seconds of whole drives by the expert; the last drive is cut."""
+    def _demonstrate(self, number: int, left_s: float) -> None:
+        """Record left_s seconds of whole drives by the expert; the last drive is cut."""
         folder, first = self.folder / _name(DEMONSTRATED, number), 1000 * number
         _remove_unfinished(folder)
         done = {row["seed"]: row["human_s"] for row in read_rows(folder / DRIVES_FILE)}
-        i, left_s = 0, most_s
-        while left_s > HALF_A_TICK_S:
+        for i in itertools.count():
+            if left_s <= HALF_A_TICK_S:
+                return
             seed = FIRST_DEMONSTRATED + first + i
             if seed not in done:
                 done[seed] = demonstrate(folder, first + i, self.experiment.learned_in(i, seed), left_s)
                 append_row(folder / DRIVES_FILE, {"seed": seed, "human_s": done[seed]})
             left_s -= done[seed]
-            i += 1
 
     def judge(self, rounds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Drive every policy through the worlds that judge, and return the rows of learn.json.
@@ -300,10 +263,15 @@ class _Lab:
         A policy's file keeps its drives, so that only those that are missing are driven.
         """
 
-        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-            return {"outcome": self.experiment.drive(policy, self.experiment.judged_in(*asked)).outcome}
+        experiment = self.experiment
 
-        asked = [(how, seed) for how in HOW for seed in self.experiment.seeds(how)]
+        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
+            how, seed = asked
+            world = World(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
+            return {"outcome": experiment.drive(policy, world).outcome}
+
+        counts = {how: experiment.worlds if how == PUSHED else experiment.other_worlds for how in HOW}
+        asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
         learned = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
         rows = []
         for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *learned]:
@@ -397,15 +365,15 @@ def table(content: Mapping[str, Any] | None) -> Table:
         name = row["name"] if row["arm"] == BEFORE else f"{row['arm']}, round {row['round']}"
         rows.append((name, f"{row['human_s']:.0f}", *hits))
     return Table(
-        ("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval"] if content else [NOTHING]
+        ("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval" if content else NOTHING]
     )
 
 
 def rounds_table(content: Mapping[str, Any] | None) -> Table:
     """Show what each round cost as a table; None gives an empty one with a sentence that says what to do."""
-    rows = [
-        (str(r["round"]), f"{r['takeovers']} of {r['drives']}", f"{r['human_s']:.1f}", str(r["missed"]))
-        for r in (content["metrics"]["rounds"] if content else ())
-    ]
+    rows = []
+    for r in content["metrics"]["rounds"] if content else ():
+        takeovers = f"{r['takeovers']} of {r['drives']}"
+        rows.append((str(r["round"]), takeovers, f"{r['human_s']:.1f}", str(r["missed"])))
     header = ("round", "drives with a takeover", "human s", "missed all the same")
     return Table(header, rows, notes=() if content else (NOTHING,))

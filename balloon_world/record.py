@@ -1,8 +1,7 @@
-"""Record an expert's drives through balloon worlds as episodes in the user's format, and keep them in the cache."""
+"""Record an expert's drives through balloon worlds as episodes in the user's format."""
 
 import json
 import os
-import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
@@ -21,7 +20,7 @@ from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.recording import episode as recording
 from rover_lib.onboard.recording.episode import SIMULATED, About, EpisodeWriter
-from rover_lib.workshop.cache import cache_folder, key_of
+from rover_lib.workshop.cache import key_of
 from rover_lib.workshop.progress import Progress, silent
 
 LABEL = "hit red balloon"
@@ -45,25 +44,18 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
     out_dir = Path(out_dir)
     if count < 1 or seed < 0:
         raise TrainingError("a recording needs at least 1 episode and a seed from 0", found=f"{count} and {seed}")
-    params = {
-        "count": count,
-        "seed": seed,
-        "shoves": SHOVES,
-        "jpeg_quality": JPEG_QUALITY,
-        "cv2": cv2.__version__,
-        "car": this_car().description(),
-    }
-    key = key_of(params, world_module, recording, pwm_module, sys.modules[__name__])
+    made_of = {"count": count, "seed": seed, "shoves": SHOVES, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
+    made_of["car"] = this_car().description()
+    key = key_of(made_of, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         if _marker_of(out_dir) == key:
             return out_dir
-        raise TrainingError(
-            f"{out_dir}: exists and is not this recording", remedy="name another folder, or move it away first"
-        )
-    made = cache_folder("episodes", key, lambda folder: _record_all(folder, count, seed, key, progress))
+        remedy = "name another folder, or move it away first"
+        raise TrainingError(f"{out_dir}: exists and is not this recording", remedy=remedy)
     with build_folder(out_dir) as new:
-        # Copied and not linked: somebody who damages an episode to see what happens must not damage the cache.
-        shutil.copytree(made, new, dirs_exist_ok=True)
+        _record_all(new, count, seed, key, progress)
+        if out_dir.exists():
+            out_dir.rmdir()  # empty, and the recording takes its place whole
     return out_dir
 
 

@@ -17,14 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from balloon_world.drives import NoLog, TimedCar, WorldPilot
+from balloon_world.drives import NoLog, TimedCar
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.pwm import NEUTRAL
-from rover_lib.onboard.drive.flight_log import Tick
-from rover_lib.onboard.drive.loop import Until, drive
-from rover_lib.onboard.drive.plan import Commanded, Settings
-from rover_lib.onboard.errors import DriveFault
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 
@@ -40,7 +37,7 @@ PACE_S = 2.0  # the pace is that of the last seconds
 THREADS = 1
 SLOW = 0.9  # of the clock; the page speaks of a slower pace
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
-SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped"}
+SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
 
 Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
 
@@ -113,7 +110,7 @@ class Simulation:
             world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
-            outcome = car.drive(settings)
+            _, outcome = car.drive(settings, car.log)
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
                 self._results[name][0] += car.world.hit
@@ -136,12 +133,11 @@ class Simulation:
     def _seen(self, car: "PacedCar") -> tuple[dict[str, Any], bytes]:
         """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
         world, row, plan = car.world, car.log.row, car.newest()
-        frame, pace = world.render(), car.pace()
-        slow = (
-            f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
-            if pace < SLOW
-            else ""
-        )
+        frame, pace, slow = world.render(), car.pace(), ""
+        if pace < SLOW:
+            slow = (
+                f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
+            )
         head: dict[str, Any] = {
             "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
@@ -163,34 +159,14 @@ class Simulation:
         return head, cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
 
-class _LastTick(NoLog):
-    row: Tick | None = None
-
-    def tick(self, row: Any) -> None:
-        self.row = row
-
-
 class PacedCar(TimedCar):
     """A car in a world whose time goes as fast as the clock, or slower. seen: called for each picture to be shown."""
 
     def __init__(self, world: World, policy: Any, seen: Callable[["PacedCar"], object]):
-        self.policy, self.log, self._seen = policy, _LastTick(), seen
+        self.log, self._seen = NoLog(), seen
         self._due_s = self._shown_s = time.monotonic()
         self._times = deque([(self._due_s, 0.0)], maxlen=round(PACE_S * RATE_HZ))
-        self._commanded = Commanded()
-        super().__init__(world, policy, PLAN_S, self._commanded)
-
-    def drive(self, settings: Settings) -> str:
-        """Drive until the world ends or `stop` is set; return the outcome."""
-        pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, None)
-        try:
-            drive(
-                pilot, None, self.log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep
-            )
-        except DriveFault as fault:
-            if fault.__cause__:
-                raise fault.__cause__ from None
-        return self.world.outcome or "stopped"
+        super().__init__(world, policy, PLAN_S)
 
     def sleep(self, seconds: float) -> None:
         super().sleep(seconds)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from balloon_world import drives, trial, world
-from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere, load_for_cores, pair_worlds
+from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere, pair_worlds
 from balloon_world.trial import run_trials
 from balloon_world.world import World
 from rover_learn.distill import errors_of
@@ -35,7 +35,7 @@ from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, wors
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Recordings, Sample, Source, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, Source, pick_evenly
 
 WORLDS, PUSHES = 200, 4
 HELD_OUT_FRAMES = 300
@@ -44,7 +44,7 @@ ARTIFACT = f"policy_{GATED}.pt"
 HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
 COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = (
-    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates, as the teacher's instructions are not counted."
+    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates: the teacher's instructions are not counted."
 )
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 
@@ -82,7 +82,7 @@ class _Run:
             "name": self.name,
             "height": camera["height"],
             "width": camera["width"],
-            **{key: self.shape[key] for key in ("decoder_layers", "feedforward", "qat")},
+            **{key: self.shape[key] for key in ("decoder_layers", "feedforward")},
             "backbone_channels": self.shape.get("backbone_channels"),  # older students have all channels
             "gmac": self.manifest["gmac"],
             **{key: self.counts and self.counts[key] for key in ("instructions_g", "simd_g")},
@@ -119,10 +119,14 @@ def judge_students(
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
     samples = pick_evenly(parts.held_out, held_out_frames)
+    if not (reference := folder / "policy_fp32.pt").is_file():
+        raise TrainingError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
+    taught = _plans(reference, f"{TEACHER} in float", samples, progress)
     counted = runs[0].counts is not None
     rows = []
-    for run, errors in zip(runs, _errors(folder, runs, samples, recordings, progress), strict=True):
-        row = run.row() | errors
+    for run in runs:
+        plans = _plans(run.artifact, run.name, samples, progress)
+        row = run.row() | errors_of(plans, taught, samples, recordings.action_range())
         pushed_ms = (row["computed_ms"] or (None, None))[1] if counted else estimate_ms(run.manifest["gmac"])
         rows.append(row | _drives(run, worlds, pushed_ms, progress))
     notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
@@ -138,13 +142,8 @@ def judge_students(
         "warnings": not_judged(recordings.action_range()),
         "notes": notes,
     }
-    how = {
-        "worlds": worlds,
-        "seed": SEED,
-        "pushes": PUSHES,
-        "drive": p["drive"],
-        "students": [r.name for r in runs[1:]],
-    }
+    how = {"worlds": worlds, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
+    how["students"] = [run.name for run in runs[1:]]
     inputs = {f"{run.name}/{ARTIFACT}": sha256_of(run.artifact) for run in runs}
     return write_stage(folder / "students.json", "students", params=how, metrics=metrics, inputs=inputs)
 
@@ -162,24 +161,11 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
         of_teacher, own = taught["metrics"]["students"]
         runs = runs or [_Run.read(folder, TEACHER, of_teacher)]
         runs.append(_Run.read(student, student.name, own))
-        if runs[0].manifest["checkpoint"]["sha256"] not in taught["inputs"].values():
-            raise TrainingError(f"{student}: is a student of another checkpoint than {folder / ARTIFACT} is made of")
-        if runs[-1].manifest["checkpoint"]["sha256"] not in taught["metrics"]["files_sha256"].values():
-            remedy = "'rover run' makes it anew"
-            raise TrainingError(f"{student / ARTIFACT}: is not made of the student that was distilled", remedy=remedy)
+        teacher, made = (run.manifest["checkpoint"]["sha256"] for run in (runs[0], runs[-1]))
+        if teacher not in taught["inputs"].values() or made not in taught["metrics"]["files_sha256"].values():
+            what = f"{student / ARTIFACT}: its checkpoint is not the student, or {folder / ARTIFACT} not its teacher's"
+            raise TrainingError(what, remedy="'rover run' makes artifacts anew")
     return runs
-
-
-def _errors(
-    folder: Path, runs: Sequence[_Run], samples: Sequence[Sample], recordings: Recordings, progress: Progress
-) -> list[dict[str, float | None]]:
-    """Return each artifact's errors against the plans of the teacher's policy_fp32.pt and against the recordings."""
-    reference = folder / "policy_fp32.pt"
-    if not reference.is_file():
-        raise TrainingError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
-    taught = _plans(reference, f"{TEACHER} in float", samples, progress)
-    planned = [_plans(run.artifact, run.name, samples, progress) for run in runs]
-    return [errors_of(plans, taught, samples, recordings.action_range()) for plans in planned]
 
 
 def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
@@ -192,7 +178,7 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
         def one(policy: Policy, i: int) -> np.ndarray:
             return policy.predict_chunk(samples[i].frame_bgr(), samples[i].state)
 
-        every = everywhere(load_for_cores(artifact, len(samples)), range(len(samples)), one)
+        every = everywhere(artifact, range(len(samples)), one)
         planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
@@ -292,7 +278,7 @@ def table(metrics: Mapping[str, Any]) -> Table:
 def shape_of(row: Mapping[str, Any]) -> str:
     layers = f"{row['decoder_layers']} decoder layer{'s' if row['decoder_layers'] != 1 else ''}"
     share = f", {row['backbone_channels']:.0%} of the channels" if row.get("backbone_channels") else ""
-    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}{', QAT' if row['qat'] else ''}"
+    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}"
 
 
 def _hits(row: Mapping[str, Any], kind: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from balloon_world.world import RATE_HZ, World
+from balloon_world.world import World
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.progress import Progress, silent
@@ -43,14 +43,16 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class WorldResult:
-    """The drive in one world. outcome: 'hit', 'left' or 'timeout'. nearest_m: least distance from camera to balloon."""
+    """The drive in one world. outcome: 'hit', 'left' or 'timeout'."""
 
     seed: int
     outcome: str
-    hit: bool
     duration_s: float
-    nearest_m: float
     trajectory: Trajectory
+
+    @property
+    def hit(self) -> bool:
+        return self.outcome == "hit"
 
 
 @dataclass(frozen=True)
@@ -98,15 +100,13 @@ def run_trials(
         raise TrainingError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
     if not 1 <= replan_every <= policy.chunk:
         raise TrainingError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk", found=replan_every)
-    seeds = range(seed, seed + worlds)
     results: list[WorldResult] = []
     seen: list[tuple[np.ndarray, np.ndarray]] = []
-    stride = 1  # doubles whenever too many are kept, so that memory is bounded and the pairs come from all drives
-    shown = 0
+    stride, shown = 1, 0  # the stride doubles whenever too many are kept: memory is bounded, and all drives are there
     # A policy of recordings that were made when the default car turned left drives a car that does.
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None
-    for world_seed in progress(seeds, desc="driving", total=worlds):
+    for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
         result, pairs = _drive(policy, World(world_seed, left=left), replan_every)
         results.append(result)
         for pair in pairs:
@@ -114,8 +114,7 @@ def run_trials(
                 seen.append(pair)
             shown += 1
             if len(seen) > keep_frames:
-                seen = seen[::2]
-                stride *= 2
+                seen, stride = seen[::2], 2 * stride
     hits = sum(r.hit for r in results)
     return TrialReport(hits, worlds, wilson_interval(hits, worlds), results, seen)
 
@@ -133,20 +132,16 @@ def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any)
 def _drive(policy: Any, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
     state: np.ndarray = np.zeros(2, np.float32)
     pairs = []
-    nearest = world.balloon_seen()[0]
     while not world.done:
         frame = world.render()
         pairs.append((frame, state))
         chunk = np.asarray(policy.predict_chunk(frame, state))
         if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
-            raise TrainingError(
-                "the policy must plan finite (steps, 2) actions", found=f"{chunk.shape} in world {world.seed}"
-            )
+            found = f"{chunk.shape} in world {world.seed}"
+            raise TrainingError("the policy must plan finite (steps, 2) actions", found=found)
         for steering, throttle in chunk[:replan_every]:
-            world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)), 1 / RATE_HZ)
+            world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)))
             state = np.array([steering, throttle], np.float32)
-            nearest = min(nearest, world.balloon_seen()[0])
             if world.done:
                 break
-    outcome, duration_s = str(world.outcome), world.state.time_s
-    return WorldResult(world.seed, outcome, world.hit, duration_s, nearest, Trajectory.of(world)), pairs
+    return WorldResult(world.seed, str(world.outcome), world.state.time_s, Trajectory.of(world)), pairs

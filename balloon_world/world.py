@@ -10,6 +10,7 @@ wheelbase and the field of view come from car.yml.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,16 +55,12 @@ FLOOR_PX_PER_M = 160
 FLOOR_TILE_PX = 640
 FAR_ROWS = 24  # rows below the horizon that show a blurred floor, as a sharp one would flicker so far away
 
+# fmt: off
 _DISTRACTOR_BGR = (
-    (190, 90, 30),
-    (70, 150, 40),
-    (40, 190, 215),
-    (150, 60, 120),
-    (205, 200, 195),
-    (45, 45, 45),
-    (170, 170, 40),
-    (90, 115, 140),
+    (190, 90, 30), (70, 150, 40), (40, 190, 215), (150, 60, 120),
+    (205, 200, 195), (45, 45, 45), (170, 170, 40), (90, 115, 140),
 )
+# fmt: on
 
 
 @dataclass(frozen=True)
@@ -219,29 +216,16 @@ class World:
         s = self.state
         cos, sin = math.cos(s.heading_rad), math.sin(s.heading_rad)
         # Below the horizon a pixel (u, v) shows the floor at ahead = f h / (v - v0), left = (u0 - u) h / (v - v0).
-        to_local = np.array(
-            [
-                [0, 0, FOCAL_PX * CAMERA_HEIGHT_M],
-                [-CAMERA_HEIGHT_M, 0, CENTRE_COLUMN * CAMERA_HEIGHT_M],
-                [0, 1, -HORIZON_ROW],
-            ]
-        )
+        ahead, left = [0, 0, FOCAL_PX * CAMERA_HEIGHT_M], [-CAMERA_HEIGHT_M, 0, CENTRE_COLUMN * CAMERA_HEIGHT_M]
+        to_local = np.array([ahead, left, [0, 1, -HORIZON_ROW]])
         to_floor = np.array([[cos, -sin, s.x_m], [sin, cos, s.y_m], [0, 0, 1]])
-        for texture, first, last in (
-            (self._far_floor, HORIZON_ROW, HORIZON_ROW + FAR_ROWS),
-            (self._floor, HORIZON_ROW + FAR_ROWS, FRAME_HEIGHT),
-        ):
+        middle, flags = HORIZON_ROW + FAR_ROWS, cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        for texture, first, last in ((self._far_floor, HORIZON_ROW, middle), (self._floor, middle, FRAME_HEIGHT)):
             px_per_m = FLOOR_PX_PER_M * texture.shape[0] / FLOOR_TILE_PX
             from_crop = np.array([[1, 0, 0], [0, 1, first + 0.5], [0, 0, 1.0]])
             matrix = np.diag([px_per_m, px_per_m, 1]) @ to_floor @ to_local @ from_crop
-            cv2.warpPerspective(
-                texture,
-                matrix,
-                (FRAME_WIDTH, last - first),
-                dst=frame[first:last],
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                borderMode=cv2.BORDER_WRAP,
-            )
+            where: dict[str, Any] = {"dst": frame[first:last], "flags": flags, "borderMode": cv2.BORDER_WRAP}
+            cv2.warpPerspective(texture, matrix, (FRAME_WIDTH, last - first), **where)
 
 
 def expert(world: World) -> tuple[float, float]:
@@ -403,19 +387,8 @@ def _draw_sphere(frame: np.ndarray, column: float, row: float, radius: float, co
     rings = int(np.clip(radius / 8, 3, 14))  # enough that a near balloon shows no steps
     for i in range(rings):
         share = i / (rings - 1)
-        size = radius * (1 - 0.85 * share)
-        shade = 0.62 + 0.50 * share
-        lift = 70 * max(0.0, share - 0.7) / 0.3
-        centre = ((column - 0.28 * radius * share) * _ONE, (row - 0.33 * radius * share) * _ONE)
-        cv2.ellipse(
-            frame,
-            (round(centre[0]), round(centre[1])),
-            (max(1, round(size * _ONE)), max(1, round(1.12 * size * _ONE))),
-            0,
-            0,
-            360,
-            [min(255.0, c * shade + lift) for c in colour],
-            cv2.FILLED,
-            cv2.LINE_AA,
-            _SHIFT,
-        )
+        size, shade, lift = radius * (1 - 0.85 * share), 0.62 + 0.50 * share, 70 * max(0.0, share - 0.7) / 0.3
+        centre = round((column - 0.28 * radius * share) * _ONE), round((row - 0.33 * radius * share) * _ONE)
+        axes = max(1, round(size * _ONE)), max(1, round(1.12 * size * _ONE))
+        lit = [min(255.0, c * shade + lift) for c in colour]
+        cv2.ellipse(frame, centre, axes, 0, 0, 360, lit, cv2.FILLED, cv2.LINE_AA, _SHIFT)

@@ -20,7 +20,6 @@ FEW: dict[str, Any] = {
     "iterations": 5,
     "latencies_ms": [0, 150],
     "pushed_latencies_ms": [150],
-    "shown_ms": 150,
     "students": ["../runs/demo-small"],
 }
 

@@ -25,6 +25,12 @@ DRAWN = 10_000
 OLD, NEW = KINDS = ("old", "new")
 
 
+RULE = (
+    f"better: on new held-out episodes nearer to the human than chance explains (randomisation test over episodes, "
+    f"below {CHANCE:g}), and on old ones not further away in that sense; at least {LEAST_EPISODES} of each"
+)
+
+
 @dataclass(frozen=True)
 class Judged:
     """A held-out episode. kind: 'old' or 'new'. frames: how many frames the errors are of.
@@ -49,20 +55,17 @@ class Judged:
     @property
     def change_points(self) -> float:
         """The change of the error (after - before), mean over the judged actions. Below 0 is better."""
-        changes = [after - before for before, after in zip(self.before.values(), self.after.values(), strict=True)
-                   if before is not None and after is not None]  # fmt: skip
+        pairs = [(self.before[action], self.after[action]) for action in self.before]
+        changes = [after - before for before, after in pairs if before is not None and after is not None]
         return float(np.mean(changes)) if changes else 0.0
 
 
 def chance_of(changes: Sequence[float]) -> float:
     """The two-sided p-value: how often changes with random signs have a mean at least as far from 0.
 
-    Returns 1 for no changes. If signs are drawn at random, the actual ones count as one more draw, so that the result
-    is never 0.
+    If signs are drawn at random, the actual ones count as one more draw, so that the result is never 0.
     """
     found = np.asarray(changes, float)
-    if not len(found):
-        return 1.0
     if len(found) <= EXACT:
         signs = np.array(list(product((-1.0, 1.0), repeat=len(found))))
     else:
@@ -85,11 +88,7 @@ def verdict(judged: Sequence[Judged]) -> dict[str, Any]:
             "chance": chance_of(changes) if changes else None,
         }
     better, why = _judge(kinds)
-    rule = (
-        f"better: on new held-out episodes nearer to the human than chance explains (randomisation test over episodes, "
-        f"below {CHANCE:g}), and on old ones not further away in that sense; at least {LEAST_EPISODES} of each"
-    )
-    return {"better": better, "why": why, "rule": rule, "kinds": kinds}
+    return {"better": better, "why": why, "rule": RULE, "kinds": kinds}
 
 
 def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
@@ -103,24 +102,15 @@ def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
         return False, f"worse: on the new episodes it is {moved[NEW]:.2f} points further from the human"
     if NEW not in moved:
         return None, "undecided: on the new episodes the difference may be chance"
-    return (
-        True,
-        f"better: on the new episodes it is {-moved[NEW]:.2f} points nearer to the human, and no worse on the old",
-    )
+    why = f"better: on the new episodes it is {-moved[NEW]:.2f} points nearer to the human, and no worse on the old"
+    return True, why
 
 
 def summary(content: Mapping[str, Any]) -> str:
     """The content of finetune.json as text for people."""
     metrics = content["metrics"]
-    counts = ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in metrics["learned_from"].items())
-    lines = [f"frames: {counts}"]
+    lines = ["frames: " + ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in metrics["learned_from"].items())]
     for row in metrics["held_out"]:
         errors = [f"{key.removesuffix('_pct')} {format_pct(row[key]).strip()}" for key in row if key.endswith("_pct")]
         lines.append(f"{row['kind']} {row['episode']}, error: {', '.join(errors)}".replace("_", " "))
-    for kind, each in metrics["verdict"]["kinds"].items():
-        if each["episodes"]:
-            lines.append(
-                f"{kind}: {each['better']} of {each['episodes']} better, {each['worse']} worse, on average by "
-                f"{each['change_points']:+.2f} points; chance alone: {each['chance']:.2g}"
-            )
     return "\n".join([*lines, metrics["verdict"]["why"], *metrics["warnings"]])

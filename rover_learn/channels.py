@@ -8,17 +8,16 @@ LeRobot runs such a file as any other. Our policies are built without channels t
 (`act.fold_block`), and training keeps them so: where a filter and its reader are zero both, neither gets a gradient.
 """
 
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from rover_learn.lessons import BatchedPolicy
-from rover_learn.refit import Gram, refit_layer
+from rover_learn.refit import grams_of, refit_layer
 from rover_lib.workshop.act import ActConfig, Weights, backbone_blocks, norm_gain
 
 TILE = 16  # XNNPACK's INT8 kernels compute 16 channels at a time: 17 cost as much as 32
@@ -47,35 +46,21 @@ def without_channels(
     names = backbone_blocks(config.backbone)
     widths = {name: len(made[f"{name}.bn1.weight"]) for name in names}
     names = [name for name in names if kept_of(widths[name], share) < widths[name]]
+    policy = BatchedPolicy(config, made)
+    readers = {name: policy.backbone.get_submodule(f"{name.removeprefix('backbone.')}.conv2") for name in names}
+
+    def some_patches(x: Tensor) -> Iterator[Tensor]:
+        for patches in F.unfold(x, 3, padding=1).transpose(1, 2):  # (B, places, channels * TAPS)
+            yield patches[rng.permutation(len(patches))[:PATCHES]]
+
     notes = []
-    for name, gram in _grams(BatchedPolicy(config, made), names, pictures, rng).items():
+    for name, gram in grams_of(
+        readers, some_patches, lambda: [policy.features(shown).shape for shown in pictures]
+    ).items():
         kept = _choose(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
         errors = _leave_out(made, name, kept, gram)
         notes.append({"block": name, "channels": len(kept), "of": widths[name], **errors})
     return made, notes
-
-
-def _grams(
-    policy: BatchedPolicy, names: list[str], pictures: Iterable[Tensor], rng: np.random.Generator
-) -> dict[str, Tensor]:
-    """By block, the mean of u u^T, u a patch that its second convolution reads, (channels * TAPS,), and a 1."""
-    grams = {name: Gram() for name in names}
-
-    def watch(gram: Gram):
-        def hook(conv2: nn.Module, args: tuple[Tensor]) -> None:
-            patches = F.unfold(args[0], 3, padding=1).transpose(1, 2)  # (B, places, channels * TAPS)
-            for of_picture in patches:
-                gram.add(of_picture[rng.permutation(len(of_picture))[:PATCHES]])
-
-        return hook
-
-    with ExitStack() as hooks:
-        for name, gram in grams.items():
-            conv2 = policy.backbone.get_submodule(f"{name.removeprefix('backbone.')}.conv2")
-            hooks.enter_context(conv2.register_forward_pre_hook(watch(gram)))
-        for shown in pictures:
-            policy.features(shown)
-    return {name: gram.mean() for name, gram in grams.items()}
 
 
 def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:

@@ -1,5 +1,6 @@
 """The commands that teach policies. `rover` has them by entry points of pyproject.toml."""
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -17,20 +18,23 @@ if TYPE_CHECKING:
 
 
 def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a training whose recipe is a section of params.yml."""
+    """Add the options of a training whose recipe is a section of params.yml. It gets its numbers as `given`."""
+
+    @functools.wraps(command)
+    def called(samples: int | None, steps: int | None, seed: int | None, **options: Any) -> None:
+        return command(given={"samples": samples, "steps": steps, "seed": seed}, **options)
+
     for option in (
         AS_JSON,
         click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]"),
         click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]"),
-        click.option(
-            "--steps", type=click.IntRange(min=1), help="Optimiser steps of all phases [default: params.yml]."
-        ),
+        click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml]."),
         click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml]."),
         click.option("--runs-dir", type=FILE, default="runs", show_default=True),
         click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/."),
     ):
-        command = option(command)
-    return command
+        called = option(called)
+    return called
 
 
 def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json: bool) -> None:
@@ -40,7 +44,7 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json:
     click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
 
 
-@click.command(short_help="Teach a smaller policy, or train one for INT8.")
+@click.command(short_help="Teach a smaller policy.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
 @click.option(
@@ -49,21 +53,15 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json:
 @click.option("--decoder-layers", type=int, metavar="N", help="Keep only the first N decoder layers.")
 @click.option("--feedforward", type=int, metavar="N", help="Keep the N most important units of each feed-forward.")
 @click.option(
-    "--backbone-channels",
-    type=float,
-    metavar="SHARE",
-    help="Keep this share, such as 0.5, of the channels inside the backbone's blocks.",
+    "--backbone-channels", type=float, metavar="SHARE", help="Of the channels inside its blocks, such as 0.5."
 )
-@click.option("--qat", is_flag=True, help="Train it for INT8 at the end; without a new shape, CHECKPOINT itself.")
 @of_a_recipe
 @with_source
 def distill(
     checkpoint: Path,
     episodes: "Source",
     size: tuple[int, int] | None,
-    samples: int | None,
-    steps: int | None,
-    seed: int | None,
+    given: dict[str, Any],
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -75,13 +73,11 @@ def distill(
     from rover_learn.distill import DistillRecipe, phases_of, summary
     from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
-    from rover_lib.onboard.params import params
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     shape = StudentShape(height, width, **parts)
-    given = {"steps": steps, "samples": samples, "seed": seed}
-    recipe = DistillRecipe.of(params(), phases=phases_of(shape, options["qat"]), **given)
+    recipe = DistillRecipe.of(phases=phases_of(shape), **given)
     folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary, as_json)
 
@@ -97,9 +93,7 @@ def finetune(
     checkpoint: Path,
     episodes: tuple[Path, ...],
     weight: float | None,
-    samples: int | None,
-    steps: int | None,
-    seed: int | None,
+    given: dict[str, Any],
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -113,21 +107,19 @@ def finetune(
     from rover_learn.acceptance import summary
     from rover_learn.finetune import FinetuneRecipe
     from rover_learn.finetune import finetune as learn_on
-    from rover_lib.onboard.params import params
 
-    recipe = FinetuneRecipe.of(params(), steps=steps, correction_weight=weight, samples=samples, seed=seed)
+    recipe = FinetuneRecipe.of(correction_weight=weight, **given)
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary, as_json)
 
 
-@click.command(short_help="Make many runs from one sheet, and compare them.")
+@click.command(short_help="Make many runs from one sheet.")
 @click.argument("sheet", type=FILE)
 @click.option("--out", type=FILE, help="The sweep's folder [default: runs/<the sheet's name>].")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine [default: one for two cores].")
 @click.option("--scheduler", metavar="tcp://HOST:8786", help="A Dask cluster instead of this machine.")
-@AS_JSON
-def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None, as_json: bool) -> None:
-    """Make all runs that the file SHEET asks for, and say which are the best.
+def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None) -> None:
+    """Make all runs that the file SHEET asks for; `rover inspect` of the sweep's folder compares them.
 
     SHEET names checkpoints, recordings, students to teach and settings to vary. Every combination is a run with its own
     folder inside the sweep's. Finished runs are not made again: after Ctrl-C, a power cut or a new line in SHEET, the
@@ -140,11 +132,7 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
     jobs, folder = sweeping.read_sheet(sheet), out or Path("runs") / sheet.stem
     with sweeping.open_cluster(scheduler, workers) as client:
         failed = sweeping.sweep(jobs, folder, client, progress=terminal_bar())
-    content = sweeping.write_report(jobs, folder, failed)
-    if as_json:
-        click.echo(json.dumps(content, indent=2))
-    else:
-        click.echo("\n".join([*sweeping.table(content["metrics"]["runs"]), "", f"done: {folder / sweeping.REPORT}"]))
+    click.echo(f"done: {len(jobs) - len(failed)} runs; compare them: rover inspect {folder}")
     for name, sentence in failed.items():
         click.echo(f"rover: {name} failed: {sentence}", err=True)
     if failed:

@@ -11,7 +11,7 @@ and a state.
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,8 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_learn.training import Frames, Given, Resumable, RowFile, frames_of, swap_states
-from rover_lib.onboard.errors import RoverError
+from rover_learn.training import Frames, Given, Resumable, RowFile, swap_states
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine, lerobot_act
@@ -36,7 +35,6 @@ MIRROR = np.array([-1, 1], np.float32)  # a mirrored view multiplies steering an
 LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # a picture is multiplied by the first as a whole, by the second per colour
 SMALLEST_RANGE = 0.02  # at least, for an action that hardly changes: errors are divided by the range
 FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
-STRANGER = 2.0  # a policy with more than this many times the error of one constant action is not of this car
 
 
 class BatchedPolicy(nn.Module):
@@ -100,7 +98,7 @@ class BatchedPolicy(nn.Module):
 
 @torch.inference_mode()
 def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
-    """Return what a policy would drive on the samples, (n, C, A) float32, clipped to what a pulse can express."""
+    """Return what a policy would drive on the samples, (n, C, A) float32, clipped to their car's limits."""
     device, (size,) = policy.image_scale.device, policy.config.image_sizes
     plans = []
     firsts = range(0, len(samples), BLOCK)
@@ -109,12 +107,8 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
         frames = torch.from_numpy(np.stack([prepare_frame(s.frame_bgr(), *size) for s in block]))
         states = torch.from_numpy(np.stack([s.state for s in block]).astype(np.float32))
         plans.append(policy(frames.to(device), states.to(device)).cpu().numpy())
-    return as_driven(np.concatenate(plans), policy.config.action_names, samples)
-
-
-def as_driven(plans: np.ndarray, action_names: Sequence[str], samples: Sequence[Sample]) -> np.ndarray:
-    """Plans, (n, C, A), clipped to what a pulse of the samples' car can express. Raises EpisodeError as car_of()."""
-    return plans.clip(*action_limits(action_names, car_of(samples)))
+    limits = action_limits(policy.config.action_names, car_of(samples))
+    return np.concatenate(plans).clip(*limits)
 
 
 def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:
@@ -131,16 +125,14 @@ def in_another_light(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """n samples, each seen in two views.
+    """n samples, each seen in two views: a file has a row for each sample, or the row 2 * sample + view.
 
-    A file has a row for each sample, or for each view the row 2 * sample + view. data: the recorded samples. asked:
-    (2 n, 2) float32, the states with which the teacher plans. frames: a row for each sample, (height, width, 3) uint8
-    RGB at the student's size, not mirrored. maps: a row for each view, (D, h, w) float16, the teacher's feature map
-    pooled to the student's grid. plans: a row for each view, (C, A) float32, the teacher's. tokens: a row for each
-    view, (D, h, w) float16, the student's own feature map; empty until `see`.
+    data: the recorded samples. asked: (2 n, 2) float32, the states with which the teacher plans. frames: a row for each
+    sample, (height, width, 3) uint8 RGB at the student's size, not mirrored. maps: for each view, (D, h, w) float16,
+    the teacher's feature map pooled to the student's grid. plans: for each view, (C, A) float32, the teacher's. tokens:
+    for each view, (D, h, w) float16, the student's own feature map; empty until `see`.
     """
 
-    samples: tuple[Sample, ...]
     data: Frames
     asked: np.ndarray
     frames: RowFile
@@ -156,15 +148,13 @@ class Lessons:
 
         config: the student's. rng: draws the states.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         (size,) = config.image_sizes
-        data = frames_of(samples, *size)
+        data = Frames.of(samples, size)
         seen = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
         rows = np.arange(len(data))
         asked = np.stack([swap_states(data, rows, rng) for _ in VIEWS], 1)
         asked[:, MIRRORED] *= MIRROR
         return cls(
-            samples,
             data,
             asked.reshape(-1, 2),
             RowFile(folder / "frames", (*size, 3), np.uint8),
@@ -176,35 +166,28 @@ class Lessons:
     def __len__(self) -> int:
         return len(self.data)
 
-    def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
-        """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
-        frames = self.frames[rows]
-        return np.where((views == MIRRORED)[:, None, None, None], frames[:, :, ::-1], frames)
+    def apart(self, folder: Path) -> "Lessons":
+        """Return the same lessons for a student whose backbone differs, with tokens of its own, still to be seen."""
+        return replace(self, tokens=RowFile(folder / "tokens", self.tokens.shape, np.float16))
 
     @property
     def blocks(self) -> int:
         """The number of blocks of BLOCK samples."""
         return -(-len(self) // BLOCK)
 
+    def _rows(self, block: int) -> np.ndarray:
+        return np.arange(block * BLOCK, min((block + 1) * BLOCK, len(self)))
+
+    def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
+        """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
+        frames = self.frames[rows]
+        return np.where((views == MIRRORED)[:, None, None, None], frames[:, :, ::-1], frames)
+
     def each_once(self) -> Iterator[np.ndarray]:
         """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
         for block in range(self.blocks):
             rows = self._rows(block)
             yield self.pictures(rows, rows % len(VIEWS))
-
-    def _rows(self, block: int) -> np.ndarray:
-        return np.arange(block * BLOCK, min((block + 1) * BLOCK, len(self)))
-
-    def apart(self, folder: Path) -> "Lessons":
-        """Return the same lessons with tokens of their own, still empty, in a folder.
-
-        A student whose backbone differs from all others needs them.
-        """
-        return replace(self, tokens=RowFile(folder / "tokens", self.tokens.shape, np.float16))
-
-    def recorded(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
-        """Return what the driver did next, (B, C, A) float32, mirrored where views says so."""
-        return self.data.chunks[rows] * np.where((views == MIRRORED)[:, None], MIRROR, 1)[:, None].astype(np.float32)
 
     @torch.inference_mode()
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
@@ -214,39 +197,26 @@ class Lessons:
         for block in blocks:
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
             rows, grid = self._rows(block), (self.maps.shape[1], self.maps.shape[2])
-            pictures = [self.samples[i].frame_bgr() for i in rows]
-            self.frames.append(np.stack([prepare_frame(p, *self.frames.shape[:2]) for p in pictures]))
+            pictures = [self.data.samples[i].frame_bgr() for i in rows]
+            self.frames.append(np.stack([prepare_frame(p, *self.data.size) for p in pictures]))
             (size,) = teacher.config.image_sizes
-            frames = torch.from_numpy(np.stack([prepare_frame(p, *size) for p in pictures])).to(device)
-            seen = policy.features(torch.stack([frames, frames.flip(2)], 1).flatten(0, 1))
+            seen = policy.features(_in_both_views(np.stack([prepare_frame(p, *size) for p in pictures]), device))
             states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
             self.maps.append(F.adaptive_avg_pool2d(seen, grid).half().cpu())
             self.plans.append(policy.plan(seen, states).cpu())
 
-    def refuse_stranger(
-        self, teacher: Checkpoint, ranges: np.ndarray, error: type[RoverError], which: str, remedy: str
-    ) -> None:
-        """Raise `error` if the teacher knows nothing of these drives, as it is for another car or camera.
-
-        ranges: (A,), from `judged_ranges`. which: the recordings, in words.
-        """
-        actions, driven = self.data.chunks, ~self.data.is_pad
-        constant = (np.abs(actions - np.median(actions[driven], axis=0)) / ranges)[driven].mean(0)
-        as_recorded = (self.asked[::2] == self.data.states).all(1)  # planned with the sample's own state
-        plans = self.plans[2 * np.arange(len(self))]
-        planned = (np.abs(plans - actions) / ranges)[driven & as_recorded[:, None]].mean(0)
-        if (planned > STRANGER * constant).all():
-            found = f"{100 * planned.min():.0f} % off instead of {100 * constant.max():.0f} %"
-            what = f"{teacher.path}: on {which} recordings its plans are worse than one action for all frames"
-            raise error(what, found=found, remedy=remedy)
-
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
         """Compute the student's own feature maps of every sample in both views, as far as they are missing."""
-        device = student.image_scale.device
         for block in saved.steps("tokens", self.blocks, rng, tokens=self.tokens):
-            frames = torch.from_numpy(self.frames[self._rows(block)]).to(device)
-            self.tokens.append(student.features(torch.stack([frames, frames.flip(2)], 1).flatten(0, 1)).half().cpu())
+            frames = _in_both_views(self.frames[self._rows(block)], student.image_scale.device)
+            self.tokens.append(student.features(frames).half().cpu())
+
+
+def _in_both_views(frames: np.ndarray, device: torch.device) -> Tensor:
+    """Return frames, (B, height, width, 3), each followed by itself mirrored, (2 B, height, width, 3)."""
+    plain = torch.from_numpy(frames).to(device)
+    return torch.stack([plain, plain.flip(2)], 1).flatten(0, 1)
 
 
 class Part(NamedTuple):
@@ -255,7 +225,16 @@ class Part(NamedTuple):
     lessons: Lessons
     rows: np.ndarray
     views: np.ndarray
-    new: bool = False
+    new: bool
+
+    @property
+    def mirror(self) -> np.ndarray:
+        """(b, 2) float32: what the view multiplies steering and throttle by."""
+        return np.where((self.views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
+
+    def by_view(self, rows: RowFile | np.ndarray) -> np.ndarray:
+        """Return these samples' rows of what has a row for each view."""
+        return rows[2 * self.rows + self.views]
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,12 +245,12 @@ class Batch:
     rng: np.random.Generator
     device: torch.device
 
-    def _join(self, each: Sequence[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.concatenate(each)).to(self.device)
+    def _join(self, each: Iterable[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.concatenate(list(each))).to(self.device)
 
     def seen(self, what: str = "maps") -> Tensor:
         """The teacher's feature maps, or the student's own tokens, (B, D, h, w) float32."""
-        return self._join([getattr(p.lessons, what)[2 * p.rows + p.views] for p in self.parts]).float()
+        return self._join(p.by_view(getattr(p.lessons, what)) for p in self.parts).float()
 
     def pictures(self) -> Tensor:
         """The pictures in another light, (B, height, width, 3) uint8 RGB."""
@@ -286,29 +265,28 @@ class Batch:
         """
         each = []
         for p in self.parts:
-            if not p.new:
-                each.append(p.lessons.asked[2 * p.rows + p.views])
-                continue
-            states = p.lessons.data.states[p.rows] * np.where((p.views == MIRRORED)[:, None], MIRROR, 1)
-            states[:, 0] *= self.rng.uniform(*FADED, len(p.rows))
-            each.append(states.astype(np.float32))
+            states = p.by_view(p.lessons.asked)
+            if p.new:
+                states = p.lessons.data.states[p.rows] * p.mirror
+                states[:, 0] *= self.rng.uniform(*FADED, len(p.rows))
+            each.append(states)
         return self._join(each)
 
     def share_of_old(self, share: float) -> Tensor:
         """The given share for old recordings, 0 for new ones, (B, 1, 1)."""
-        return self._join([np.full(len(p.rows), 0.0 if p.new else share) for p in self.parts]).float()[:, None, None]
+        return self._join(np.full((len(p.rows), 1, 1), 0.0 if p.new else share, np.float32) for p in self.parts)
 
     def planned(self) -> Tensor:
         """What the teacher planned, (B, C, A)."""
-        return self._join([p.lessons.plans[2 * p.rows + p.views] for p in self.parts])
+        return self._join(p.by_view(p.lessons.plans) for p in self.parts)
 
     def recorded(self) -> Tensor:
         """What was driven, (B, C, A)."""
-        return self._join([p.lessons.recorded(p.rows, p.views) for p in self.parts])
+        return self._join(p.lessons.data.chunks[p.rows] * p.mirror[:, None] for p in self.parts)
 
     def driven(self) -> Tensor:
         """Whether that was driven and is no padding, (B, C, 1)."""
-        return self._join([~p.lessons.data.is_pad[p.rows] for p in self.parts])[..., None]
+        return self._join(~p.lessons.data.is_pad[p.rows, :, None] for p in self.parts)
 
 
 class Pool:

@@ -1,16 +1,15 @@
-"""What distilling and finetuning share: a recipe of checked numbers, the phases, and what they leave.
+"""What the trainings share: recipes that are data, the phases, and what a student or a finetuned policy leaves.
 
-recipe = DistillRecipe.of(params(), steps=200)
-with make_run(folder, config, TrainingError) as new:
-    work.train_policy(saved, policy, pool, loss, seen="maps", slower=10)
-    hashes = work.write_policy(new, name, config, weights, error, "episodes")
+recipe = DistillRecipe.of(steps=200)
+work.train_policy(saved, policy, pool, loss, seen="maps", slower=10)
+folder = work.make("runs", "fast")
 """
 
-import math
+import functools
+import shutil
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -19,87 +18,115 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_learn.lessons import Batch, BatchedPolicy, Pool
+from rover_learn.lessons import Batch, BatchedPolicy, Pool, judged_ranges
 from rover_learn.student import gmac
 from rover_learn.training import Phase, Resumable, threads
-from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.checked import Rule, broken_rule, number, whole
 from rover_lib.onboard.durable import build_folder
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import TrainingError
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy import preprocess
+from rover_lib.workshop import act
 from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run.run_folder import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
-from rover_lib.workshop.untrusted import quote
 
-# Least and most of a recipe's numbers. Of the others, steps may be 0, whole numbers are at least 1, and rates above 0.
-LIMITS = {"seed": (0, math.inf), "to_parent": (0, 1), "held_out_share": (0, 0.999)}
-LIMITS |= dict.fromkeys(("focus", "to_teacher", "to_recorded"), (0, math.inf))
+MOST = {"to_parent": 1.0, "held_out_share": 0.999}
+MAY_BE_ZERO = ("seed", "transformer_warmup")
+LEAST_RATE, LARGE = 1e-9, 10**9
+VERSIONS = ("torch", "lerobot", "torchvision", "numpy")
+
+
+def _rule(each: "Field[Any]") -> Rule:
+    """The rule of a recipe's number: by its type, its name and its limits."""
+    if each.type is int:
+        return whole(0 if each.name.endswith("_steps") or each.name in MAY_BE_ZERO else 1, LARGE)
+    return number(LEAST_RATE if each.name.endswith("rate") else 0, MOST.get(each.name, LARGE))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """How a policy is trained: a section of params.yml, which explains each number.
 
-    samples: learned from at most. rate: learning rate of the first phases. judged_frames: of the held-out episodes, at
-    most. seed: of all that is drawn at random. Each of PHASES has its number of steps, `<phase>_steps`.
+    samples: learned from at most. Each of PHASES has its number of steps, `<phase>_steps`.
     """
 
-    SECTION: ClassVar[str]
-    ERROR: ClassVar[type[RoverError]]
     PHASES: ClassVar[tuple[str, ...]]
 
     samples: int
     batch: int
-    rate: float
-    judged_frames: int
-    seed: int
-
-    def __post_init__(self):
-        """Raise ERROR for what is no number, or not within its limits."""
-        for each in fields(self):
-            value, whole = getattr(self, each.name), each.type is int
-            least, most = LIMITS.get(each.name, (1 if whole else math.ulp(0.0), math.inf))
-            least = 0 if each.name.endswith("_steps") else least
-            if not (is_whole if whole else is_number)(value) or not least <= value <= most:
-                what = "a whole number" if whole else "a number, written like 1.0e-3,"
-                limits = f"from {least:g} to {most:g}" if most < math.inf else f"of at least {least:g}"
-                limits = "above 0" if 0 < least < 1 else limits
-                where = f"params.yml: {self.SECTION}: {each.name}"
-                raise self.ERROR(f"{where} must be {what} {limits}", found=quote(value))
 
     @classmethod
-    def of(
-        cls, params: dict[str, Any], *, steps: int | None = None, phases: Collection[str] | None = None, **given: Any
-    ) -> Self:
-        """Take the recipe of params.yml, with each given value that is not None instead.
-
-        steps: in all, see `of_steps`. Raises ERROR for a name that it does not have or that is missing, and for values
-        that cannot be.
-        """
-        values = params[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
-        known = {f.name for f in fields(cls)}
-        if wrong := sorted(known ^ set(values)):
+    def read(cls, where: str, values: Mapping[str, Any]) -> Self:
+        """Make a recipe of values. where: in params.yml. Raises TrainingError for a name or a value that cannot be."""
+        known = {each.name: each for each in fields(cls)}
+        needed = {name for name, each in known.items() if each.default is MISSING}
+        if wrong := sorted(set(values) - set(known) | needed - set(values)):
             what = "is missing" if wrong[0] in known else "is unknown"
-            raise cls.ERROR(
-                f"params.yml: {cls.SECTION}: {wrong[0]} {what}", remedy=f"it has {', '.join(sorted(known))}"
-            )
-        recipe = cls(**values)
-        return recipe if steps is None else recipe.of_steps(steps, phases)
+            remedy = f"it has {', '.join(sorted(known))}"
+            raise TrainingError(f"params.yml: {where}: {wrong[0]} {what}", remedy=remedy)
+        rules = {name: _rule(each) for name, each in known.items() if name in values and each.type in (int, float)}
+        if broken := broken_rule(values, rules):
+            name, words, found = broken
+            raise TrainingError(f"params.yml: {where}: {name} must be {words}", found=found)
+        return cls(**values)
 
     def of_steps(self, steps: int, phases: Collection[str] | None = None) -> Self:
         """Return the same recipe with that many steps in all, at least one in each of these phases, none in others.
 
-        phases: None means all. Raises ERROR for less than one step.
+        phases: None means all that have steps. Raises TrainingError for less than one step.
         """
         if steps < 1:
-            raise self.ERROR("training needs at least 1 step", found=steps)
-        planned = {name: getattr(self, f"{name}_steps") for name in self.PHASES if phases is None or name in phases}
-        share = steps / max(sum(planned.values()), 1)
-        counts = {name: max(1, round(share * count)) for name, count in planned.items()}
-        return replace(self, **{f"{name}_steps": counts.get(name, 0) for name in self.PHASES})
+            raise TrainingError("training needs at least 1 step", found=steps)
+        planned = {f"{name}_steps": getattr(self, f"{name}_steps") for name in phases or self.PHASES}
+        counts = {f"{name}_steps": 0 for name in self.PHASES}
+        for name, count in planned.items():
+            counts[name] = max(1, round(steps * count / sum(planned.values()))) if count else 0
+        return replace(self, **counts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LessonRecipe(Recipe):
+    """A recipe of distilling or finetuning. SECTION: of params.yml.
+
+    rate: learning rate of the first phases. judged_frames: of the held-out episodes, at most. seed: of all that is
+    drawn at random.
+    """
+
+    SECTION: ClassVar[str]
+
+    rate: float
+    judged_frames: int
+    seed: int
+
+    @classmethod
+    def of(cls, *, steps: int | None = None, phases: Collection[str] | None = None, **given: Any) -> Self:
+        """Take the recipe of params.yml, with each given value that is not None instead.
+
+        steps: in all, see `of_steps`. Raises TrainingError for names and values that it does not have.
+        """
+        values = params()[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
+        recipe = cls.read(cls.SECTION, values)
+        return recipe if steps is None else recipe.of_steps(steps, phases)
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A policy that has learned.
+
+    weights: by LeRobot's names without the leading `model.`. losses: by phase. folder: where the phases are saved.
+    notes: for the stage's file.
+    """
+
+    weights: dict[str, Tensor]
+    losses: dict[str, list[float]]
+    folder: Path
+    notes: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,9 +137,41 @@ class Work:
     VERB: ClassVar[str]
 
     origin: Checkpoint
-    recipe: Any  # of the training's own kind of Recipe
+    config: ActConfig  # of the policy that is made
+    recipe: Any  # of the training's own kind of LessonRecipe
     device: torch.device
     progress: Progress
+
+    def action_range(self) -> dict[str, tuple[float, float]]:
+        """Return the smallest and largest recorded value of each action."""
+        raise NotImplementedError
+
+    def learn(self) -> Learned:
+        """Train all phases."""
+        raise NotImplementedError
+
+    def leave(self, new: Path, name: str, learned: Learned) -> None:
+        """Judge the policy, and write all files of the run of that name into `new`."""
+        raise NotImplementedError
+
+    def make(self, folder: Path) -> Path:
+        """Learn, and leave the run's folder, which appears when it is complete. Returns it."""
+        with build_folder(folder) as new, threads(1 if gmac(self.config) < SMALL_GMAC else torch.get_num_threads()):
+            learned = self.learn()
+            self.leave(new, folder.name, learned)
+            free_folder(folder.parent, folder.name)  # another command may have made it meanwhile
+        shutil.rmtree(learned.folder, ignore_errors=True)  # who learns the same elsewhere may have removed it already
+        return folder
+
+    @functools.cached_property
+    def ranges(self) -> np.ndarray:
+        """(A,) float32: each action's recorded range, in which errors are counted."""
+        return judged_ranges(self.action_range())
+
+    @functools.cached_property
+    def units(self) -> Tensor:
+        """(A,) float32: what an error of 1 in each action counts."""
+        return torch.from_numpy(1 / self.ranges).to(self.device)
 
     def rng(self, phase: str) -> np.random.Generator:
         """Return a phase's source of random numbers, the same in every process."""
@@ -126,17 +185,15 @@ class Work:
             "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
             "recorded": [zlib.crc32(np.stack([getattr(s, name) for s in samples]).tobytes()) for name in recorded],
             "at": [self.device.type, self.recipe.seed],
-            "versions": [version(package) for package in ("torch", "lerobot", "torchvision", "numpy")],
+            "versions": [version(package) for package in VERSIONS],
         }
 
     def train(
         self, saved: Resumable, phase: str, module: nn.Module, rate: float, pool: Pool, loss: Callable[[Batch], Tensor]
     ) -> None:
         """Train a module for the phase's number of steps in the recipe, or continue where that was interrupted."""
-        rng, steps = self.rng(phase), getattr(self.recipe, f"{phase}_steps")
-        saved.train(
-            Phase(phase, steps, rate), module, rng, lambda _: pool.batch(self.recipe.batch, rng, self.device), loss
-        )
+        rng, steps, count = self.rng(phase), getattr(self.recipe, f"{phase}_steps"), self.recipe.batch
+        saved.train(Phase(phase, steps, rate), module, rng, lambda _: pool.batch(count, rng, self.device), loss)
 
     def train_policy(
         self,
@@ -158,32 +215,24 @@ class Work:
         return asdict(self.recipe) | {"device": self.device.type}
 
     def write_policy(
-        self, folder: Path, name: str, config: ActConfig, weights: dict[str, Tensor], loss: float, recordings: str
+        self, folder: Path, name: str, weights: dict[str, Tensor], loss: float, recordings: str
     ) -> dict[str, str]:
         """Write best_model.pth and pretrained_model/ of a run of that name, and return their files' sha256."""
-        settings = {
-            "learning_rate": self.recipe.rate,
-            "batch_size": self.recipe.batch,
-            "data_dir": recordings,
-            "output_dir": name,
-            "device": self.device.type,
-            "seed": self.recipe.seed,
-        }
+        settings = {"learning_rate": self.recipe.rate, "batch_size": self.recipe.batch, "seed": self.recipe.seed}
+        settings |= {"data_dir": recordings, "output_dir": name, "device": self.device.type}
         origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}
-        return write_both(folder, config, weights, loss, origin | {self.VERB: self.described()}, **settings)
+        return write_both(folder, self.config, weights, loss, origin | {self.VERB: self.described()}, **settings)
 
 
-def free_folder(runs_dir: Path | str, name: str, error: type[RoverError]) -> Path:
-    """Return a run's folder, which is not there yet. Raises `error` if it is, or for a name that cannot be."""
-    folder = run_folder(runs_dir, name, error)
+def cache_for(kind: str, made_of: Mapping[str, Any]) -> Path:
+    """Return the cache's folder for what these parameters and the present code make."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return cache_root() / f"{kind}-{key_of(dict(made_of), *sources, preprocess, act)}"
+
+
+def free_folder(runs_dir: Path | str, name: str) -> Path:
+    """Return a run's folder, which is not there yet. Raises TrainingError if it is, or for a name that cannot be."""
+    folder = run_folder(runs_dir, name, TrainingError)
     if folder.exists():
-        raise error(f"{folder}: is there already", remedy="give another --name, or move that run away")
+        raise TrainingError(f"{folder}: is there already", remedy="give another --name, or move that run away")
     return folder
-
-
-@contextmanager
-def make_run(folder: Path, config: ActConfig, error: type[RoverError]) -> Iterator[Path]:
-    """Build a run's folder beside it, with as many threads as a policy of that config gains from."""
-    with build_folder(folder) as new, threads(1 if gmac(config) < SMALL_GMAC else torch.get_num_threads()):
-        yield new
-        free_folder(folder.parent, folder.name, error)  # another command may have made it meanwhile

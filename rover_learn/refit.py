@@ -1,12 +1,14 @@
 """Refit a layer that reads fewer inputs than before to the output that all of them gave.
 
-gram = Gram()
-gram.add(rows)                                        # what the layer reads; may be called repeatedly
-weight, errors = refit_layer(whole, gram.mean(), kept)
+grams = grams_of({"head": layer}, rows_of, run)        # of what each layer reads while run() runs
+weight, errors = refit_layer(whole, grams["head"], kept)
 """
 
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 RIDGE = 1e-4  # times an input's mean square: it keeps the weights as they were where the rows say nothing
 ROWS = 4096  # rows that are multiplied at once; few, because they become double and memory is small
@@ -46,6 +48,27 @@ class Gram:
             self._sum = x.new_zeros(x.shape[1], x.shape[1])
         self._sum.addmm_(x.T, x)
         self._count += len(x)
+
+
+@torch.no_grad()
+def grams_of(
+    layers: Mapping[str, nn.Module], rows_of: Callable[[Tensor], Iterable[Tensor]], run: Callable[[], object]
+) -> dict[str, Tensor]:
+    """Return `Gram.mean` of what each layer reads in run(). rows_of: rows, (n, inputs) each, of a layer's input."""
+    grams = {name: Gram() for name in layers}
+
+    def watch(gram: Gram) -> Callable[[nn.Module, tuple[Tensor]], None]:
+        def hook(_: nn.Module, args: tuple[Tensor]) -> None:
+            for rows in rows_of(args[0]):
+                gram.add(rows)
+
+        return hook
+
+    with ExitStack() as hooks:
+        for name, layer in layers.items():
+            hooks.enter_context(layer.register_forward_pre_hook(watch(grams[name])))
+        run()
+    return {name: gram.mean() for name, gram in grams.items()}
 
 
 def refit_layer(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:

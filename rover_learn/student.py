@@ -10,16 +10,14 @@ every feed-forward. The VAE's encoder is left out, because only training on reco
 its teacher's plans.
 """
 
-from collections import defaultdict
 from collections.abc import Iterable
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from rover_learn.refit import Gram, refit_layer
+from rover_learn.refit import grams_of, refit_layer
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, expected_shapes, multiply_accumulates
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -50,9 +48,7 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     the teacher's weights do not run.
     """
     c = teacher.config
-    if found := not_a_cars(c):
-        remedy = "if it is of one camera, steering and throttle, say which number is what: --action-names"
-        raise TrainingError(f"{teacher.path}: is not a car's policy", found=found, remedy=remedy)
+    refuse_no_car(teacher)
     ((height, width),) = c.image_sizes
     own = (shape.height, shape.width, shape.decoder_layers, shape.feedforward)
     teachers = (height, width, c.decoder_layers, c.feedforward)
@@ -76,18 +72,17 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     )
 
 
-def not_a_cars(config: ActConfig) -> str | None:
-    """Say what a policy has instead of one camera, and steering and throttle as its states and actions; None if it has
-    those.
+def refuse_no_car(policy: Checkpoint) -> None:
+    """Raise TrainingError unless a policy has one camera, and steering and throttle as its states and actions.
 
-    A policy that we teach needs them, because it is also shown mirrored samples, with the first number negated, and is
-    stored under these names.
+    A policy that we teach is also shown mirrored samples, with the first number negated, and is stored so named.
     """
-    c = config
-    if len(c.cameras) == 1 and c.state_names == c.action_names == ACTION_NAMES:
-        return None
-    states, actions = quote_all(c.state_names), quote_all(c.action_names)
-    return f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
+    c = policy.config
+    if len(c.cameras) != 1 or not c.state_names == c.action_names == ACTION_NAMES:
+        states, actions = quote_all(c.state_names), quote_all(c.action_names)
+        found = f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
+        remedy = "if it is of one camera, steering and throttle, name them so in the dataset's meta/info.json"
+        raise TrainingError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
 
 
 def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
@@ -109,9 +104,13 @@ def initial_weights(
     kept = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
     if config.feedforward == teacher.config.feedforward:
         return kept, []
-    notes = []
-    wide = replace(config, feedforward=teacher.config.feedforward)
-    for name, gram in _grams(ACT(wide, teacher.weights), inputs).items():
+    wide, notes = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights), []
+    downs = {}
+    for name, module in wide.named_modules():
+        if isinstance(module, FeedForward):
+            part, index, _ = name.split(".")
+            downs[f"{part}.layers.{index}"] = module.down
+    for name, gram in grams_of(downs, lambda x: x[:1], lambda: [wide(*x)[0] for x in inputs]).items():
         layer, notes_of_layer = _narrow(kept, name, gram, config.feedforward)
         kept |= layer
         notes.append(notes_of_layer)
@@ -125,42 +124,13 @@ def _is_kept(name: str, config: ActConfig) -> bool:
     return part != "decoder" or not rest or int(rest.split(".")[0]) < config.decoder_layers
 
 
-@torch.inference_mode()
-def _grams(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor]:
-    """Return for every feed-forward the mean of h h^T over all tokens, h being its hidden activations and a 1.
-
-    The keys are LeRobot's names of the layers; each value is (units + 1, units + 1) float64. After ReLU, a unit's mean
-    magnitude is its product with the 1. For other activations `_narrowed` uses the root of its mean square instead.
-    """
-    grams: dict[str, Gram] = defaultdict(Gram)
-
-    def watch(name: str):
-        def hook(_: nn.Module, args: tuple[Tensor]) -> None:
-            grams[name].add(args[0][0])
-
-        return hook
-
-    with ExitStack() as hooks:
-        for name, module in model.named_modules():
-            if isinstance(module, FeedForward):
-                hooks.enter_context(module.down.register_forward_pre_hook(watch(_lerobots(name))))
-        for x in inputs:
-            model(*x)
-    if not grams:
-        raise TrainingError("choosing units needs frames", found="none", remedy="record more episodes")
-    return {name: gram.mean() for name, gram in grams.items()}
-
-
-def _lerobots(name: str) -> str:
-    """Return LeRobot's name of a layer: encoder.3.feed_forward -> encoder.layers.3."""
-    part, index, _ = name.split(".")
-    return f"{part}.layers.{index}"
-
-
 def _narrow(
     weights: dict[str, Tensor], layer: str, gram: Tensor, units: int
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Keep one feed-forward's most important units, and refit `down` to the output that all units gave."""
+    """Keep one feed-forward's most important units, and refit `down` to the output that all units gave.
+
+    A unit's importance is its mean magnitude, or, where activations may be negative, the root of its mean square.
+    """
     down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values

@@ -21,13 +21,14 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from rover_learn import training as loop
+from rover_learn.phases import VERSIONS, Recipe
 from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Best, Frames, Given, Phase, Resumable, RowFile
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
@@ -52,6 +53,7 @@ from rover_lib.workshop.run.session import training_device
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
+FEATURES, HEAD_WIDTH = 512, 32  # of ResNet18's last stage, and of the first phase's head
 SMALL_DIM = 256  # below it, two threads wait for each other longer than they compute
 PLANNED_HZ = 30.0  # of the user's trainer
 SIZES = {
@@ -65,20 +67,20 @@ SIZES = {
 FULL_VERSION = 1
 
 
-@dataclass(frozen=True)
-class TrainingRecipe:
+@dataclass(frozen=True, kw_only=True)
+class TrainingRecipe(Recipe):
     """How long and how fast each phase trains: an entry of params.yml's section `train`, which explains each number.
 
     at: (height, width) of the pictures in all phases but the last; None: the policy's own, and no last phase.
     """
 
+    PHASES = ("backbone", "transformer", "together", "carry")
+
     backbone_steps: int
     transformer_steps: int
     together_steps: int
-    batch: int
     transformer_batch: int
     together_batch: int
-    samples: int
     feature_samples: int
     judged: int
     backbone_rate: float
@@ -88,35 +90,22 @@ class TrainingRecipe:
     carry_steps: int = 0
 
     @classmethod
-    def of(cls, size: str, device: str) -> "TrainingRecipe":
-        """Return the recipe of params.yml for that size; with cuda's own values, if it has some.
-
-        Raises TrainingError for names and values that it does not have.
-        """
+    def of(cls, size: str, device: str) -> Self:
+        """Return the recipe of params.yml for that size; with cuda's own values, if it has some."""
         recipes = params()["train"]
         values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
-        try:
-            recipe = cls(**values | {"at": tuple(values["at"]) if values.get("at") else None})
-            numbers = [value for name, value in asdict(recipe).items() if name != "at"]
-            if not all(0 <= value < math.inf for value in numbers) or recipe.batch < 1:
-                raise ValueError("a number below 0, or an empty batch")
-        except (TypeError, ValueError) as error:
-            raise TrainingError(f"params.yml: train: {size}", found=error) from None
-        return recipe
+        return cls.read(f"train: {size}", values | {"at": tuple(values["at"]) if values.get("at") else None})
 
-    def of_steps(self, steps: int) -> "TrainingRecipe":
-        """Return the same recipe with `steps` steps in all, and at least one in each phase that it has."""
-        names = "backbone_steps", "transformer_steps", "together_steps", "carry_steps"
-        planned = {name: getattr(self, name) for name in names if getattr(self, name)}
-        shorter = {name: max(1, round(steps * n / sum(planned.values()))) for name, n in planned.items()}
-        # So few steps only show that training works, so a few frames are enough for each.
+    def of_few(self, steps: int) -> Self:
+        """Return the same recipe with `steps` steps in all, and with fewer frames: they only show that it works."""
         sizes = "batch", "transformer_batch", "together_batch"
         batches = {name: min(getattr(self, name), max(2, steps // 8)) for name in sizes}
-        samples = min(self.samples, max(4 * self.batch, steps * self.batch))
-        features = min(self.feature_samples, steps * batches["transformer_batch"])
-        judged = min(self.judged, max(8, steps))
-        counts: dict[str, Any] = {**shorter, **batches}
-        return replace(self, **counts, samples=samples, feature_samples=features, judged=judged, transformer_warmup=0)
+        counts = {
+            "samples": min(self.samples, max(4 * self.batch, steps * self.batch)),
+            "feature_samples": min(self.feature_samples, steps * batches["transformer_batch"]),
+            "judged": min(self.judged, max(8, steps)),
+        }
+        return replace(self.of_steps(steps), **batches, **counts, transformer_warmup=0)
 
 
 def train(
@@ -130,16 +119,14 @@ def train(
 ) -> Path:
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
 
-    size: 'small' (72x128, minutes on two cores) or 'full' (the user's policy, 360x640).
-    steps: optimiser steps of all phases together; those of the recipe when left out.
-    device: 'cpu', 'cuda', or None for cuda where torch finds it and cpu elsewhere.
-    The calibration part of params.yml's split trains the policy, the choosing part gives best_val_loss, and the
-    held-out part is left alone, so that it can judge the policy later.
+    episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
+    part trains the policy, the choosing part gives best_val_loss, and the held-out part is left alone, so that it can
+    judge the policy later. size: 'small' (72x128, minutes on two cores) or 'full' (the user's policy, 360x640). steps:
+    optimiser steps of all phases together; those of the recipe when left out. device: 'cpu', 'cuda', or None for cuda
+    where torch finds it and cpu elsewhere.
+
     Returns out_path, which appears complete or not at all. On one machine the same input gives the same weights, even
-    if training was ended at any moment and started again, as it goes on where it was. A checkpoint that was made before
-    is taken from the cache.
-    episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. The plans have their
-    rate: 30 steps a second if that is within a fifth of it.
+    if training was ended at any moment and started again. A checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, and if another process trains the same,
     and EpisodeError for recordings that cannot be used.
     """
@@ -147,11 +134,11 @@ def train(
     device = training_device(device, TrainingError).type
     if size not in SIZES:
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
-    if (steps is not None and steps < 1) or seed < 0:
-        raise TrainingError("training needs at least 1 step and a seed from 0", found=f"{steps} and {seed}")
+    if seed < 0:
+        raise TrainingError("training needs a seed from 0", found=seed)
     recipe = TrainingRecipe.of(size, device)
     if steps is not None:
-        recipe = recipe.of_steps(steps)
+        recipe = recipe.of_few(steps)
     p = params()["calibration"]
     recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
@@ -160,7 +147,7 @@ def train(
         "recipe": asdict(recipe),
         "seed": seed,
         "device": device,
-        "versions": [version(name) for name in ("torch", "lerobot", "torchvision", "numpy")],
+        "versions": [version(name) for name in VERSIONS],
         "episodes": recordings.hashes(),
         "rate_hz": rate_hz,
         "split": p,
@@ -171,20 +158,12 @@ def train(
     unfinished = cache_root() / f"training-{key}"
 
     def make(folder: Path) -> None:
+        known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": device, "seed": seed}
+        known |= {"data_dir": "episodes", "output_dir": "checkpoints", "rate_hz": int(rate_hz)}
         with Resumable(unfinished, progress) as saved:
             trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, torch.device(device), saved)
-            config = trainer_config(
-                SIZES[size],
-                learning_rate=recipe.transformer_rate,
-                batch_size=recipe.batch,
-                data_dir="episodes",
-                output_dir="checkpoints",
-                device=device,
-                seed=seed,
-                rate_hz=int(rate_hz),
-            )
             # It must be on the disk before the unfinished training, which it comes from, is removed.
-            save_torch(folder / "best_model.pth", {**trained, "config": config})
+            save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
 
     made = cache_folder("checkpoint", key, make) / "best_model.pth"
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -194,15 +173,16 @@ def train(
 
 
 def _rate_hz(recordings: Recordings) -> float:
-    """Return the steps per second of plans. Raises EpisodeError for recordings that this training is not for."""
+    """Return the steps per second of plans: the recordings', but 30 if those are within a fifth of it.
+
+    Raises EpisodeError for recordings that this training is not for.
+    """
     layout = recordings.layout
     recorded.car_of(recordings.samples)
     if layout.action_names != ACTION_NAMES or layout.state_names != ACTION_NAMES or len(layout.cameras) != 1:
-        raise EpisodeError(
-            f"{recordings.root}: rover train is for cars of steering and throttle with one camera",
-            found=layout.words(),
-            remedy=f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}",
-        )
+        what = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
+        remedy = f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}"
+        raise EpisodeError(what, found=layout.words(), remedy=remedy)
     rates = [found for e in recordings.episodes if (found := recorded.frame_rate_hz(e.samples)) is not None]
     found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
     return float(round(found_hz)) if layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
@@ -210,14 +190,11 @@ def _rate_hz(recordings: Recordings) -> float:
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:
     """Return the recordings with the pictures of those that are mirrored beside most others turned over."""
-    mirrored = measure_sides(recordings, progress).mirrored
-    return replace(
-        recordings,
-        episodes=tuple(
-            replace(e, samples=tuple(replace(s, mirrored=True) for s in e.samples)) if e.id in mirrored else e
-            for e in recordings.episodes
-        ),
-    )
+    mirrored, episodes = measure_sides(recordings, progress).mirrored, []
+    for e in recordings.episodes:
+        samples = tuple(replace(s, mirrored=True) for s in e.samples) if e.id in mirrored else e.samples
+        episodes.append(replace(e, samples=samples))
+    return replace(recordings, episodes=tuple(episodes))
 
 
 @dataclass(frozen=True)
@@ -250,11 +227,9 @@ class _Training:
 
         maps: their feature maps, for a policy that takes those.
         """
-        images: Any = self.judges.images if maps is None else maps
-        judges = replace(self.judges, images=images)
-        units = self.weights.cpu().numpy()
+        judges, units = self.judges, self.weights.cpu().numpy()
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
-        errors = [loop.driving_error(self.policy, judges, rows, units, maps is not None) for rows in every]
+        errors = [loop.driving_error(self.policy, judges, rows, units, maps) for rows in every]
         self.policy.train()
         return float(np.average(errors, weights=[len(rows) for rows in every]))
 
@@ -267,9 +242,9 @@ def _train(
     parts = split(recordings, p["held_out_share"], p["seed"])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
     samples, judging = pick_evenly(parts.calibration, recipe.samples), pick_evenly(parts.choosing, recipe.judged)
-    data, judges = loop.frames_of(samples, *first.image_sizes[0]), loop.frames_of(judging, *size.image_sizes[0])
+    data, judges = Frames.of(samples, first.image_sizes[0]), Frames.of(judging, size.image_sizes[0])
     if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
-        data = loop.in_memory(data, "reading frames", saved.progress)
+        data.read_all(saved.progress)
     spread = loop.recorded_spread(data)
     with loop.seed_inside(seed):
         policy = lerobot_act(size)
@@ -282,7 +257,7 @@ def _train(
             size=first,
             policy=policy,
             data=data,
-            judges=loop.frames_of(judging, *first.image_sizes[0]),
+            judges=Frames.of(judging, first.image_sizes[0]),
             recipe=recipe,
             weights=torch.from_numpy(1 / spread).to(device),
             rng=np.random.default_rng([seed, 77]),
@@ -292,7 +267,7 @@ def _train(
         _train_transformer(training)
         if recipe.at:
             _train_together(training, "all together", recipe.together_steps)
-            training = replace(training, data=loop.frames_of(samples, *size.image_sizes[0]))
+            training = replace(training, data=Frames.of(samples, size.image_sizes[0]))
             optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
         else:
             optimizer, scheduler = _train_together_or_not(training)
@@ -310,11 +285,11 @@ def _train(
 class _ChunkFromFeatures(nn.Module):
     """The backbone with the first phase's throw-away head, which maps the features at all positions to a chunk."""
 
-    def __init__(self, backbone: nn.Module, size: ActConfig, features: int = 512, width_after: int = 32):
+    def __init__(self, backbone: nn.Module, size: ActConfig):
         super().__init__()
         self.backbone, self.chunk = backbone, size.chunk
-        convolution = nn.Conv2d(features, width_after, 1)
-        last = nn.Linear(width_after * math.prod(size.grid(*size.image_sizes[0])), 2 * size.chunk)
+        convolution = nn.Conv2d(FEATURES, HEAD_WIDTH, 1)
+        last = nn.Linear(HEAD_WIDTH * math.prod(size.grid(*size.image_sizes[0])), 2 * size.chunk)
         nn.init.zeros_(last.weight)  # start with "no action": real actions are small, and an untrained head's are not
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
@@ -365,7 +340,7 @@ def _train_transformer(training: _Training) -> None:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1
         arrays = {IMAGE: views[step % 2][kept], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
-        return {name: torch.from_numpy(array).to(training.device) for name, array in arrays.items()}
+        return loop.on_device(arrays, training.device)
 
     policy.model.backbone = Given()
     policy.train()
@@ -382,10 +357,9 @@ def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, 
     view: 'plain', 'mirrored', or 'judges', which are plain too. chosen: (n,) row numbers.
     """
     batch, (size,) = training.recipe.batch, training.size.image_sizes
-    channels = training.policy.model.encoder_img_feat_input_proj.in_channels
-    maps = RowFile(training.saved.folder / f"{view}.rows", (channels, *training.size.grid(*size)))
+    maps = RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
     for step in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, maps=maps):
-        images = data.images[chosen[step * batch : (step + 1) * batch]]
+        images = data.pictures(chosen[step * batch : (step + 1) * batch])
         images = images[:, :, ::-1] if view == "mirrored" else images
         with torch.no_grad():
             maps.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -41,53 +41,41 @@ JUDGE_EVERY, PATIENCE = 50, 8  # steps; judgements without a better one, after w
 SAVING_SHARE = 0.05  # saving takes at most this share of the time, however slow the disk
 
 
-class Pictures:
-    """The frames of samples at one size, read from their files when asked for, so that many need no more memory."""
+@dataclass
+class Frames:
+    """Samples as arrays with a row for each, and their pictures at one size.
 
-    def __init__(self, samples: tuple[Sample, ...], height: int, width: int):
-        self.samples, self.height, self.width = samples, height, width
+    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool, true where a
+    chunk is padded. images: all pictures, if they are in memory; else they are read from their files when asked for.
+    """
+
+    samples: tuple[Sample, ...]
+    size: tuple[int, int]
+    states: np.ndarray
+    chunks: np.ndarray
+    is_pad: np.ndarray
+    images: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, samples: tuple[Sample, ...], size: tuple[int, int]) -> "Frames":
+        """Return the samples, with pictures that are read when asked for."""
+        states, chunks = (np.stack([getattr(s, name) for s in samples]) for name in ("state", "chunk"))
+        is_pad = np.stack([s.is_pad for s in samples])
+        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad)
 
     def __len__(self) -> int:
         return len(self.samples)
 
-    def __getitem__(self, rows: np.ndarray | slice) -> np.ndarray:
-        """Read these rows: (n, height, width, 3) uint8 RGB. Raises EpisodeError if a picture is gone or damaged."""
-        chosen = np.arange(len(self.samples))[rows]
-        return np.stack([prepare_frame(self.samples[i].frame_bgr(), self.height, self.width) for i in chosen])
+    def pictures(self, rows: np.ndarray) -> np.ndarray:
+        """Return these rows' pictures, (n, height, width, 3) uint8 RGB. Raises EpisodeError if one is gone."""
+        if self.images is not None:
+            return self.images[rows]
+        return np.stack([prepare_frame(self.samples[i].frame_bgr(), *self.size) for i in rows])
 
-
-@dataclass
-class Frames:
-    """Samples as arrays with a row for each.
-
-    images: (n, height, width, 3) uint8 RGB, in memory or read when asked for. states: (n, 2) float32. chunks:
-    (n, chunk, 2) float32. is_pad: (n, chunk) bool, true where a chunk is padded.
-    """
-
-    images: np.ndarray | Pictures
-    states: np.ndarray
-    chunks: np.ndarray
-    is_pad: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-
-def frames_of(samples: tuple[Sample, ...], height: int, width: int) -> Frames:
-    """Return the samples with their frames at this size, which are read from disk whenever they are asked for."""
-    return Frames(
-        Pictures(samples, height, width),
-        np.stack([s.state for s in samples]).astype(np.float32),
-        np.stack([s.chunk for s in samples]).astype(np.float32),
-        np.stack([s.is_pad for s in samples]),
-    )
-
-
-def in_memory(frames: Frames, desc: str, progress: Progress = silent) -> Frames:
-    """Return the same with all images in memory: for small images, which take longer to read than to train on."""
-    rows = progress(range(len(frames)), desc=desc, total=len(frames))
-    images = np.concatenate([frames.images[row : row + 1] for row in rows])
-    return Frames(images, frames.states, frames.chunks, frames.is_pad)
+    def read_all(self, progress: Progress = silent) -> None:
+        """Keep all pictures in memory: small ones take longer to read than to train on."""
+        rows = progress(np.arange(len(self))[:, None], desc="reading frames", total=len(self))
+        self.images = np.concatenate([self.pictures(row) for row in rows])
 
 
 class RowFile:
@@ -100,7 +88,8 @@ class RowFile:
         self.path, self.shape, self.dtype = path, shape, np.dtype(dtype)
         self.row_bytes = math.prod(shape) * self.dtype.itemsize
         self._rows = 0  # although a process that was killed may have left rows in the file
-        self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b", buffering=0)
+        path.touch()
+        self._file = path.open("r+b", buffering=0)
 
     def __len__(self) -> int:
         return self._rows
@@ -109,9 +98,7 @@ class RowFile:
         """Append rows, (n, *shape)."""
         array = np.ascontiguousarray(rows, self.dtype)
         self._file.seek(self._rows * self.row_bytes)
-        data = array.data.cast("B")
-        while data:
-            data = data[self._file.write(data) :]
+        array.tofile(self._file)
         self._rows += len(array)
 
     def __getitem__(self, rows: np.ndarray) -> np.ndarray:
@@ -127,19 +114,9 @@ class RowFile:
         return {"rows": len(self)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        there = self.path.stat().st_size // self.row_bytes
-        if there < state["rows"]:
-            found = f"{there} of {state['rows']}"
-            raise TrainingError(f"{self.path}: rows are missing", found=found, remedy="remove its folder")
+        if (there := self.path.stat().st_size // self.row_bytes) < state["rows"]:
+            raise TrainingError(f"{self.path}: rows are missing", found=f"{there} of {state['rows']}")
         self._rows = state["rows"]
-
-
-class Stateful(Protocol):
-    """A part of a training whose state can be saved: a module, an optimiser, a scheduler, a file of rows."""
-
-    def state_dict(self) -> Any: ...
-
-    def load_state_dict(self, state: Any) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -169,8 +146,8 @@ class Best:
         error = self.judge()
         self.stale += 1
         if error < self.error:
-            weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
-            self.error, self.stale, self.weights = error, 0, weights
+            self.error, self.stale = error, 0
+            self.weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def state_dict(self) -> dict[str, Any]:
         return {"error": self.error, "stale": self.stale, "weights": self.weights}
@@ -204,18 +181,18 @@ class Resumable:
             self._lock.acquire()
         except Timeout:
             raise TrainingError("another process trains the same", found=self.folder, remedy="wait for it") from None
-        for left in self.folder.glob(".*.pt"):  # incomplete files of a process that was killed while it saved
+        for left in self.folder.glob(".*.pt"):  # of a process that was killed while it saved
             left.unlink()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def steps(self, phase: str, count: int, rng: np.random.Generator, **parts: Stateful) -> Iterator[int]:
+    def steps(self, phase: str, count: int, rng: np.random.Generator, **parts: Any) -> Iterator[int]:
         """Yield the numbers of the steps of a phase that are still to be done; the loop's body does one of them.
 
-        parts: everything that a step changes. Before the first step they are restored as they were saved, and so are
-        rng and torch's own random numbers: after a phase these are the same whichever process did it.
+        parts: everything that a step changes, each with state_dict() and load_state_dict(): modules, optimisers, files
+        of rows. They, rng and torch's own random numbers are restored as they were saved.
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
@@ -242,7 +219,7 @@ class Resumable:
         batch: draws a step's batch from rng. loss: of such a batch. best: if given, the module ends with the weights
         that it judged best, and learns no longer once they are not beaten. Returns the optimiser and its scheduler.
         """
-        optimizer, scheduler = optimiser(module.parameters(), phase.rate, max(phase.steps, 1), phase.warmup)
+        optimizer, scheduler = optimiser(phase, module.parameters())
         parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
         parts |= {"best": best} if best else {}
         for step in self.steps(phase.name, phase.steps, rng, **parts):
@@ -255,31 +232,29 @@ class Resumable:
             module.load_state_dict(best.weights)
         return optimizer, scheduler
 
-    def _save(self, file: Path, phase: str, step: int, rng: np.random.Generator, parts: dict[str, Stateful]) -> None:
+    def _save(self, file: Path, phase: str, step: int, rng: np.random.Generator, parts: dict[str, Any]) -> None:
         content = {
             "step": step,
             "parts": {name: part.state_dict() for name, part in parts.items()},
             "numpy": rng.bit_generator.state,
             "torch": torch.get_rng_state(),
-            "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+            "cuda": torch.cuda.get_rng_state_all(),
             "losses": self.losses[phase],
         }
         save_torch(file, content)
 
-    def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Stateful]) -> int:
+    def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Any]) -> int:
         try:
             content = torch.load(file, map_location="cpu", weights_only=True)
             for name, part in parts.items():
                 part.load_state_dict(content["parts"][name])
-        except TrainingError:
-            raise
-        except Exception as error:  # whatever a damaged file makes torch say
+        except Exception as error:  # rows that are missing, or whatever a damaged file makes torch say
+            found = error if isinstance(error, TrainingError) else type(error).__name__
             remedy = f"remove {file.parent} to train from the beginning"
-            raise TrainingError(f"{file}: cannot go on from it", found=type(error).__name__, remedy=remedy) from error
+            raise TrainingError(f"{file}: cannot resume from it", found=found, remedy=remedy) from error
         rng.bit_generator.state = content["numpy"]
         torch.set_rng_state(content["torch"])
-        if content["cuda"]:
-            torch.cuda.set_rng_state_all(content["cuda"])
+        torch.cuda.set_rng_state_all(content["cuda"])
         self.losses[phase] = content["losses"]
         return content["step"]
 
@@ -287,8 +262,7 @@ class Resumable:
 @contextmanager
 def seed_inside(seed: int) -> Iterator[None]:
     """Seed torch's random numbers inside the block, and restore their state afterwards."""
-    devices = list(range(torch.cuda.device_count()))
-    with torch.random.fork_rng(devices=devices):
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         yield
 
@@ -307,17 +281,18 @@ def threads(count: int) -> Iterator[None]:
 def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> dict[str, Tensor]:
     """Return a batch to train on: in another light, half of the samples mirrored, and half of the states swapped."""
     flipped = rng.random(len(rows)) < 0.5
-    images, states, chunks = data.images[rows], swap_states(data, rows, rng), data.chunks[rows].copy()
+    images, states, chunks = data.pictures(rows), swap_states(data, rows, rng), data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
     states[flipped, 0] *= -1
     chunks[flipped, :, 0] *= -1
     gain = rng.uniform(0.8, 1.25, (len(rows), 1, 1, 1)).astype(np.float32)
-    return {
-        IMAGE: torch.from_numpy(normalise(np.minimum(images * gain, 255))).to(device),
-        STATE: torch.from_numpy(states).to(device),
-        ACTION: torch.from_numpy(chunks).to(device),
-        IS_PAD: torch.from_numpy(data.is_pad[rows]).to(device),
-    }
+    images = normalise(np.minimum(images * gain, 255))
+    return on_device({IMAGE: images, STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}, device)
+
+
+def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:
+    """Return arrays by name as tensors on the device."""
+    return {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
 
 
 def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -356,20 +331,17 @@ def policy_loss(policy: "ACTPolicy", batch: dict[str, Tensor], loss_weights: Ten
 
 
 def optimiser(
-    parameters: Iterable[nn.Parameter], rate: float, steps: int, warmup: int = 0
+    phase: Phase, parameters: Iterable[nn.Parameter]
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
-    """Make AdamW with a rate that warms up over `warmup` steps and falls to 1/100 along a cosine.
-
-    warmup: 0 means a twentieth of all steps.
-    """
-    optimizer = torch.optim.AdamW(parameters, lr=rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
-    warmup = warmup or max(1, steps // 20)
+    """Make AdamW with a rate that warms up and then falls to 1/100 along a cosine."""
+    optimizer = torch.optim.AdamW(parameters, lr=phase.rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
+    steps = max(phase.steps, 1)
+    warmup = phase.warmup or max(1, steps // 20)
 
     def share(step: int) -> float:
         return min(1.0, (step + 1) / warmup) * (0.01 + 0.99 * (1 + math.cos(math.pi * min(1, step / steps))) / 2)
 
-    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, share)
-    return optimizer, scheduler
+    return optimizer, torch.optim.lr_scheduler.LambdaLR(optimizer, share)
 
 
 def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, scheduler: Any) -> float:
@@ -393,27 +365,21 @@ class Given(nn.Module):
 
 
 def driving_error(
-    policy: "ACTPolicy", data: Frames, rows: np.ndarray, units: np.ndarray | float = 1.0, features: bool = False
+    policy: "ACTPolicy", data: Frames, rows: np.ndarray, units: np.ndarray | float = 1.0, maps: RowFile | None = None
 ) -> float:
     """Return the mean absolute error of the policy's plans on these rows (no latent is sampled), in action units.
 
-    units: what an error of 1 in each action counts. features: the images are the backbone's feature maps already.
+    units: what an error of 1 in each action counts. maps: feature maps to take instead of the pictures.
     """
     policy.eval()
-    device = next(policy.parameters()).device
-    images = data.images[rows] if features else normalise(data.images[rows])
-    chunks = policy.predict_action_chunk(
-        {IMAGE: torch.from_numpy(images).to(device), STATE: torch.from_numpy(data.states[rows]).to(device)}
-    )
+    images = normalise(data.pictures(rows)) if maps is None else maps[rows]
+    batch = on_device({IMAGE: images, STATE: data.states[rows]}, next(policy.parameters()).device)
+    chunks = policy.predict_action_chunk(batch)
     return float((np.abs(chunks.cpu().numpy() - data.chunks[rows]) * units)[~data.is_pad[rows]].mean())
 
 
 def to_cpu(value: Any) -> Any:
-    """Return a state dict, or anything nested of lists, tuples and dicts, with all its tensors on the CPU."""
-    if isinstance(value, Tensor):
-        return value.cpu()
+    """Return a state dict with all its tensors on the CPU."""
     if isinstance(value, dict):
         return {k: to_cpu(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(to_cpu(v) for v in value)
-    return value
+    return value.cpu() if isinstance(value, Tensor) else value

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
-from rover_lib.workshop.plots.style import BLACK, BLUE, RED, SLATE, Note, legend, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLACK, BLUE, RED, SLATE, legend, legend_below, new_figure
 
 HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
 
@@ -15,6 +15,14 @@ HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "
 def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
     """Return the rows without ensembling, of cars that were pushed or not. rows: of drive.json."""
     return [r for r in rows if r["ensemble"] is None and bool(r["pushes"]) == pushed]
+
+
+def hit_bars(ax: Axes, x: Sequence[float], rows: Sequence[Mapping[str, Any]], key: str, **style: Any) -> np.ndarray:
+    """Draw the share of worlds hit, in %, with Wilson's 95 % interval; return it. key: of the interval's ends."""
+    share = np.array([100 * row["hits"] / row["trials"] for row in rows])
+    ends = 100 * np.array([[row[f"{key}_low"], row[f"{key}_high"]] for row in rows]).reshape(-1, 2).T
+    ax.errorbar(x, share, np.clip(np.abs(ends - share), 0, None), ms=6, capsize=3, **style)
+    return share
 
 
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
@@ -28,10 +36,7 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
         for compensate, (label, colour, marker, side) in HOW.items():
             shown = [r for r in drives if r["compensate"] == compensate]
             x = [places[r["latency_ms"]] + 0.1 * side for r in shown]
-            share = np.array([100 * r["hits"] / r["trials"] for r in shown])
-            ends = 100 * np.array([[r["hits_wilson_low"], r["hits_wilson_high"]] for r in shown]).reshape(-1, 2).T
-            bars = np.clip(np.abs(ends - share), 0, None)
-            ax.errorbar(x, share, bars, fmt=marker, ms=6, color=colour, elinewidth=2, capsize=3, label=label)
+            share = hit_bars(ax, x, shown, "hits_wilson", fmt=marker, color=colour, elinewidth=2, label=label)
             for at, y, r in zip(x, share, shown, strict=True):
                 ax.annotate(f"{r['hits']}", (at, y), (9 * side, 0), textcoords="offset points", color=colour,
                             ha="left" if side > 0 else "right", va="center", fontsize=8)  # fmt: skip
@@ -69,24 +74,4 @@ def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
     ax.set(xlabel="an inference takes (ms)", ylabel=f"beside the path of\n{min(places, default=0):g} ms, at most (cm)")
     ax.set_title("bar and number: median of the worlds; line: 90 % of them", fontsize=11)
     legend(ax, loc="upper left")
-    return fig
-
-
-def plans_from_above(drives: Sequence[Mapping[str, Any]]) -> Figure | Note:
-    """Draw drives of one world with all their plans, each from where it looked. drives: `from_above` of drive.json."""
-    if not drives:
-        return Note("no drive was kept to be shown from above")
-    fig, axes = new_figure(len(drives), height_in=0.5 + 3.1 * len(drives))
-    for ax, drive in zip(axes[:, 0], drives, strict=True):
-        label, colour, _, _ = HOW[drive["compensate"]]
-        ax.plot(drive["x_m"], drive["y_m"], color=colour, lw=7, alpha=0.35, label="driven")
-        for i, plan in enumerate(drive["plans"]):
-            ax.plot(plan["x_m"], plan["y_m"], color=BLACK, lw=0.9, label=None if i else "a plan, from where it looked")
-            ax.plot(plan["x_m"][0], plan["y_m"][0], "o", color=colour, mec=BLACK, mew=0.7, ms=5)
-        ax.add_patch(Circle(drive["balloon_xy_m"], 0.16, color=RED))
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.set_ylabel("to the left (m)")
-        ax.set_title(f"{drive['latency_ms']:g} ms, {label}: {drive['outcome']}", fontsize=11)
-    axes[-1, 0].set_xlabel("ahead of the start (m)")
-    legend(axes[0, 0], loc="best")
     return fig

@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from balloon_world.plots.late_plans import hit_bars
 from rover_lib.workshop.plots.style import MIST, SLATE, Note, legend_below, new_figure
 
 # name, colour, marker, and to which side the marks are moved
@@ -36,8 +36,5 @@ def _arms(ax: Axes, policies: Sequence[Mapping[str, Any]], how: str) -> None:
     most = max(row["human_s"] for row in policies)
     for arm, colour, marker, aside in ARMS:
         rows = [first, *(row for row in policies if row["arm"] == arm)]
-        x = np.array([row["human_s"] for row in rows]) + 0.008 * most * aside
-        share = np.array([100 * row[how]["hits"] / row[how]["trials"] for row in rows])
-        ends = 100 * np.array([[row[how]["wilson_low"], row[how]["wilson_high"]] for row in rows])
-        bars = np.clip(np.abs(ends.T - share), 0, None)
-        ax.errorbar(x, share, yerr=bars, fmt=f"{marker}-", ms=6, lw=1.5, color=colour, capsize=3, label=arm)
+        x = [row["human_s"] + 0.008 * most * aside for row in rows]
+        hit_bars(ax, x, [row[how] for row in rows], "wilson", fmt=f"{marker}-", lw=1.5, color=colour, label=arm)

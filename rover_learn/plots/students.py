@@ -7,50 +7,35 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots.style import (
-    MIST,
-    OTHERS,
-    SLATE,
-    Note,
-    action_colour,
-    bar_values,
-    legend,
-    new_figure,
-)
+from rover_lib.workshop.plots.style import MIST, OTHERS, SLATE, Note, bar_values, legend, new_figure
 
 # prefix of a row's keys, label, face colour, marker, and how far the marks are moved
 DRIVES = (("", "left alone", SLATE, "o", -0.16), ("pushed_", "pushed", "white", "s", 0.16))
 
 
 def frontier(students: Sequence[Mapping[str, Any]], chosen: str) -> Figure:
-    """Draw the policies from most work to least: time of a plan, errors, and hits with Wilson's 95 % interval.
+    """Draw the policies from most work to least: time of a plan, and hits with Wilson's 95 % interval.
 
     Without drives there is no panel of hits. students: rows of students.json, the teacher first. chosen: the
     recommended one's name.
     """
     drove = any(row["trials"] for row in students)
     rows = sorted(students, key=lambda row: -row["gmac"])
-    height_in, widths = 2.0 + 0.75 * len(rows), (1, 1.35, 1.2) if drove else (1, 1.2)
-    fig, axes = new_figure(1, len(widths), height_in=height_in, sharey=True, width_ratios=widths)
-    _work(axes[0, 0], rows)
+    fig, axes = new_figure(1, 1 + drove, height_in=2.0 + 0.75 * len(rows), sharey=True)
+    first = axes[0, 0]
+    _work(first, rows)
     if drove:
         _hits(axes[0, 1], rows)
-    _errors(axes[0, -1], rows)
-    first = axes[0, 0]
     first.set_yticks(range(len(rows)), [_label(row) for row in rows])
     first.set_ylim(len(rows) - 0.4, -0.6)
     for label, row in zip(first.get_yticklabels(), rows, strict=True):
-        if row["name"] == chosen:
-            label.set(weight="bold")
+        label.set(weight="bold" if row["name"] == chosen else "normal")
     return fig
 
 
 def _label(row: Mapping[str, Any]) -> str:
     share = f", {row['backbone_channels']:.0%}" if row.get("backbone_channels") else ""
-    return (
-        f"{row['name']}\n{row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}"
-        f"{share}{', QAT' if row['qat'] else ''}"
-    )
+    return f"{row['name']}\n{row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}{share}"
 
 
 def _work(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -70,37 +55,17 @@ def _work(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
 def _hits(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for key, label, face, marker, aside in DRIVES:
         driven = [(y + aside, row) for y, row in enumerate(rows) if row[f"{key}trials"]]
+        y = [at for at, _ in driven]
         share = np.array([100 * row[f"{key}hits"] / row[f"{key}trials"] for _, row in driven])
         ends = 100 * np.array([[row[f"{key}hits_wilson_{end}"] for end in ("low", "high")] for _, row in driven])
         bars = np.clip(np.abs(ends.reshape(-1, 2).T - share), 0, None)
-        y = [at for at, _ in driven]
         ax.errorbar(share, y, xerr=bars, fmt=marker, ms=6, color=SLATE, mfc=face, elinewidth=2, capsize=3, label=label)
-        for at, (low, _), (_, row) in zip(y, ends.reshape(-1, 2), driven, strict=True):
+        for at, x, (_, row) in zip(y, share, driven, strict=True):
             late = f", {row['pushed_latency_ms']:.0f} ms late" if key else ""
-            ax.annotate(f"{row[f'{key}hits']}{late}", (low, at), (-6, 0), textcoords="offset points", color=SLATE,
-                        ha="right", va="center", fontsize=8)  # fmt: skip
-    left, right = ax.get_xlim()
-    ax.set_xlim(left - 0.55 * (right - left), right)
+            ax.annotate(f"{row[f'{key}hits']}{late}", (x, at), (0, 6), textcoords="offset points", fontsize=8)
     trials = max(row["trials"] or 0 for row in rows)
     ax.set_xlabel(f"worlds hit (% of {trials}),\nwith the 95 % interval")
     legend(ax, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
-
-
-def _errors(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
-    actions = [k.removeprefix("recorded_").removesuffix("_pct") for k in rows[0] if k.startswith("recorded_")]
-    height = 0.8 / (2 * max(len(actions), 1))
-    for i, action in enumerate(actions):
-        if any(row[f"recorded_{action}_pct"] is None for row in rows):
-            ax.plot([], [], " ", label=f"{action}: not judged")
-            continue
-        for j, (to, alpha) in enumerate((("recorded", 1.0), ("teacher", 0.45))):
-            y = np.arange(len(rows)) + (2 * i + j + 0.5 - len(actions)) * height
-            errors = [row[f"{to}_{action}_pct"] for row in rows]
-            label = f"{action}, to the {'recordings' if to == 'recorded' else 'teacher'}"
-            ax.barh(y, errors, height, color=action_colour(action, i), alpha=alpha, label=label)
-            bar_values(ax, y, errors, "{:.2f}")
-    ax.set_xlabel("mean error\n(% of the recorded range)")
-    legend(ax, loc="lower center", bbox_to_anchor=(0.5, 1))
 
 
 def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int = 40) -> Figure | Note:
@@ -116,8 +81,8 @@ def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int =
         for i, (name, found) in enumerate(by_student.items()):
             if steps := found.get(phase):
                 parts = np.array_split(np.arange(len(steps)), min(means, len(steps)))
-                x, y = zip(*((part.mean() + 1, np.asarray(steps)[part].mean()) for part in parts), strict=True)
-                ax.plot(x, y, color=OTHERS[i % len(OTHERS)], lw=1.5, label=name)
+                y = [np.asarray(steps)[part].mean() for part in parts]
+                ax.plot([part.mean() + 1 for part in parts], y, color=OTHERS[i % len(OTHERS)], lw=1.5, label=name)
         ax.set_title(phase, fontsize=11)
         ax.set(xlabel="step", ylim=(0, None))
     axes[0, 0].set_ylabel("loss")

@@ -7,13 +7,7 @@ import pytest
 from balloon_world.child_process import Child
 from rover_lib.onboard.errors import TrainingError
 
-ECHO = """
-import sys, time
-for line in sys.stdin:
-    for piece in line.upper()[:-1], "\\n":  # as an unbuffered Python's print() does
-        print(piece, end="", flush=True)
-        time.sleep(0.05)
-"""
+ECHO = "import sys; [print(line.upper(), end='', flush=True) for line in sys.stdin]"
 
 
 def start(program, **options):
@@ -23,8 +17,7 @@ def start(program, **options):
 def test_a_child_that_talks_ends_with_its_input():
     child = start(ECHO, talks=True)
     child.send_line("hello")
-    assert child.read_line(20) == "HELLO\n"
-    assert child.read_line(0.01) == ""
+    assert child.read(20) == b"HELLO\n" and child.read(0.01) == b""
     child.check()
     child.close()
     assert child.process.returncode == 0

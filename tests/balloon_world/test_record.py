@@ -3,7 +3,6 @@ import json
 import cv2
 import pytest
 
-from balloon_world import record
 from balloon_world.record import record_episodes
 from rover_lib.onboard.errors import TrainingError
 
@@ -39,24 +38,11 @@ def test_pulses_are_what_an_arduino_measures(recorded):
     assert min(c["throttle_raw_us"] for c in controls) >= 120, "never below stopped"
 
 
-def test_the_same_seed_gives_the_same_bytes(recorded, tmp_path, monkeypatch):
-    monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "another"))
+def test_the_same_seed_gives_the_same_bytes(recorded, tmp_path):
     assert bytes_of(record_episodes(tmp_path / "again", count=5, seed=3)) == bytes_of(recorded)
     before = {p: p.stat().st_mtime_ns for p in recorded.rglob("*")}
     assert record_episodes(recorded, count=5, seed=3) == recorded  # which is left as it is
     assert {p: p.stat().st_mtime_ns for p in recorded.rglob("*")} == before
-
-
-def test_a_recording_that_was_made_is_taken_from_the_cache(recorded, tmp_path, monkeypatch):
-    def never(*args):
-        raise AssertionError("recorded again")
-
-    monkeypatch.setattr(record, "record_drive", never)
-    again = record_episodes(tmp_path / "again", count=5, seed=3)
-    assert bytes_of(again) == bytes_of(recorded)
-    with pytest.raises(AssertionError, match="recorded again"):
-        record_episodes(tmp_path / "other", count=5, seed=4)
-    assert not (tmp_path / "other").exists()
 
 
 def test_a_folder_with_something_else_is_refused(tmp_path):

@@ -41,7 +41,7 @@ def artifact(path, checkpoint, off=0.0, misses=0, gmac=15.0, height=360):
 
 
 def shape(name, layers):
-    return {"name": name, "decoder_layers": layers, "feedforward": 1600, "qat": False}
+    return {"name": name, "decoder_layers": layers, "feedforward": 1600}
 
 
 def distilled(folder, teacher="teacher's", own="student's"):
@@ -83,13 +83,6 @@ def made(tmp_path, recorded, monkeypatch):
     return SimpleNamespace(teacher=teacher, student=student, driven=driven)
 
 
-KEYS = [
-    "name", "height", "width", "decoder_layers", "feedforward", "qat", "instructions_g", "simd_g", "size_mb",
-    "computed_ms", "teacher_steering_pct", "teacher_throttle_pct", "recorded_steering_pct", "recorded_throttle_pct",
-    "hits", "trials", "pushed_hits", "pushed_trials", "pushed_latency_ms",
-]  # fmt: skip
-
-
 @pytest.mark.slow
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     counted(made.teacher, 90)
@@ -97,7 +90,7 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     content = judge_students(made.teacher, [made.student], worlds=3)
     assert content == read_stage(made.teacher / "students.json", "students")
     teacher, student = content["metrics"]["students"]
-    assert set(KEYS) <= set(teacher) and set(teacher) == set(student)
+    assert set(teacher) == set(student)
     assert (teacher["name"], teacher["decoder_layers"]) == ("teacher", 7)
     assert teacher["computed_ms"] == pytest.approx(predict_ms(Work(teacher["instructions_g"], 0, 0))[::2])
     assert teacher["computed_ms"][1] == pytest.approx(90)
@@ -109,30 +102,23 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     assert student["teacher_throttle_pct"] == pytest.approx(2 * teacher["teacher_throttle_pct"], rel=1e-3)
     assert {late and round(late, 6) for *_, late in made.driven} == {None, 90, 20}
     assert content["metrics"]["latency"] == "counted" and content["metrics"]["recommendation"]["name"] == "teacher"
-    assert {p.name for p in made.teacher.iterdir()} == {
-        "arm.json", "load.json", "policy_fp32.pt", "policy_static.pt", "students.json",
-    }  # fmt: skip
 
 
 def test_what_was_driven_once_is_kept(made):
-    judge_students(made.teacher, [made.student], worlds=2)
+    first = judge_students(made.teacher, [made.student], worlds=2)["metrics"]
     assert len(made.driven) == 8
-    first = read_stage(made.teacher / "students.json", "students")["metrics"]
     made.driven.clear()
     assert judge_students(made.teacher, [made.student], worlds=2)["metrics"] == first and not made.driven
-    judge_students(made.teacher, [made.student], worlds=3)  # one more world for each
-    assert len(made.driven) == 4 and {seed for _, seed, _ in made.driven} == {SEED + 2}
-    made.driven.clear()
     artifact(made.student / "policy_static.pt", "student's", off=0.004)
-    judge_students(made.teacher, [made.student], worlds=3)
-    assert len(made.driven) == 6 and {off for off, *_ in made.driven} == {0.004}
+    judge_students(made.teacher, [made.student], worlds=3)  # one more world for each, and all for another artifact
+    assert len(made.driven) == 2 + 6 and {seed for off, seed, _ in made.driven if off != 0.004} == {SEED + 2}
 
 
 def test_where_there_is_no_world_nobody_drives(made):
     found = judge_students(made.teacher, [made.student], worlds=0)["metrics"]
     assert not made.driven and found["notes"][0].startswith("Nobody drove")
     assert all(row["hits"] is row["trials"] is row["pushed_latency_ms"] is None for row in found["students"])
-    assert plots.frontier(found["students"], "teacher").axes and len(plots.frontier(found["students"], "").axes) == 2
+    assert len(plots.frontier(found["students"], "teacher").axes) == 1
 
 
 @pytest.mark.slow
@@ -140,39 +126,32 @@ def test_rows_are_drawn(made):
     counted(made.teacher, 90)
     counted(made.student, 20)
     rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
-    work, hits, errors = plots.frontier(rows, "fast").axes
+    work, hits = plots.frontier(rows, "fast").axes
     assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
     assert {"10.3 to 20", "46.2 to 90"} <= {text.get_text() for text in work.texts}
-    assert "2, 20 ms late" in {text.get_text() for text in hits.texts} and len(errors.patches) == 8
-    rows = [row | {"computed_ms": None, "recorded_throttle_pct": None} for row in rows]
-    work, _, errors = plots.frontier(rows, "fast").axes
-    assert "multiply-accumulates" in work.get_xlabel() and len(errors.patches) == 4
-
-
-def moved(made, name):
-    return made.student.rename(made.student.with_name(name))
+    assert "2, 20 ms late" in {text.get_text() for text in hits.texts}
+    work, _ = plots.frontier([row | {"computed_ms": None} for row in rows], "fast").axes
+    assert "multiply-accumulates" in work.get_xlabel()
 
 
 @pytest.mark.parametrize(
     ("breaks", "says"),
     [
-        (lambda made: moved(made, "teacher"), "none is 'teacher'"),
-        (lambda made: (made.student / "distill.json").unlink() or made.student, "no distill.json in it"),
-        (lambda made: (made.student / "policy_static.pt").unlink() or made.student, r"policy_static\.pt: not there"),
-        (lambda made: (made.teacher / "policy_fp32.pt").unlink() or made.student, "as it was trained"),
-        (lambda made: (made.teacher / "load.json").unlink() or made.student, "give --episodes"),
-        (lambda made: distilled(made.student, teacher="another") or made.student, "a student of another checkpoint"),
-        (lambda made: distilled(made.student, own="another") or made.student, "not made of the student"),
+        (lambda made: made.student.rename(made.student.with_name("teacher")), "none is 'teacher'"),
+        (lambda made: (made.student / "distill.json").unlink(), "no distill.json in it"),
+        (lambda made: (made.student / "policy_static.pt").unlink(), r"policy_static\.pt: not there"),
+        (lambda made: (made.teacher / "policy_fp32.pt").unlink(), "as it was trained"),
+        (lambda made: (made.teacher / "load.json").unlink(), "give --episodes"),
+        (lambda made: distilled(made.student, teacher="another"), "not its teacher"),
+        (lambda made: distilled(made.student, own="another"), "is not the student"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(made, breaks, says):
-    student = breaks(made)
+    student = breaks(made) or made.student
     before = {p: p.read_bytes() for p in made.teacher.iterdir()}
     with pytest.raises(TrainingError, match=says):
         judge_students(made.teacher, [student], worlds=1)
     assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
-    with pytest.raises(TrainingError, match="names of their own"):
-        judge_students(made.teacher, [student, student], worlds=1)
 
 
 def test_the_command_drives_and_executes_the_notebook(made, monkeypatch):
@@ -193,7 +172,7 @@ SEEDS = list(range(10_000, 10_200))
 
 def row(name, lost=0, pushed_lost=0, above=0.0, work=1.0, **changed):
     """A policy that misses `lost` of 200 worlds when left alone, and `pushed_lost` of them when it is pushed."""
-    values = {"name": name, "height": 180, "width": 320, "decoder_layers": 2, "feedforward": 1600, "qat": False}
+    values = {"name": name, "height": 180, "width": 320, "decoder_layers": 2, "feedforward": 1600}
     values |= {"gmac": 10 * work, "instructions_g": work, "simd_g": work, "size_mb": 30.0}
     values |= {"computed_ms": [40 * work, 60 * work], "pushed_latency_ms": 60 * work}
     for action in ("steering", "throttle"):
@@ -211,8 +190,7 @@ NOT_DRIVEN = {f"{key}{what}": None for key in ("", "pushed_") for what in ("hits
     ("student", "passed"),
     [
         (row("s", lost=4, pushed_lost=20, above=0.29), [True, True, True]),
-        (row("s", lost=5, pushed_lost=0), [False, True, True]),
-        (row("s", pushed_lost=21), [True, False, True]),
+        (row("s", lost=5, pushed_lost=21), [False, False, True]),
         (row("s", recorded_steering_pct=4.0, recorded_throttle_pct=5.31), [True, True, False]),
         (row("s", pushed_hits=None, pushed_trials=None, pushed_missed=None), [True, None, True]),
     ],
@@ -226,8 +204,7 @@ def test_the_fastest_of_those_within_the_limits_is_recommended():
     slow, fast, wrong = row("slow", work=0.5), row("fast", work=0.3), row("wrong", work=0.1, lost=9)
     verdict = recommendation([TEACHER, slow, fast, wrong], LIMITS)
     assert (verdict["name"], verdict["fastest_by"], len(verdict["gates"])) == ("fast", "instructions_g", 9)
-    uncounted = row("slow", work=0.5, instructions_g=None, computed_ms=None, gmac=1.0)
-    rows = [TEACHER, uncounted, fast, wrong]
+    rows = [TEACHER, slow | {"instructions_g": None, "computed_ms": None, "gmac": 1.0}, fast, wrong]
     verdict = recommendation(rows, LIMITS)
     assert verdict["name"] == "slow"  # then by multiply-accumulates
     metrics = {"students": rows, "recommendation": verdict, "notes": ["a note"], "warnings": []}

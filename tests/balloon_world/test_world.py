@@ -20,13 +20,12 @@ def frame_hash(world):
     return hashlib.sha256(world.render().tobytes()).hexdigest()
 
 
-@pytest.mark.parametrize("shoves", [0, 2])
-def test_the_same_seed_gives_the_same_drive_and_frames(shoves):
-    worlds = [World(7, shoves), World(7, shoves)]
-    assert frame_hash(worlds[0]) == frame_hash(worlds[1])
+def test_the_same_seed_gives_the_same_drive_and_frames():
+    worlds = [World(7, 2), World(7, 2)]
+    assert frame_hash(worlds[0]) == frame_hash(worlds[1]) != frame_hash(World(8, 2))
     for world in worlds:
         drive(world)
-    assert worlds[0].trajectory == worlds[1].trajectory
+    assert worlds[0].trajectory == worlds[1].trajectory != World(7).trajectory
     assert frame_hash(worlds[0]) == frame_hash(worlds[1])
 
 
@@ -85,17 +84,16 @@ def test_a_car_that_stands_or_drives_away_hits_nothing(action, outcomes):
 
 @pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1), (0.0, 1.1)])
 def test_an_action_outside_its_range_is_refused(action):
-    with pytest.raises(TrainingError, match="steering"):
+    with pytest.raises(TrainingError):
         World(1).step(*action)
 
 
 def test_what_is_no_world_is_refused():
     world = World(1)
     drive(world)
-    with pytest.raises(TrainingError, match="ended"):
-        world.step(0.0, 0.0)
-    with pytest.raises(TrainingError, match="negative"):
-        World(-1)
+    for refused in (lambda: world.step(0.0, 0.0), lambda: World(-1)):
+        with pytest.raises(TrainingError):
+            refused()
 
 
 @pytest.mark.parametrize(("left", "side"), [(None, -1), (1, 1), (-1, -1)])

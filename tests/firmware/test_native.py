@@ -12,7 +12,6 @@ import uno
 from hypothesis import given
 from hypothesis import strategies as st
 
-from balloon_world import simulated_arduino as standin
 from lab.driving.virtual import library
 from rover_lib.onboard.car import car, servo_link
 from rover_lib.onboard.errors import RoverError
@@ -162,12 +161,13 @@ def test_both_sides_have_the_same_limits():
         for name in ("STEERING", "THROTTLE")
     ]
     assert (*servos[0], *servos[1], limit["CAP_MAX_US"]) == car.DEFAULT_NUMBERS
-    assert car.DEFAULT_NUMBERS[6] + limit["CAP_MAX_US"] == standin.CAP_US
-    shared = [name for name in limit if hasattr(car, name) and name != "FAST_PULSE_MAX_US"]  # there, a receiver's
-    assert {name: limit[name] for name in shared} == {name: getattr(car, name) for name in shared}
-    assert len(shared) == 13
+    names = ["PERIOD_MIN", "PERIOD_MAX", "FAST_PERIOD_MIN", "FAST_PERIOD_MAX", "FAST_NEUTRAL_MIN", "FAST_NEUTRAL_MAX"]
+    names += ["PULSE_MIN", "PULSE_MAX", "STEERING_NEUTRAL_MIN", "THROTTLE_NEUTRAL_MIN", "NEUTRAL_MAX", "STEERING_THROW"]
+    assert {name: limit[f"{name}_US"] for name in [*names, "CAP_MAX"]} == {
+        name: getattr(car, f"{name}_US") for name in [*names, "CAP_MAX"]
+    }
     assert limit["THROTTLE_MAX_US"] == car.FAST_PULSE_MAX_US
-    assert int(re.search(r"LATE_MS = (\d+)", text)[1]) == standin.LATE_MS == servo_link.LATE_S * 1000
+    assert int(re.search(r"LATE_MS = (\d+)", text)[1]) == servo_link.LATE_S * 1000
 
 
 @given(st.data())

@@ -52,27 +52,6 @@ def test_channels_that_are_always_zero_are_not_there_and_nothing_changes(tiny, t
     assert (predictions(model, [inputs_of(s, thin.config) for s in samples]) - expected).abs().max() < 1e-5
 
 
-def test_training_leaves_zeros_alone(thin):
-    """If a channel's filter, batch norm and reader are all zero, none of them gets a gradient or decays."""
-    weights = {k: v.clone() for k, v in thin.weights.items()}
-    for name in BLOCKS:
-        weights[f"{name}.bn1.bias"][::2] = 0
-        weights[f"{name}.conv2.weight"][:, ::2] = 0
-    policy = BatchedPolicy(thin.config, weights)
-    policy.thaw()
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=0.1, weight_decay=0.1)
-    state, frame = inputs_of(memory_samples(1)[0], thin.config)
-    policy(frame[None], state).square().sum().backward()
-    optimizer.step()
-    after = policy.weights()
-    for name in BLOCKS:
-        for part in (*PARTS, "conv2.weight"):
-            key, axis = f"{name}.{part}", int(part == "conv2.weight")
-            was, now = (w[key].transpose(0, axis) for w in (weights, after))
-            assert not now[::2].any(), key
-            assert (now[1::2] != was[1::2]).any(), key
-
-
 def patches_of(h):
     return F.unfold(h, 3, padding=1).transpose(1, 2).flatten(0, 1)
 

@@ -18,7 +18,6 @@ from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, EpisodeWriter
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -60,7 +59,7 @@ def checkpoint(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recipe():
     few = {"samples": 20, "batch": 4, "judged_frames": 4, "rate": 1e-3}
-    return FinetuneRecipe.of(params(), transformer_steps=6, together_steps=3, **few)
+    return FinetuneRecipe.of(transformer_steps=6, together_steps=3, **few)
 
 
 @pytest.fixture(autouse=True)
@@ -99,33 +98,26 @@ def test_a_plan_that_began_before_the_takeover_is_not_taught():
 
 
 @pytest.mark.slow
-def test_what_is_left_is_one_policy_in_two_formats_with_its_parent_and_recipe(taught, checkpoint):
+def test_what_is_left_is_one_policy_in_two_formats_with_what_it_learned_from(taught, checkpoint):
     ours, lerobots = load_checkpoint(taught / "best_model.pth"), load_checkpoint(taught / "pretrained_model")
     parent = load_checkpoint(checkpoint)
     assert ours.config == parent.config  # including the VAE's encoder, so that the trainer can go on with it
     assert set(ours.weights) == set(parent.weights)
     assert all(torch.equal(weight, lerobots.weights[name]) for name, weight in ours.weights.items())
     moved = {name for name, weight in ours.weights.items() if not torch.equal(weight, parent.weights[name])}
-    assert any(name.startswith("backbone.") for name in moved) and any(name.startswith("decoder.") for name in moved)
+    assert {name.split(".")[0] for name in moved} >= {"backbone", "decoder"}
     assert not any(name.startswith("vae_") for name in moved)
     origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
     assert origin == ours.report["trainer_config"]["origin"] | {"rate_hz": 30.0}
     assert origin["parent_sha256"] == parent.sha256 and origin["finetuned_by"]["transformer_steps"] == 6
     assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "finetune.json", "pretrained_model"]
-
-
-@pytest.mark.slow
-def test_finetune_json_says_what_was_learned_from_and_judges_each_episode(taught):
     metrics = read_stage(taught / "finetune.json", "finetune")["metrics"]
-    assert metrics["learned_from"] == {
-        "demonstrations": 20,
-        "new_demonstrations": 0,
-        "corrections": 24,
-        "not_imitated": 3 * (8 + 3),  # nobody's first frame makes no sample: the action before it was the human's
-    } | {"corrections": 20}
+    learned = {"demonstrations": 20, "new_demonstrations": 0, "corrections": 20}
+    # nobody's first frame makes no sample: the action before it was the human's
+    assert metrics["learned_from"] == learned | {"not_imitated": 3 * (8 + 3)}
     assert [(row["kind"], row["frames"]) for row in metrics["held_out"]] == [("old", 4)] * 2 + [("new", 4)]
     assert all(row[f"{when}_steering_pct"] > 0 for row in metrics["held_out"] for when in ("before", "after"))
-    assert metrics["verdict"]["better"] is None and "2 old and 1 new" in metrics["verdict"]["why"]
+    assert metrics["verdict"]["better"] is None
     assert {phase: len(losses) for phase, losses in metrics["losses"].items()} == {"transformer": 6, "together": 3}
 
 
@@ -135,7 +127,7 @@ def test_killed_in_both_phases_it_goes_on_and_gives_the_same(
 ):
     save_each_step(monkeypatch, finetune_module)
     arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
-    for at in (1, 4, 4, 2):  # with 0, 3, 6 and 7 steps done, of which the first phase has 6
+    for at in (4, 5):  # with 3 and 7 steps done, of which the first phase has 6
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training, "descend", at)
             finetune(checkpoint, [old, new], "better", **arguments)
@@ -143,14 +135,10 @@ def test_killed_in_both_phases_it_goes_on_and_gives_the_same(
     steps = interrupt(monkeypatch, training, "descend", at=0)
     folder = finetune(checkpoint, [old, new], "better", **arguments)
     assert len(steps) == 6 + 3 - 7
-    assert_same(folder, taught)
-
-
-def assert_same(folder, other):
-    expected = load_checkpoint(other / "best_model.pth").weights
+    expected = load_checkpoint(taught / "best_model.pth").weights
     weights = load_checkpoint(folder / "best_model.pth").weights
     assert all(torch.equal(weight, expected[name]) for name, weight in weights.items())
-    losses = [json.loads((f / "finetune.json").read_text())["metrics"]["losses"] for f in (folder, other)]
+    losses = [json.loads((f / "finetune.json").read_text())["metrics"]["losses"] for f in (folder, taught)]
     assert losses[0] == losses[1]
 
 
@@ -172,60 +160,44 @@ def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old,
 # --- what cannot be ---
 
 
-def refused(says, checkpoint, episodes, tmp_path, **options):
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(TrainingError, match=says) as error:
-        finetune(checkpoint, episodes, **{"name": "better", "runs_dir": tmp_path / "runs", "device": "cpu", **options})
-    assert "\n" not in str(error.value) and sorted(tmp_path.rglob("*")) == before
+def shifted():
+    """Another car."""
+    car = Car()
+    return replace(car, pwm=replace(car.pwm, steering=replace(car.pwm.steering, neutral_pct=7.0)))
 
 
-def test_a_run_that_is_there_is_not_overwritten(checkpoint, old, new, tmp_path):
-    (tmp_path / "runs" / "better").mkdir(parents=True)
-    refused("is there already", checkpoint, [old, new], tmp_path)
+@pytest.mark.parametrize(
+    ("says", "options"),
+    [
+        ("no human drove", {"drivers": [POLICY] * 20 + [NOBODY] * 4}),
+        ("another camera", {"size": (64, 64)}),
+        ("another rate", {"rate_hz": 15}),  # a plan has 30 steps a second: the car would do all in half the time
+        ("another car", {"car": shifted()}),
+    ],
+)
+def test_recordings_that_do_not_belong_to_the_old_ones_are_refused(says, options, checkpoint, old, tmp_path):
+    others = record(tmp_path / "others", drives=2, offset=90, **{"drivers": TAKEN_OVER, **options})
+    with pytest.raises(TrainingError, match=says):
+        finetune(checkpoint, [old, others], "better", runs_dir=tmp_path / "runs", device="cpu")
+    assert not (tmp_path / "runs").exists()
 
 
-def test_without_a_new_episode_there_is_nothing_to_learn(checkpoint, old, tmp_path):
-    refused("no new episode", checkpoint, [old], tmp_path)
-
-
-def test_drives_in_which_no_human_drove_teach_nothing(checkpoint, old, tmp_path):
-    alone = record(tmp_path / "alone", drives=2, drivers=[POLICY] * 20 + [NOBODY] * 4)
-    refused("no human drove", checkpoint, [old, alone], tmp_path)
-
-
-def test_another_camera_is_refused(checkpoint, old, tmp_path):
-    square = record(tmp_path / "square", drives=1, drivers=TAKEN_OVER, size=(64, 64))
-    refused("another camera", checkpoint, [old, square], tmp_path)
-
-
-def test_recordings_of_another_rate_are_refused(checkpoint, old, tmp_path):
-    """A plan has 30 steps a second: learned from 15, the car would do all of it in half the time."""
-    dark = record(tmp_path / "dark", drives=2, drivers=TAKEN_OVER, offset=90, rate_hz=15)
-    refused("another rate", checkpoint, [old, dark], tmp_path)
-
-
-def test_another_car_is_refused(checkpoint, old, tmp_path):
-    other = Car()
-    channel = replace(other.pwm.steering, neutral_pct=7.0)
-    other = replace(other, pwm=replace(other.pwm, steering=channel))
-    others = record(tmp_path / "other", drives=1, drivers=TAKEN_OVER, car=other)
-    refused("another car", checkpoint, [old, others], tmp_path)
-
-
-def test_the_same_recordings_twice_are_refused(checkpoint, old, tmp_path):
-    refused("given twice", checkpoint, [old, old.parent / "." / old.name], tmp_path)
-
-
-def test_an_artifact_does_not_learn(old, new, tmp_path):
-    refused("is an artifact", tmp_path / "policy_static.pt", [old, new], tmp_path)
+def test_what_cannot_learn_is_refused(checkpoint, old, new, tmp_path):
+    (tmp_path / "there").mkdir()
+    for policy, episodes, name, says in (
+        (checkpoint, [old, new], "there", "is there already"),
+        (checkpoint, [old], "better", "no human drove in a new episode"),
+        (checkpoint, [old, old.parent / "." / old.name], "better", "given twice"),
+        (tmp_path / "policy_static.pt", [old, new], "better", "is an artifact"),
+    ):
+        with pytest.raises(TrainingError, match=says):
+            finetune(policy, episodes, name, runs_dir=tmp_path, device="cpu")
+    assert [p.name for p in tmp_path.iterdir()] == ["there"]
 
 
 @pytest.mark.slow
-def test_the_command_prints_what_it_learned_from_and_where_it_left_it(checkpoint, old, new, tmp_path):
-    given_ = [
-        "--name", "better", "--runs-dir", tmp_path, "--samples", 8, "--steps", 2, "--weight", 3, "--device", "cpu",
-    ]  # fmt: skip
-    result = CliRunner().invoke(main, [str(a) for a in ("finetune", checkpoint, old, new, *given_)])
-    assert result.exit_code == 0, result.output
-    assert "8 corrections" in result.output and f"done: {tmp_path / 'better'}" in result.output
+def test_the_command_says_what_it_learned_from(checkpoint, old, new, tmp_path):
+    words = ["--name", "better", "--runs-dir", tmp_path, "--samples", 8, "--steps", 2, "--weight", 3, "--device", "cpu"]
+    result = CliRunner().invoke(main, [str(a) for a in ("finetune", checkpoint, old, new, *words)])
+    assert result.exit_code == 0 and "8 corrections" in result.output, result.output
     assert read_stage(tmp_path / "better" / "finetune.json", "finetune")["params"]["correction_weight"] == 3

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from rover_learn import training
-from rover_learn.training import Best, Phase, Resumable, RowFile, frames_of, in_memory, seed_inside
+from rover_learn.training import Best, Frames, Phase, Resumable, RowFile, seed_inside
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -71,13 +71,6 @@ def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, ev
         assert (losses, after) == (whole[0], whole[2])
 
 
-def test_ended_again_and_again_it_comes_to_its_end(tmp_path, whole):
-    for _ in range(2 * STEPS - 1):
-        with pytest.raises(Killed):
-            train(tmp_path, 2)  # each run makes one step that it can keep
-    assert torch.equal(train(tmp_path)[1], whole[1])
-
-
 @pytest.mark.slow
 def test_killed_for_real_while_it_saves(tmp_path, whole):
     """SIGKILL from outside, at moments that nobody chose."""
@@ -118,46 +111,36 @@ def test_a_damaged_file_is_named(tmp_path, name, left, says):
 
 def test_a_file_of_rows_gives_what_was_appended(tmp_path):
     given = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float16)
-    rows = RowFile(tmp_path / "rows", (2, 3), np.float16)
+    rows, chosen = RowFile(tmp_path / "rows", (2, 3), np.float16), np.array([4, 0, 4])
     rows.append(given[:3])
     rows.append(torch.from_numpy(given[3:]))
-    chosen = np.array([4, 0, 4])
-    assert len(rows) == 5 and rows[chosen].dtype == np.float16
-    assert (rows[chosen] == given[chosen]).all()
+    assert len(rows) == 5 and rows[chosen].dtype == np.float16 and (rows[chosen] == given[chosen]).all()
+
+
+def learn(folder, steps, loss, best=None):
+    """A phase of a network of one weight, which it returns."""
+    model, rng = nn.Linear(1, 1), np.random.default_rng(0)
+    with Resumable(folder) as saved:
+        saved.train(
+            Phase("p", steps, 0.1), model, rng, lambda _: torch.ones(1, 1), lambda x: loss(model(x)), best(model)
+        )
+    return model.weight.item()
 
 
 def test_a_loss_that_is_not_finite_ends_the_training(tmp_path):
-    model = nn.Linear(1, 1)
-    with Resumable(tmp_path) as saved, pytest.raises(TrainingError, match="not finite"):
-        saved.train(
-            Phase("nan", 1, 0.1),
-            model,
-            np.random.default_rng(0),
-            lambda _: None,
-            lambda _: model(torch.tensor([math.nan])).sum(),
-        )
+    with pytest.raises(TrainingError, match="not finite"):
+        learn(tmp_path, 1, lambda y: y.sum() * math.nan, lambda _: None)
 
 
 def test_the_best_weights_are_kept_and_what_learns_by_heart_stops(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "JUDGE_EVERY", 1)
-    model, errors = nn.Linear(1, 1), iter([3.0, 1.0, *[2.0] * 20])
-    weights = []
+    errors, weights = iter([3.0, 1.0, *[2.0] * 20]), []
 
-    def judge():
-        weights.append(model.weight.item())
-        return next(errors)
+    def best(model):
+        return Best(lambda: weights.append(model.weight.item()) or next(errors))
 
-    with Resumable(tmp_path) as saved:
-        batch = torch.ones(1, 1)
-        saved.train(
-            Phase("p", 20, 0.1),
-            model,
-            np.random.default_rng(0),
-            lambda _: batch,
-            lambda x: model(x).square().sum(),
-            Best(judge),
-        )
-    assert len(weights) == 2 + training.PATIENCE and model.weight.item() == weights[1] != weights[-1]
+    kept = learn(tmp_path, 20, lambda y: y.square().sum(), best)
+    assert len(weights) == 2 + training.PATIENCE and kept == weights[1] != weights[-1]
 
 
 def samples_of(folder: Path, count: int) -> tuple[Sample, ...]:
@@ -173,16 +156,13 @@ def samples_of(folder: Path, count: int) -> tuple[Sample, ...]:
     return tuple(samples)
 
 
-def test_frames_read_when_asked_for_are_those_in_memory(tmp_path):
-    read = frames_of(samples_of(tmp_path, 5), 18, 32)
-    held = in_memory(read, "reading")
-    assert held.images.shape == (5, 18, 32, 3)
-    for rows in (np.array([3, 0]), slice(1, 4)):
-        assert (read.images[rows] == held.images[rows]).all()
-
-
-def test_a_frame_that_is_gone_is_named(tmp_path):
-    read = frames_of(samples_of(tmp_path, 2), 18, 32)
+def test_frames_read_when_asked_for_are_those_in_memory_and_one_that_is_gone_is_named(tmp_path):
+    frames, rows = Frames.of(samples_of(tmp_path, 5), (18, 32)), np.array([3, 0])
+    read = frames.pictures(rows)
+    assert read.shape == (2, 18, 32, 3)
     (tmp_path / "1.jpg").unlink()
     with pytest.raises(EpisodeError, match=r"1\.jpg: cannot be read"):
-        read.images[np.array([1])]
+        frames.read_all()
+    held = Frames.of(tuple(frames.samples[i] for i in (0, 2, 3)), (18, 32))
+    held.read_all()
+    assert (held.pictures(np.array([2, 0])) == read).all()

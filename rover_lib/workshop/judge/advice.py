@@ -122,7 +122,6 @@ def list_remedies(
         gate=gate,
         key=key,
         smaller=_smaller(stages, names),
-        qat=names.distill("--qat", kind="qat"),
         mixed=rows.get("mixed", {}),
         most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
         odd=quantized.get("odd"),
@@ -211,12 +210,4 @@ def _to_drive(judged: Mapping[str, Any], stages: Stages, names: Names, artifact:
         ]
     if judged["deploy"] == "mixed":
         commands.append((deploying, "put it on the rover"))
-    if not stages["quantize"].get("odd"):
-        name = f"{names.name}-qat"
-        left = "pretrained_model" if stages["load"]["checkpoint"].get("format") == "lerobot" else "best_model.pth"
-        run = shlex.join(["rover", "run", f"runs/{name}/{left}", names.episodes, "--name", name])
-        commands += [
-            (names.distill("--qat", kind="qat"), "train static INT8 to keep its gates"),
-            (run, "and judge that"),
-        ]
     return commands
