@@ -103,10 +103,8 @@ class TakeoverRecorder:
 
         armed: the status with which the car was armed, when both sticks were at rest; None takes neutral as rest. stop:
         ends the recording when it is set. over: called at each tick; may return another reason to end the recording.
-        clock: the clock of the link and the recorder.
-        The recording also ends after MOST_S, or if the receiver loses its signal, the link has no new status, the
-        Arduino was reset, another program has armed the car, or the recorder can record no more. Sends nothing to the
-        Arduino, and raises nothing if the link fails.
+        clock: the clock of the link and the recorder. Sends nothing to the Arduino, and raises nothing if the link
+        fails.
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
@@ -160,17 +158,11 @@ class TakeoverRecorder:
             tick = max(tick + 1, int((now_s - start_s) * rate_hz))
             stop.wait(max(0.0, start_s + tick / rate_hz - clock()))
 
-    def _write(self, telemetry: Telemetry, driver: str) -> None:
-        self._last_s = telemetry.host_s
-        self.recorder.control(
-            telemetry.host_s,
-            telemetry.uptime_ms,
-            telemetry.receiver_steering_us,
-            telemetry.receiver_throttle_us,
-            telemetry.receiver_steering_period_us,
-            telemetry.receiver_throttle_period_us,
-            driver=driver,
-        )
+    def _write(self, t: Telemetry, driver: str) -> None:
+        self._last_s = t.host_s
+        sticks = t.receiver_steering_us, t.receiver_throttle_us
+        periods = t.receiver_steering_period_us, t.receiver_throttle_period_us
+        self.recorder.control(t.host_s, t.uptime_ms, *sticks, *periods, driver=driver)
 
 
 def _at_rest(telemetry: Telemetry, rest_us: tuple[int, int]) -> bool:
