@@ -370,15 +370,6 @@ class _Session(Session):
         pilot.world, pilot.planner = world, planner
         return pilot
 
-    def make_warnings(self, pilot: PolicyPilot) -> Callable[[], list[str]]:
-        """Return the sources of warnings, less what they say of the machine that this runs on."""
-        warnings = super().make_warnings(pilot)
-
-        def of_the_drive() -> list[str]:
-            return [text for text in warnings() if not text.startswith("this machine")]
-
-        return of_the_drive
-
     def _arm(self, arming: Arming, stop: threading.Event, said: str) -> Telemetry | None:
         self.process.world.phase("disarmed")
         return super()._arm(arming, stop, said)

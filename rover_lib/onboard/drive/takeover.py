@@ -7,11 +7,9 @@
 
 After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,
 and sends nothing. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the
-receiver, as the Arduino measures them. If the Arduino's pins differ from the receiver (because the throttle is blocked
-until it has been at rest once, or because the signal was lost), the driver is "nobody".
-
-Who drove is exact to one tick: the Arduino's first status after the takeover says whether it still took the policy's
-last command. A command that it did not take is not recorded.
+receiver; if the pins differ from it (the throttle is blocked until it has been at rest once, or the signal was lost),
+the driver is "nobody". The Arduino's first status after the takeover says whether it still took the policy's last
+command; one that it did not take is not recorded.
 """
 
 import threading

@@ -25,7 +25,6 @@ PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before that
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands that were sent again within a second
-IDLE = 0.05  # of the processors' time; if less is idle, some process has to wait
 TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
 
 
@@ -135,7 +134,6 @@ class HealthWatch:
         self._report, self._link, self._pids = report, link, tuple(pids)
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
-        self._spent, self._busy = _spent(), False
 
     def __call__(self) -> Iterator[str]:
         self._report.memory_mb = memory_mb(self._pids)
@@ -145,11 +143,6 @@ class HealthWatch:
         with contextlib.suppress(LinkError):  # the next tick handles it
             if self._link and (telemetry := self._link.latest()):
                 yield from self._of_the_link(self._link.garbled, telemetry)
-        before, self._spent = self._spent, _spent()
-        idle, total = (now - then for now, then in zip(self._spent, before, strict=True))
-        was_busy, self._busy = self._busy, idle < IDLE * total
-        if self._busy and not was_busy:  # what goes on is not said again
-            yield f"this machine is busy: its processors were idle for {idle / total:.0%} of the time"
 
     def _of_the_link(self, garbled_lines: int, t: Telemetry) -> Iterator[str]:
         counted = (self._report.resent, garbled_lines, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
@@ -162,14 +155,6 @@ class HealthWatch:
                 f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "
                 f"garbled, {old} old and {beyond} out of range, and lost {lost} bytes"
             )
-
-
-def _spent() -> tuple[int, int]:
-    """Return the processors' time in the kernel's ticks, idle and in total; zeros where the kernel reports none."""
-    with contextlib.suppress(OSError):
-        spent = [int(value) for value in Path("/proc/stat").read_text().partition("\n")[0].split()[1:9]]
-        return spent[3] + spent[4], sum(spent)
-    return 0, 0
 
 
 def memory_mb(pids: Iterable[int]) -> float | None:

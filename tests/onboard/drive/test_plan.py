@@ -76,15 +76,6 @@ def test_an_older_frames_plan_is_left_aside():
     assert f.plan.number == 1
 
 
-def test_a_fresh_plan_takes_over_in_steps():
-    f = follower(blend_ticks=3)
-    f.add(Plan(1, 0.0, 0.0, ramp(0.0, 0.0)), 0.0)
-    f.command(0.0)
-    f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
-    found = [f.command(0.1 + i * STEP).steering for i in range(5)]
-    assert found == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
-
-
 @given(
     st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1)), min_size=2, max_size=12),
     st.integers(0, 6),

@@ -34,7 +34,7 @@ from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.session import Arming, Session
-from rover_lib.onboard.errors import CameraError, PolicyError
+from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.recording.episode import json_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
@@ -444,19 +444,6 @@ def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
 # arming.py
 
 
-def test_an_old_plan_is_renewed_before_the_car_is_armed():
-    """Or it would set off by a picture of long ago."""
-    asked = []
-
-    def renew(age_s):
-        asked.append(age_s)
-        raise PolicyError("no fresh plan")
-
-    with pytest.raises(PolicyError):
-        arms(renew)
-    assert asked == [Settings().fade_s]
-
-
 def arms(renew=lambda age_s: None, check_sight=lambda: None, asked_s=0.0):
     """Arm at 40 s by a session whose car was asked for at asked_s."""
     planner = SimpleNamespace(without_rest=contextlib.nullcontext, renew=renew)
@@ -470,11 +457,16 @@ def arms(renew=lambda age_s: None, check_sight=lambda: None, asked_s=0.0):
         return arming.arm()
 
 
+def test_an_old_plan_is_renewed_before_the_car_is_armed():
+    """Or it would set off by a picture of long ago."""
+    asked = []
+    assert arms(asked.append, asked_s=11.0) == "armed" and asked == [Settings().fade_s]
+
+
 def test_no_car_is_armed_whose_camera_shows_nothing():
     def check_sight():
         raise CameraError("black")
 
-    assert arms(asked_s=11.0) == "armed"
     with pytest.raises(CameraError):
         arms(check_sight=check_sight, asked_s=11.0)
 
