@@ -233,7 +233,7 @@ PIN_ROWS = (
            lambda bench: bench.drive.process.send_signal(signal.SIGTERM), exit_code=0),
     PinRow("SIGKILL", "operator", STOPPED, "the drive before this one", "a signal from outside",
            lambda bench: bench.drive.process.send_signal(signal.SIGKILL), exit_code=-9, told_later=True),
-    PinRow("CPU starved", "host", CONTINUES, "this machine is busy", "4 busy processes of ordinary priority",
+    PinRow("CPU starved", "host", CONTINUES, "", "4 busy processes of ordinary priority",
            _starve, exit_code=None, watch_s=3.0, starves=True),
     PinRow("disk full while logging", "host", CONTINUES, "the flight log cannot be written",
            "RLIMIT_FSIZE by prlimit", _fill_disk, exit_code=None, watch_s=2.0),

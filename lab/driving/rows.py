@@ -292,7 +292,7 @@ def run_row(fault: FaultRow, car: Car = DEFAULT) -> dict[str, Any]:
         verdict.wrong.append(f"the drive ended with {code}, expected {wanted}")
     said = [text for ms, text in seen.log if ms >= at_ms] + [words for _, ms, words in seen.drives if words]
     message = fault.message + f"|{LOST_SIGNAL}" * (gamepad and fault.expected == STOPPED)  # its sticks stop, too
-    line = next((text for text in said if re.search(message, text)), None) if message else "killed"
+    line = next((text for text in said if re.search(message, text)), None) if message else "nothing tells of it"
     if line is None:
         verdict.wrong.append(f"no line tells of it (wanted: {fault.message})")
     run = Run(seen)

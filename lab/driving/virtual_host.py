@@ -13,9 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
-from unittest.mock import patch
 
 import numpy as np
 
@@ -23,7 +21,6 @@ from lab.driving.virtual import DROPPING, FRAME_MS, GONE, LOST, SILENT, STUCK, K
 from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
-from rover_lib.onboard.drive import watch
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Report
@@ -377,19 +374,6 @@ class _Session(Session):
         pilot = _Pilot(*args, calibration=world.car.pwm)
         pilot.world, pilot.planner = world, planner
         return pilot
-
-    def make_warnings(self, pilot: PolicyPilot) -> Callable[[], list[str]]:
-        """Return the sources of warnings, less what they say of the machine that this runs on."""
-        world = self.process.world
-        clocks = SimpleNamespace(time=functools.partial(wall_clock, world), monotonic=world.clock)
-        with patch.object(watch, "time", clocks):
-            warnings = super().make_warnings(pilot)
-
-        def of_the_drive() -> list[str]:
-            with patch.object(watch, "time", clocks):
-                return [text for text in warnings() if not text.startswith(("this machine", "this virtual machine"))]
-
-        return of_the_drive
 
     def attempt(self, arming: Arming) -> Telemetry | None:
         try:

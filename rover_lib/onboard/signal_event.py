@@ -14,10 +14,9 @@ POLL_S = 0.01
 
 
 class SignalEvent(threading.Event):
-    """A flag that the handler of a signal may set, whatever the interrupted thread is doing; wait() polls it.
+    """A flag that the handler of a signal may set at any moment; wait() polls it.
 
-    Python's own Event takes a lock that a thread cannot take twice: a handler that interrupted the thread which holds
-    it would wait for itself, and Ctrl-C would hang the program.
+    Python's own Event takes a lock: a handler that interrupted the thread which holds it would wait for itself.
     """
 
     def __init__(self) -> None:

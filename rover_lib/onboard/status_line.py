@@ -4,6 +4,7 @@ import contextlib
 import logging
 import os
 import queue
+import shutil
 import sys
 import threading
 from collections.abc import Callable
@@ -15,10 +16,10 @@ CLOSE_S = 0.5  # close() waits no longer for a terminal that was stopped
 
 
 class StatusLine(logging.Handler):
-    """One line of status on a stream, written by a thread of its own inside the context; also a handler of log records.
+    """One line of status on a stream, overwritten on a terminal, inside the context; also a handler of log records.
 
-    callback: returns the status. A terminal's line is overwritten, any other stream gets a new line now and then. Log
-    records appear above the status. Whoever logs them waits for nothing: of a terminal that was stopped, some are lost.
+    callback: returns the status. Log records appear above it. Whoever logs them waits for nothing: of a terminal that
+    was stopped, some are lost.
     """
 
     def __init__(self, callback: Callable[[], str], stream: TextIO | None = None, every_s: float | None = None):
@@ -46,16 +47,15 @@ class StatusLine(logging.Handler):
         while line is not None:
             try:
                 line = self._lines.get(timeout=self._every_s)
-                text = f"{line}\n" if line is not None else f"{self._status()}\n"
+                text = f"{self._status() if line is None else line}\n"
             except queue.Empty:
                 text = self._status() + ("" if self._terminal else "\n")
             with contextlib.suppress(OSError, ValueError):  # nobody reads the stream any more
                 self._write(f"\r\x1b[K{text}" if self._terminal else text)
 
     def _status(self) -> str:
-        with contextlib.suppress(OSError, ValueError):  # it is no terminal
-            return self._callback()[: (os.get_terminal_size(self._stream.fileno()).columns or 80) - 1]
-        return self._callback()
+        text = self._callback()
+        return text[: shutil.get_terminal_size().columns - 1] if self._terminal else text
 
     def _write(self, text: str) -> None:
         try:

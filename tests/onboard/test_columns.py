@@ -3,11 +3,8 @@
 from rover_lib.onboard.columns import align, benchmark_rows, number, ratio
 
 
-def test_columns_stand_under_each_other():
+def test_columns_stand_under_each_other_and_what_was_not_measured_is_a_dash():
     assert align([["", "MB"], ["static", "11.9"], ["fp32", "-"]]) == ["          MB", "static  11.9", "fp32       -"]
-
-
-def test_what_was_not_measured_is_a_dash():
     assert number(None) == number(float("nan")) == "-" and number(1.25) == "1.2"
     assert ratio(None, 2) is None and ratio(1, 0) is None and ratio(6, 2) == 3
 

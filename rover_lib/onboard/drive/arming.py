@@ -1,19 +1,12 @@
-"""Arm the car: wait for what a human must do, and ask the Arduino for the car last of all.
-
-    telemetry = arm_when_asked(attempt, link, stop, log.event, still_wanted=wanted_since(asked_s), terminal=True)
-
-A service, a terminal and a script differ only in who asks; session.py has what is done then.
-"""
+"""Arm the car: wait for what a human must do, and ask the Arduino for the car last of all. For session.py."""
 
 import threading
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive.loop import Arm
-from rover_lib.onboard.drive.service import CHECK_S, Service, check_age
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.drive.service import CHECK_S, RoverError, check_age
 
 WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduino refuses an arming after 31
 
@@ -21,31 +14,6 @@ WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduin
 def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
     """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
     return lambda: check_age(clock() - asked_s, WAIT_S)
-
-
-def arm_when_asked(
-    attempt: Arm,
-    link: ServoLink | None,
-    stop: threading.Event,
-    notify: Callable[[str], None],
-    checks: Sequence[Callable[[], object]] = (),
-    *,
-    still_wanted: Callable[[], object],
-    service: Service | None = None,
-    said: str = "",
-    terminal: bool = False,
-) -> Telemetry | None:
-    """Arm the car by `attempt` for whoever asks for it, and return what it returned.
-
-    With a service, its operator asks, said: how the previous drive ended. In a terminal, the command itself asked, and
-    the car waits for what is missing. Otherwise, and without a link, it is armed at once. Raises as wait_for_human(),
-    arm_when_ready() and attempt() do.
-    """
-    if link and service:
-        return service.wait_for_human(attempt, checks, partial(what_is_missing, link), said=said)
-    if link and terminal:
-        return arm_when_ready(attempt, link, stop, notify, checks, still_wanted)
-    return attempt()
 
 
 def arm_when_ready(

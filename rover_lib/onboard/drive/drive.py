@@ -1,9 +1,7 @@
-"""A whole drive: open all devices in order, run the control loop, and close everything in reverse order.
+"""A whole drive: open all devices in order, arm and drive (session.py), and close everything in reverse order.
 
-    report = Report()
-    drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev/ttyUSB0"), report)
-
-The loop itself is in loop.py, what the car does at a tick in pilot.py, and how it is armed in session.py.
+report = Report()
+drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev/ttyUSB0"), report)
 """
 
 import contextlib

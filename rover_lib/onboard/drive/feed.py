@@ -3,12 +3,10 @@
     feed = Feed(place, log, title="policy_static.pt")
     drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
 
-The view (view.py) is another process; on a rover, another user runs it. It listens at a Unix socket that transports
-whole messages, and the drive checks once a second whether a view listens there. Neither side ever waits for the other.
-A message is dropped while the previous one has not been read; the next one follows a tenth of a second later and is
-complete in itself. So a view that hangs, floods or dies costs a drive no more than a failed system call. At each tick
-the drive reads a few of the view's messages: STOP ends the drive like any other reason to end it, and all others are
-ignored.
+The view is another process; on a rover, another user runs it. It listens at a Unix socket that transports whole
+messages, and the drive checks once a second whether a view listens there. Neither side waits for the other: a message
+is dropped while the previous one has not been read, and the next one is complete in itself. So a view that hangs,
+floods or dies costs a drive no more than a failed system call. All messages of the view but STOP are ignored.
 
 A message is a line of JSON, followed by the camera's newest picture: a JPEG if the camera delivers JPEGs, otherwise
 every nth pixel of every nth row, (h, w, 3) uint8 BGR, whose size is the line's "shape".
@@ -156,20 +154,14 @@ class Feed:
         since_s = self._ticks[-1][0] - self._ticks[0][0] if self._ticks else 0.0
         try:
             shown, picture = self._picture(camera)
-            line = {
-                "phase": phase,
-                "text": text,
-                "title": self._title,
-                "sent_s": self._clock(),
-                "tick": None,
-                "missed": report.missed,
-                "machine": self._log.machine,
-                "events": [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)],
+            events = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
+            rate = {
                 "hz": (len(self._ticks) - 1) / since_s if since_s > 0 else None,
                 "late_most_ms": max((late_ms for _, late_ms in self._ticks), default=None),
-                **message,
-                **shown,
             }
+            about = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
+            state = {"missed": report.missed, "machine": self._log.machine, "events": events}
+            line = about | state | rate | message | shown
             return self._put(json.dumps(line).encode() + b"\n", picture)
         except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")

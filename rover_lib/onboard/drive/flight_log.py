@@ -5,13 +5,11 @@
         log.event("camera unplugged", level=logging.WARNING, frame=812)
     flight = read_log(path)
 
-Each file begins with a header, which names the columns of the ticks. A tick is an array of values, null if unknown.
-Events, and the machine's temperature and throttling, are objects. A line that a power cut or a full disk
-has cut short is skipped by the reader.
+Each file begins with a header, which names the columns of the ticks. A tick is an array of values, null if unknown;
+all else are objects. A line that a power cut or a full disk has cut short is skipped by the reader.
 
-`tick` and `event` only put a row into a bounded queue. Two threads do everything that may take long or fail: one reads
-the machine's state, writes the file and syncs it; the other passes events on to `logging` (logger "rover"), whose
-stream may be a terminal that somebody stopped.
+`tick` and `event` only put a row into a bounded queue; one thread reads the machine's state, writes the file and syncs
+it. Events also go to `logging` (logger "rover"), whose handler must not wait: status_line.py has one.
 """
 
 import contextlib
@@ -21,13 +19,12 @@ import json
 import logging
 import math
 import os
-import queue
 import shutil
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from io import FileIO
 from pathlib import Path
@@ -46,7 +43,6 @@ from rover_lib.onboard.stage import FILE_BYTES, plain, private_lock, read_plain
 
 SCHEMA = 2
 QUEUE_ROWS = 2048  # the disk may stall for a minute at 30 Hz; 1 MB
-QUEUE_EVENTS = 256
 SYNC_S = 0.9  # between two syncs to the disk: a power cut costs a second at most
 RETRY_S = 1.0  # from a failed write to the next attempt
 CLOSE_S = 2.0  # close() waits no longer
@@ -98,27 +94,24 @@ def log_limits() -> tuple[int, int]:
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
     if not is_number(max_mb, 0.02, FILE_BYTES / 1e6) or not is_whole(keep, 0):
-        raise ParamsError(
-            f"flight_log: max_mb must be a number from 0.02 to {FILE_BYTES / 1e6:g}, and keep a whole one from 0",
-            found=f"{max_mb!r} and {keep!r}",
-            remedy="see params.yml",
-        )
+        what = f"flight_log: max_mb must be from 0.02 to {FILE_BYTES / 1e6:g}, keep whole and not negative"
+        raise ParamsError(what, found=f"{max_mb!r} and {keep!r}", remedy="see params.yml")
     return int(max_mb * 1e6), keep
 
 
 class FlightLog:
     """The flight log of one drive. It is written inside its context, in which no other drive can write that file.
 
-    path: the file, to which the drive is appended; None only passes events on to logging. header: what the drive was
-    started with; the figure of a log looks for hz, fade_s and stop_s in it. max_bytes: a file of this size is renamed
-    to path.1, path.1 to path.2 and so on, and only `keep` older files stay. Raises RoverError on entering if another
-    drive writes the file, and nothing later: if the disk is full or gone, this is logged once, and tried again every
-    second. Ticks must come from one thread; events may come from any, and from the handlers of signals.
+    path: the file, to which the drive is appended. header: what the drive was started with; figures need hz, fade_s and
+    stop_s in it. max_bytes: a file of this size is renamed to path.1, path.1 to path.2 and so on, and only `keep` older
+    files stay. Raises RoverError on entering if another drive writes the file, and nothing later: if the disk is full
+    or gone, this is logged once, and tried again every second. Ticks must come from one thread; events may come from any,
+    and from the handlers of signals.
     """
 
     def __init__(
         self,
-        path: Path | str | None,
+        path: Path | str,
         *,
         header: dict[str, Any],
         max_bytes: int,
@@ -126,29 +119,24 @@ class FlightLog:
         clock: Callable[[], float] = time.monotonic,
         host: Host | None = None,
     ):
-        self.path = Path(path) if path is not None else None
-        self.start_s = clock()
+        self.path, self.start_s = Path(path), clock()
         self.recent: deque[Event] = deque(maxlen=RECENT)
         self.machine: dict[str, Any] = {}  # its newest state: temperature_c, throttled
         start = {"start": datetime.now().astimezone().isoformat(), "start_monotonic_s": self.start_s}
         self._header = {"schema": SCHEMA, "kind": "header", **start, "columns": Tick._fields, "drive": header}
         self._max_bytes, self._keep, self._clock, self._host = max_bytes, keep, clock, host or Host()
-        self._rows: deque[Tick | Event] = deque(maxlen=QUEUE_ROWS if self.path else 0)
+        self._rows: deque[Tick | Event] = deque(maxlen=QUEUE_ROWS)
         self._dropped = 0  # ticks for which the queue had no room
-        self._messages: queue.SimpleQueue[tuple[int, object] | None] = queue.SimpleQueue()  # None: the end
-        self._locked: BaseFileLock | None = None
+        self._lock: BaseFileLock | None = None
         self._closing = threading.Event()
-        self._teller = threading.Thread(target=self._tell, name="flight log events", daemon=True)
         self._writer = threading.Thread(target=self._write, name="flight log", daemon=True)
         # Only the writing thread uses these, once it runs:
         self._file: FileIO | None = None
         self._lines: deque[bytes] = deque()  # not written yet
 
     def __enter__(self) -> "FlightLog":
-        if self.path:
-            self._lock(self.path)
-            self._writer.start()
-        self._teller.start()
+        self._take_lock()
+        self._writer.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -164,38 +152,26 @@ class FlightLog:
         event = Event(self._clock() - self.start_s, text, fields)
         self._rows.append(event)
         self.recent.append(event)
-        self._pass_on(level, event)
+        _log.log(level, "%s", event)
 
     def close(self) -> None:
-        """Write what is left. Waits 2 s at most, and then gives up on a disk or a terminal that is stuck."""
-        end = time.monotonic() + CLOSE_S
+        """Write what is left. Waits 2 s at most, and then gives up on a disk that is stuck."""
         self._closing.set()
         if self._writer.is_alive():
             self._writer.join(CLOSE_S)
-        self._messages.put(None)
-        self._teller.join(max(0.0, end - time.monotonic()))
-        if self._locked:
-            self._locked.release()
+        if self._lock and not self._writer.is_alive():  # a stuck one still writes, and keeps other drives out
+            self._lock.release()
 
-    def _lock(self, path: Path) -> None:
+    def _take_lock(self) -> None:
         """Keep other drives from the file, also while it is renamed. Raises RoverError if one writes it now."""
+        path = self.path
         with contextlib.suppress(OSError):  # where nothing can be locked, such as beside /dev/null
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._locked = private_lock(path.with_name(f".{path.name}.lock"))
+            self._lock = private_lock(path.with_name(f".{path.name}.lock"))
             try:
-                self._locked.acquire()
+                self._lock.acquire()
             except Timeout:
                 raise RoverError(f"{path}: another drive writes this log", remedy="name another by --log") from None
-
-    def _pass_on(self, level: int, message: object) -> None:
-        if self._messages.qsize() < QUEUE_EVENTS:
-            self._messages.put((level, message))
-
-    def _tell(self) -> None:
-        """The thread that passes messages on to logging."""
-        while message := self._messages.get():
-            with contextlib.suppress(Exception):  # a failing handler must not end this thread
-                _log.log(message[0], "%s", message[1])
 
     def _write(self) -> None:
         """The thread that writes the file."""
@@ -211,14 +187,13 @@ class FlightLog:
                 failed = False
             except Exception as error:  # of any type: a drive goes on without its log
                 if not failed:
-                    text = f"{self.path}: the flight log cannot be written ({error}); driving goes on without"
-                    self._pass_on(logging.WARNING, text)
+                    _log.warning("%s: the flight log cannot be written (%s); driving goes on without", self.path, error)
                 failed = True
                 self._close_file()
         self._close_file()
 
     def _collect(self) -> None:
-        """Make lines of the rows that have come, and of the machine's state."""
+        """Make lines of the machine's state, and of the rows that have come."""
         now_s = self._clock() - self.start_s
         vcgencmd = shutil.which(self._host.vcgencmd)  # never start a program that is not there
         bits = self._host.throttled() if vcgencmd else None
@@ -232,21 +207,18 @@ class FlightLog:
 
     def _write_lines(self) -> None:
         """Write what was collected, and sync it to the disk. Raises OSError."""
-        assert self.path, "this thread runs only for a file"
-        file = self._file or self._open(self.path)
+        file = self._file or self._open()
         while self._lines:
             if file.tell() >= self._max_bytes:
-                file = self._shift(self.path)
+                file = self._shift()
             if file.write(self._lines[0]) < len(self._lines[0]):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._lines.popleft()
         os.fsync(file)
 
-    def _open(self, path: Path) -> FileIO:
-        """Open the file and write a header. Raises OSError."""
-        file = FileIO(path, "a")
+    def _open(self) -> FileIO:
+        self._file = file = FileIO(self.path, "a")
         file.write(b"\n" * (file.tell() > 0) + _line(self._header))  # the line feed ends a line that was cut short
-        self._file = file
         return file
 
     def _close_file(self) -> None:
@@ -255,14 +227,16 @@ class FlightLog:
                 self._file.close()
         self._file = None
 
-    def _shift(self, path: Path) -> FileIO:
+    def _shift(self) -> FileIO:
         """Rename the files so that `path` is free, and open a new one."""
-        for number in range(self._keep, 1, -1):
+        path = self.path
+        names = [path, *(path.with_name(f"{path.name}.{number}") for number in range(1, self._keep + 1))]
+        for older, newer in zip(names[:0:-1], names[-2::-1], strict=True):
             with contextlib.suppress(FileNotFoundError):
-                path.with_name(f"{path.name}.{number - 1}").replace(path.with_name(f"{path.name}.{number}"))
-        path.replace(path.with_name(f"{path.name}.1")) if self._keep else path.unlink()
+                newer.replace(older)
+        path.unlink(missing_ok=True)
         self._close_file()
-        return self._open(path)
+        return self._open()
 
 
 def _line(row: Any) -> bytes:
@@ -283,8 +257,8 @@ class Flight:
 
     header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: an array per field of
     Tick, (n,) float64 with NaN for "not known"; state and reason are text. machine: t_s and temperature_c, (m,)
-    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged: how
-    many lines were skipped in these files, of all drives together.
+    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files, of which
+    `damaged` lines were skipped.
     """
 
     path: Path
@@ -329,22 +303,17 @@ class Flight:
         if period_ms:
             passed = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
             missed = max(0, int(passed[passed > 0].sum()) - not_logged)
+        in_state = [(s, float(durations_s[ticks["state"] == s].sum())) for s in np.unique(ticks["state"])]
         return {
             "start": self.header.get("start"),
             "seconds": float(t_s[-1] - t_s[0]) if len(t_s) else 0.0,
             "ticks": len(t_s),
             "missed": missed,
-            "jitter_p50_ms": _percentile(late_ms, 50),
-            "jitter_p99_ms": _percentile(late_ms, 99),
-            "jitter_max_ms": _percentile(late_ms, 100),
+            **{f"jitter_{name}_ms": _percentile(late_ms, q) for name, q in (("p50", 50), ("p99", 99), ("max", 100))},
             "plans": len(latency_ms),
             "plan_age_p95_ms": _percentile(ticks["plan_age_ms"], 95),
-            "latency_p50_ms": _percentile(latency_ms, 50),
-            "latency_p95_ms": _percentile(latency_ms, 95),
-            "seconds_in": {
-                states.get(str(s), str(s)): float(durations_s[ticks["state"] == s].sum())
-                for s in np.unique(ticks["state"])
-            },
+            **{f"latency_p{q}_ms": _percentile(latency_ms, q) for q in (50, 95)},
+            "seconds_in": {states.get(str(s), str(s)): seconds for s, seconds in in_state},
             "temperature_max_c": _percentile(self.machine["temperature_c"], 100),
             "throttled": throttled,
             "throttled_means": throttled_means(throttled),
@@ -361,22 +330,22 @@ def _percentile(values: np.ndarray, q: float) -> float | None:
     return float(np.percentile(values, q)) if len(values) else None
 
 
+@dataclass
 class _Drive:
     """One drive while it is read. machine: (t_s, temperature_c, throttled) each."""
 
-    def __init__(self, header: dict[str, Any]):
-        self.header, self.armed = header, False
-        self.ticks: list[list[Any]] = []
-        self.events: list[Event] = []
-        self.machine: list[tuple[float, float | None, str | None]] = []
+    header: dict[str, Any]
+    armed: bool = False
+    ticks: list[list[Any]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    machine: list[tuple[float, float | None, str | None]] = field(default_factory=list)
 
 
 def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
 
     drive: index of the drive in these files: 0 is the first, -1 the last. A service's log has a drive for each arming.
-    Raises RoverError if the file is missing or not a regular file, holds no line of a flight log, has no such drive, or
-    was written in another version of the format.
+    Raises RoverError if the file cannot be read, holds no such drive, or is of another version of the format.
     """
     path = Path(path)
     drives, damaged = _read_drives(path)
@@ -417,18 +386,17 @@ def _read_drives(path: Path) -> tuple[list[_Drive], int]:
     drives: list[_Drive] = []
     damaged = 0
     for row in map(_row, lines):
+        last = drives[-1] if drives else None
         if row is None:
             damaged += 1
         elif isinstance(row, dict):
-            if not drives or any(drives[-1].header.get(k) != row.get(k) for k in ("start", "start_monotonic_s")):
+            if not last or any(last.header.get(k) != row.get(k) for k in ("start", "start_monotonic_s")):
                 drives.append(_Drive(row))  # and not just the next file of the same drive
         else:
-            last = drives[-1] if drives else _Drive({})
-            if isinstance(row, Event) and row.text == ARMED:
-                last = _Drive(last.header) if last.armed else last
-                last.armed = True
-            if not drives or last is not drives[-1]:
-                drives.append(last)
+            begins = isinstance(row, Event) and row.text == ARMED
+            if not last or (begins and last.armed):
+                drives.append(last := _Drive(last.header if last else {}))
+            last.armed = last.armed or begins
             rows: Any = {list: last.ticks, Event: last.events, tuple: last.machine}[type(row)]
             rows.append(row)
     return drives, damaged

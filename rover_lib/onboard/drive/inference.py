@@ -15,7 +15,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
@@ -23,12 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.artifact.engines import UNCONFINED
 from rover_lib.onboard.artifact.manifest import Artifact, read_manifest
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.drive.plan import LIMITS, Commanded, Plan
 from rover_lib.onboard.errors import ArtifactError, PolicyError, RoverError
-from rover_lib.onboard.policy.confine import confine, forbid_opening, memory_mb
+from rover_lib.onboard.policy.confine import forbid_opening
 
 LOAD_S = 120.0  # time to load an engine and a full-size policy from a slow card
 POLL_S = 0.05
@@ -153,24 +151,19 @@ class Planner:
 class PolicyProcess:
     """An artifact in a process of its own; a context manager. Only one thread at a time may call predict().
 
-    With a process, the loop's commands were 1.4 to 3.5 ms late at p99, and with a thread instead of it 5.4 to 6.3 ms
-    (measured on a workstation at commit 7343b87, which could do both).
-
     artifact: a file, or an open Artifact whose manifest need not be read again. threads: of the engine; None: all cores
     but one, which is left for the loop. Raises PolicyError, with the sentence of the ArtifactError, if the artifact
-    cannot be used here.
+    cannot be used here. unconfined: why the kernel cannot confine the process, "" if it does. chunk: number of actions
+    in a plan, of which there are rate_hz per second.
 
     The artifact is not trusted. So the process is confined (see confine.py), and nothing that it sends is unpickled:
     its answers are accepted only if they have the shape that the manifest gives, which is read in this process.
-    unconfined: why the kernel cannot confine the process, "" if it does. chunk: number of actions in a plan, of which
-    there are rate_hz per second.
     """
 
     loaded: Callable[[Any], None] | None = None  # called with the loaded policy; the laboratory makes it misbehave
 
     def __init__(self, artifact: Path | str | Artifact, *, threads: int | None = None):
-        self._source = artifact
-        self.artifact = artifact.path if isinstance(artifact, Artifact) else Path(artifact)
+        self._source, self.artifact = artifact, artifact.path if isinstance(artifact, Artifact) else Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
         self.rate_hz, self.chunk, self.unconfined = 0.0, 0, ""
@@ -190,8 +183,7 @@ class PolicyProcess:
         arguments = theirs, str(self.artifact), self.threads, type(self).loaded
         self._process = spawn.Process(target=serve, args=arguments, name="policy", daemon=True)
         try:
-            with _blocked(TERMINALS):  # it inherits this: Ctrl-C comes to the loop alone, which stops the car first
-                self._process.start()
+            self._process.start()
             theirs.close()
             self.unconfined = self._answer(LOAD_S).decode(errors="replace")
         except BaseException:
@@ -264,11 +256,13 @@ class PolicyProcess:
 def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] | None) -> None:
     """Run the policy's process: answer each request until the other side closes the pipe.
 
-    An answer is "=" and bytes, or "!" and an error's sentence. The bytes of the first answer say why the
-    process is not confined, those of all others are chunks.
+    An answer is "=" and bytes, or "!" and an error's sentence. The first says why the process is not confined, all
+    others are chunks.
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)
+    for number in TERMINALS:  # Ctrl-C is for the loop alone, which stops the car first
+        signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError, OSError):
         try:
             policy, unconfined = _load_confined(artifact, threads)
@@ -292,35 +286,23 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
 def _load_confined(artifact: str, threads: int) -> tuple[Any, str]:
     """Confine this process, and load a policy in it; return it, and why the process is not confined. Raises RoverError.
 
-    Engines are imported here, because the process that drives must load none, and before the limit of memory, which an
-    engine exceeds.
+    Engines are imported here, because the process that drives must load none.
     """
-    from rover_lib.onboard.policy.load import import_engine, load_policy
+    from rover_lib.onboard.policy.confined import load_confined
 
-    with Artifact(artifact) as opened:
-        unconfined = UNCONFINED.get(import_engine(opened)) or confine(memory_mb(artifact, threads))
-        policy = load_policy(opened, threads=threads)
+    reasons: list[str] = []
+    policies, _ = load_confined({"policy": artifact}, threads=threads, notify=reasons.append)
+    policy = policies["policy"]
     names = list(policy.state_names), list(policy.action_names)
     if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
         raise PolicyError(
             f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
             remedy="this car has one camera, steering and throttle, by these names (rover run: --action-names)",
         )
-    return policy, unconfined
+    return policy, "".join(reasons)
 
 
 def _refusal(what: str, error: Exception) -> bytes:
     """Return an error as an answer: a RoverError's own sentence, or `what` and what was unexpected."""
     text = str(error) if isinstance(error, RoverError) else f"{what} ({type(error).__name__}: {str(error)[-300:]})"
     return b"!" + " ".join(text.split()).encode()
-
-
-@contextlib.contextmanager
-def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Inside this context, signals wait until its end, except for processes that are started in it: they get none."""
-    resource_tracker.ensure_running()  # or multiprocessing would start it here, and unblock SIGINT
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -30,10 +30,8 @@ KEEP_S = 0.034  # longest time between commands, even if ticks are rarer: to the
 RESEND_S = 0.018  # time to be acknowledged: 3 ms for the command, 7 for a status already on the wire, 7 for its own
 SPARE_S = 0.004  # nothing is sent again so shortly before a deadline
 READ_S = 0.005  # time for the thread that reads the port, after a pause of the whole process
-# The Arduino itself stops the car after a single pause of 150 ms, and after a second pause soon after one of 100 ms. It
-# lets shorter pauses pass, so they are added up here: within half a second, all of them together may take no longer
-# than a single one. A machine that is busy but healthy misses a tick now and then (4 of 55,801 beside builds,
-# docs/driving.md), never several again and again.
+# The Arduino stops the car after a pause of 150 ms, and after a second one soon after one of 100 ms. Shorter pauses are
+# added up here: within half a second, all of them together may take no longer than a single one.
 LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 
@@ -42,15 +40,15 @@ Warnings = Callable[[], Iterable[str]]  # sentences about what was unusual since
 
 
 class Log(Protocol):
-    """What the loop needs of a flight log."""
+    """What the loop needs of a flight log. None of its methods waits."""
 
     start_s: float
 
     def tick(self, row: Tick) -> None:
-        """Log one control tick, without waiting."""
+        """Log one control tick."""
 
     def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
-        """Log something that happened, without waiting."""
+        """Log something that happened."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,8 @@ class Hooks:
 class Report:
     """The outcome of a drive, and its state while it lasts.
 
-    late_ms, plan_age_ms and latency_ms have one value per tick; the last two have none where no plan is followed.
-    late_ms: how long after its deadline the command was sent; the summary calls it jitter.
+    late_ms (the summary's jitter: how long after its deadline a command was sent), plan_age_ms and latency_ms have one
+    value per tick; the last two have none where no plan is followed.
     """
 
     ticks: int = 0
@@ -111,9 +109,7 @@ class Report:
         return {
             "ticks": self.ticks,
             "missed": self.missed,
-            "jitter_p50_ms": at(self.late_ms, 50),
-            "jitter_p99_ms": at(self.late_ms, 99),
-            "jitter_max_ms": at(self.late_ms, 100),
+            **{f"jitter_{name}_ms": at(self.late_ms, pct) for name, pct in (("p50", 50), ("p99", 99), ("max", 100))},
             "plan_age_p95_ms": at(self.plan_age_ms, 95),
             "latency_p50_ms": at(self.latency_ms, 50),
             "latency_p95_ms": at(self.latency_ms, 95),
@@ -298,26 +294,19 @@ class _Loop:
         if telemetry.state is not State.AUTONOMOUS:
             raise DriveFault(f"the Arduino stopped the car: {telemetry.why}")
         if (age_s := self.link.unacknowledged_s(self.clock())) > LATE_S:
-            raise DriveFault(
-                f"the Arduino has not answered for {age_s * 1e3:.0f} ms, the link is behind",
-                remedy="what is between this machine and the Arduino?",
-            )
+            what = f"the Arduino has not answered for {age_s * 1e3:.0f} ms, the link is behind"
+            raise DriveFault(what, remedy="what is between this machine and the Arduino?")
         return telemetry
 
     def _check_time(self, now: float, late_s: float) -> None:
-        """Note that ticks were missed and that the present one is late_s late.
-
-        Raises DriveFault if such ticks were late by more than LATE_MOST_S altogether within LATE_WITHIN_S.
-        """
+        """Note a tick that is late_s late. Raises DriveFault if such ticks were too late altogether."""
         self.late.append((now, late_s))
         while self.late[0][0] < now - LATE_WITHIN_S:
             self.late.popleft()
         late_s = sum(seconds for _, seconds in self.late)
         if late_s > LATE_MOST_S:
-            raise DriveFault(
-                f"the loop had no time for its ticks in {late_s * 1e3:.0f} of the last {LATE_WITHIN_S * 1e3:.0f} ms",
-                remedy="is this machine too busy?",
-            )
+            what = f"the loop had no time for its ticks in {late_s * 1e3:.0f} of the last {LATE_WITHIN_S * 1e3:.0f} ms"
+            raise DriveFault(what, remedy="is this machine too busy?")
 
     def _send(self, order: Order) -> None:
         self.last = order

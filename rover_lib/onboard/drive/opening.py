@@ -68,24 +68,17 @@ def check_no_film(camera: str) -> None:
     """Raise CameraError for pictures that do not come from a camera's device."""
     path = path_of(camera)
     if path.exists() and not path.is_char_device():
-        raise CameraError(
-            f"{camera}: recorded pictures know nothing of where the car is",
-            remedy="give the camera's /dev/videoN, or --film if this is no real car",
-        )
+        what = f"{camera}: recorded pictures know nothing of where the car is"
+        raise CameraError(what, remedy="give the camera's /dev/videoN, or --film if this is no real car")
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:
-    """Return a warning if an artifact was calibrated for another car than this one, else "". It may drive all the same.
-
-    An artifact that names no car is for the car of the original recordings.
-    """
+    """Return a warning if an artifact was calibrated for another car, else "". It may drive all the same."""
     meant = car_of(manifest)
     if meant.drives_like(this):
         return ""
-    return (
-        f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: it has not seen what this one "
-        "does; see that the way is free"
-    )
+    what = f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}"
+    return f"{what}: it has not seen what this one does; see that the way is free"
 
 
 @contextlib.contextmanager

@@ -135,9 +135,8 @@ class PolicyPilot:
         end = time.monotonic() + FIRST_PLAN_S
         while self._planner.wait(0.1) is None and not stop.is_set():
             if time.monotonic() > end:
-                raise PolicyError(
-                    f"no plan within {FIRST_PLAN_S:g} s", remedy="does 'rover benchmark' run on this artifact?"
-                )
+                what = f"no plan within {FIRST_PLAN_S:g} s"
+                raise PolicyError(what, remedy="does 'rover benchmark' run on this artifact?")
 
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()

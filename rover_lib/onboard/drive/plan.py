@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.checked import Rule, broken_rule, is_whole, number, of_type, optional, whole
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
 STEERING, THROTTLE = 0, 1
@@ -24,8 +24,21 @@ LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, th
 IN_FORCE_S = 0.15  # how long a command holds: after that, the Arduino stops a car that gets no other
 BLIND_M = 1.0  # how far the car may go by one picture, at RECORDED_MPS
 RECORDED_MPS = 1.1  # throttle 0.09, the most of the recordings, of 12 m/s
-ENSEMBLE_MOST = 10.0  # times 64 plans; exp(709) is the largest that a float holds
+ENSEMBLE_MOST = 10.0  # times 64 plans, whose weights must not overflow: exp(709) is the largest that a float holds
 OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
+FRAMES = Rule(lambda count: is_whole(count, 0) and count != 1, "0 (off) or a whole number from 2")
+RULES = {
+    "fade_s": number(1e-3, 3600),
+    "stop_s": number(1e-3, 3600),
+    "blend_ticks": whole(0, 1000),
+    "compensate": of_type(bool),
+    "ensemble": optional(number(-ENSEMBLE_MOST, ENSEMBLE_MOST)),
+    "throttle_limit": number(0, 1),
+    "frozen_frames": FRAMES,
+    "black_frames": FRAMES,
+    "black_level": number(-255, 255),
+    "flat_level": number(-255, 255),
+}
 
 
 @dataclass(frozen=True)
@@ -53,29 +66,15 @@ class Settings:
     flat_level: float = 2.0
 
     def __post_init__(self):
-        def must(holds: bool, what: str) -> None:
-            if not holds:
-                raise ParamsError(f"drive: {what}", remedy="look at the section 'drive' of params.yml")
-
-        for name in ("fade_s", "stop_s", "throttle_limit", "black_level", "flat_level"):
-            value = getattr(self, name)
-            must(is_number(value), f"{name} must be a finite number, found {value!r}")
-        for name in ("blend_ticks", "frozen_frames", "black_frames"):
-            value = getattr(self, name)
-            must(is_whole(value, 0), f"{name} must be a whole number from 0, found {value!r}")
-        must(0 < self.fade_s <= self.stop_s, f"0 < fade_s <= stop_s must hold, found {self.fade_s} and {self.stop_s}")
-        must(
-            self.blind_s * RECORDED_MPS <= BLIND_M,
-            f"by one picture the car would go {self.blind_s * RECORDED_MPS:.1f} m at {RECORDED_MPS:g} m/s, and it may "
-            f"{BLIND_M:g}: choose a smaller fade_s and stop_s, found {self.fade_s:g} and {self.stop_s:g}",
-        )
-        must(0 <= self.throttle_limit <= 1, f"throttle_limit must be in [0, 1], found {self.throttle_limit}")
-        must(self.frozen_frames != 1 and self.black_frames != 1, "one frame alone is no fault: 0 (off) or from 2")
-        must(type(self.compensate) is bool, f"compensate must be true or false, found {self.compensate!r}")
-        if self.ensemble is not None:
-            # Beyond it, the weights of a few dozen plans overflow, and their average is not a number.
-            holds = is_number(self.ensemble, -ENSEMBLE_MOST, ENSEMBLE_MOST)
-            must(holds, f"ensemble must be a number within {ENSEMBLE_MOST:g} of 0, found {self.ensemble!r}")
+        remedy = "look at the section 'drive' of params.yml"
+        if broken := broken_rule(vars(self), RULES):
+            name, wanted, found = broken
+            raise ParamsError(f"drive: {name} must be {wanted}", found=found, remedy=remedy)
+        if self.fade_s > self.stop_s:
+            raise ParamsError("drive: fade_s must not be above stop_s", found=self.fade_s, remedy=remedy)
+        if (blind_m := self.blind_s * RECORDED_MPS) > BLIND_M:
+            what = f"by one picture the car would go {blind_m:.1f} m at {RECORDED_MPS:g} m/s, and it may {BLIND_M:g}"
+            raise ParamsError(f"drive: {what}", remedy="choose a smaller fade_s and stop_s in params.yml")
 
     @property
     def blind_s(self) -> float:

@@ -57,10 +57,7 @@ WAITING = "waiting for a human to arm it"
 
 @dataclass(frozen=True)
 class Request:
-    """Limits that an operator sets for a drive.
-
-    None means the service's own limit, or no heartbeat. Raises ValueError for a time that is not above 0.
-    """
+    """Limits that an operator sets for a drive, in seconds; None: no limit. Raises ValueError for one not above 0."""
 
     max_seconds: float | None = None
     heartbeat_s: float | None = None
@@ -74,19 +71,16 @@ def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise RoverError for a request to arm that is too old: whoever sent it may no longer be watching the car."""
     most_s = REQUEST_S if most_s is None else most_s
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
-        raise RoverError(
-            f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may",
-            remedy="ask again",
-            kind="not armed",
-        )
+        what = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
+        raise RoverError(what, remedy="ask again", kind="not armed")
 
 
 class Service:
     """Talks to systemd and to operators about a car's drives; a context manager, for the main thread.
 
     report: the drive's report, whose ticks feed the watchdog. stop: ends the waiting. model: content hash of the model
-    that drives. Without systemd (no NOTIFY_SOCKET) no notifications are sent, and everything else is the same. The
-    operators' socket is in $RUNTIME_DIRECTORY. Raises RoverError if it cannot be made there.
+    that drives. Without systemd (no NOTIFY_SOCKET) no notifications are sent. The operators' socket is in
+    $RUNTIME_DIRECTORY. Raises RoverError if it cannot be made there.
     """
 
     def __init__(
@@ -157,9 +151,8 @@ class Service:
         """Report ready, wait until a human arms the car and the Arduino agrees, and return what arm() returned.
 
         arm: must call check_request() just before the Arduino is told. checks: called again and again while waiting;
-        each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing; requests
-        are refused with this text. said: how the previous drive ended. Raises RoverError when told to stop, and what
-        a check raises.
+        each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing. said:
+        how the previous drive ended. Raises RoverError when told to stop, and what a check raises.
         """
         checks = tuple(checks)
         first, self._state, self._text = not self._rounds, DISARMED, ""
@@ -294,8 +287,7 @@ class Service:
     def _stopping(self, why: str) -> None:
         """Tell systemd that the service stops, so that the watchdog leaves time to end the policy and write files."""
         self._state = STOPPING
-        # A notification consists of lines; the library has no function for this one.
-        self._tell(f"{STOPPING}: {why}", "STOPPING=1")
+        self._tell(f"{STOPPING}: {why}", "STOPPING=1")  # the library has no function for this line
 
     def _tell(self, text: str, *more: str) -> None:
         text = " ".join(text.split())
@@ -350,10 +342,8 @@ def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
             raise RoverError(f"{unit} cannot be asked ({error})", remedy="use sudo") from None
         except OSError:
             state = state_of(unit)
-            raise RoverError(
-                f"{unit} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})",
-                remedy=f"sudo systemctl start {unit}",
-            ) from None
+            what = f"{unit} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
+            raise RoverError(what, remedy=f"sudo systemctl start {unit}") from None
         try:
             connection.send(json.dumps(question).encode())
             return json.loads(connection.recv(QUESTION_BYTES))
@@ -372,17 +362,13 @@ def arm_car(
 ) -> str:
     """Arm the car whose service waits for it; return what the service then says. Raises RoverError if it refuses.
 
-    model: content hash of the model that is meant; "": whichever the service has loaded. confirm: called with the
-    service's state (model, text) before arming; may raise. wait_s: how long to wait for what is missing, such as the
-    transmitter; each such sentence is passed to `notify`.
+    model: content hash of the model that is meant; "": whichever is loaded. confirm: called with the service's state
+    before arming; may raise. wait_s: how long to wait for what is missing; `notify` is told each such sentence.
     """
     state = ask_service(unit, ask="state")
     if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
-        raise RoverError(
-            f"{unit} has loaded another model than {model[:12]}",
-            found=state["model"][:12],
-            remedy="did somebody else deploy meanwhile?",
-        )
+        what = f"{unit} has loaded another model than {model[:12]}"
+        raise RoverError(what, found=state["model"][:12], remedy="did somebody else deploy meanwhile?")
     confirm(state)
     now, told, end_s = state, "", time.monotonic() + wait_s
     while now.get("missing") and time.monotonic() < end_s:

@@ -20,7 +20,7 @@ from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive.arming import arm_capped, arm_when_asked, wanted_since
+from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, wanted_since, what_is_missing
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner
@@ -123,13 +123,19 @@ class Session:
         (self.service.check_request if self.service else wanted_since(self.options.asked_s, self.now))()
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
+        """Arm the car for whoever asks for it: a service's operator, or the command itself."""
         checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest]
         if self.link:
             checks.append(self.link.latest)
         checks.append(partial(self._show_waiting, said))
-        attempt, notify = partial(self.attempt, arming), self.log.event
-        how: dict[str, Any] = {"service": self.service, "said": said, "terminal": self.terminal}
-        telemetry = arm_when_asked(attempt, self.link, stop, notify, checks, still_wanted=self.check_wanted, **how)
+        attempt = partial(self.attempt, arming)
+        if self.link and self.service:
+            missing = partial(what_is_missing, self.link)
+            telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)
+        elif self.link and self.terminal:
+            telemetry = arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
+        else:
+            telemetry = attempt()
         self.camera.begin()  # a film must start with the loop, not while arming waits
         return telemetry
 

@@ -7,11 +7,9 @@
 
 After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,
 and sends nothing. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the
-receiver, as the Arduino measures them. If the Arduino's pins differ from the receiver (because the throttle is blocked
-until it has been at rest once, or because the signal was lost), the driver is "nobody".
-
-Who drove is exact to one tick: the Arduino's first status after the takeover says whether it still took the policy's
-last command. A command that it did not take is not recorded.
+receiver; if the pins differ from it (the throttle is blocked until it has been at rest once, or the signal was lost),
+the driver is "nobody". The Arduino's first status after the takeover says whether it still took the policy's last
+command; one that it did not take is not recorded.
 """
 
 import threading
@@ -103,10 +101,8 @@ class TakeoverRecorder:
 
         armed: the status with which the car was armed, when both sticks were at rest; None takes neutral as rest. stop:
         ends the recording when it is set. over: called at each tick; may return another reason to end the recording.
-        clock: the clock of the link and the recorder.
-        The recording also ends after MOST_S, or if the receiver loses its signal, the link has no new status, the
-        Arduino was reset, another program has armed the car, or the recorder can record no more. Sends nothing to the
-        Arduino, and raises nothing if the link fails.
+        clock: the clock of the link and the recorder. Sends nothing to the Arduino, and raises nothing if the link
+        fails.
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
@@ -160,17 +156,11 @@ class TakeoverRecorder:
             tick = max(tick + 1, int((now_s - start_s) * rate_hz))
             stop.wait(max(0.0, start_s + tick / rate_hz - clock()))
 
-    def _write(self, telemetry: Telemetry, driver: str) -> None:
-        self._last_s = telemetry.host_s
-        self.recorder.control(
-            telemetry.host_s,
-            telemetry.uptime_ms,
-            telemetry.receiver_steering_us,
-            telemetry.receiver_throttle_us,
-            telemetry.receiver_steering_period_us,
-            telemetry.receiver_throttle_period_us,
-            driver=driver,
-        )
+    def _write(self, t: Telemetry, driver: str) -> None:
+        self._last_s = t.host_s
+        sticks = t.receiver_steering_us, t.receiver_throttle_us
+        periods = t.receiver_steering_period_us, t.receiver_throttle_period_us
+        self.recorder.control(t.host_s, t.uptime_ms, *sticks, *periods, driver=driver)
 
 
 def _at_rest(telemetry: Telemetry, rest_us: tuple[int, int]) -> bool:

@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -27,8 +26,6 @@ PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before that
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands that were sent again within a second
-IDLE = 0.05  # of the processors' time; if less is idle, some process has to wait
-CLOCK_SET_S = 1.0  # a smaller step of the system's clock is ignored
 TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
 
 
@@ -36,9 +33,9 @@ TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
 def real_time(priority: int) -> Iterator[bool]:
     """Give all threads of this process a real-time priority inside the context. Yields False if the user may not.
 
-    All threads get it, because one that waits for the processor while it holds the interpreter makes the others wait.
-    With four busy processes on two cores, the loop's lateness at p99 was 0.7 ms; it was 4 to 9 ms with only the loop's
-    thread at that priority, and 14 to 19 ms without (measured on an x86-64 workstation).
+    All threads get it, because one that waits for the processor while it holds the interpreter makes the others wait:
+    beside four busy processes on two cores, the loop was 0.7 ms late at p99, with its own thread alone at that priority
+    4 to 9 ms (measured on an x86-64 workstation).
     """
     gc.collect()
     gc.freeze()  # so that garbage collection skips all objects that exist now
@@ -74,10 +71,7 @@ def boost_priority(log: FlightLog) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_signals(stop: SignalEvent | threading.Event, log: FlightLog) -> Iterator[None]:
-    """Inside the context, each of SIGNALS sets `stop`; the second time, the same signal does what it did before.
-
-    Only the main thread may use this.
-    """
+    """Inside the context, a signal sets `stop`; the second time, it does what it did before. For the main thread."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         log.event(f"{signal.Signals(number).name}: stopping")
@@ -92,8 +86,8 @@ def stop_on_signals(stop: SignalEvent | threading.Event, log: FlightLog) -> Iter
 def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
     """Inside the context, end this process (exit code 3) if its loop has begun, has not ended, and no longer ticks.
 
-    Nobody else would end it, and camera, port and memory would stay in use. The watching thread counts its own turns
-    instead of reading a clock, so that a process that was stopped as a whole gets the time to go on.
+    Nobody else would end it, and camera, port and memory would stay in use. Turns are counted instead of time, so that
+    a process that was stopped as a whole gets the time to go on.
     """
 
     def watch() -> None:
@@ -116,10 +110,7 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
 
 
 def find_unfinished_drive(log: Path | str) -> str | None:
-    """Return a sentence if the last drive in a flight log was armed but has no end. Call this before a new drive.
-
-    A process that was killed, or lost its power, could not log its own end.
-    """
+    """Return a sentence if the last drive in a flight log was armed but has no end: it was killed, or lost power."""
     try:
         with open_plain(log, RoverError(f"{log}: not a regular file")) as file:  # opening a FIFO would wait
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
@@ -144,8 +135,6 @@ class HealthWatch:
         self._report, self._link, self._pids = report, link, tuple(pids)
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
-        self._spent, self._busy = _spent(), False
-        self._clock_s = time.time() - time.monotonic()
 
     def __call__(self) -> Iterator[str]:
         self._report.memory_mb = memory_mb(self._pids)
@@ -155,14 +144,6 @@ class HealthWatch:
         with contextlib.suppress(LinkError):  # the next tick handles it
             if self._link and (telemetry := self._link.latest()):
                 yield from self._of_the_link(self._link.garbled, telemetry)
-        before, self._spent = self._spent, _spent()
-        idle, total = (now - then for now, then in zip(self._spent, before, strict=True))
-        was_busy, self._busy = self._busy, idle < IDLE * total
-        if self._busy and not was_busy:  # what goes on is not said again
-            yield f"this machine is busy: its processors were idle for {idle / total:.0%} of the time"
-        before_s, self._clock_s = self._clock_s, time.time() - time.monotonic()
-        if abs(self._clock_s - before_s) > CLOCK_SET_S:
-            yield f"the system's clock was set by {self._clock_s - before_s:+.0f} s; nothing that drives goes by it"
 
     def _of_the_link(self, garbled_lines: int, t: Telemetry) -> Iterator[str]:
         counted = (self._report.resent, garbled_lines, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
@@ -175,15 +156,6 @@ class HealthWatch:
                 f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "
                 f"garbled, {old} old and {beyond} out of range, and lost {lost} bytes"
             )
-
-
-def _spent() -> tuple[int, int]:
-    """Return the processors' time in the kernel's ticks, idle and in total; zeros if the kernel reports none."""
-    try:
-        spent = [int(value) for value in Path("/proc/stat").read_text().partition("\n")[0].split()[1:9]]
-        return spent[3] + spent[4], sum(spent)
-    except (OSError, ValueError, IndexError):
-        return 0, 0
 
 
 def memory_mb(pids: Iterable[int]) -> float | None:

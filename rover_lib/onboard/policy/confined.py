@@ -3,7 +3,7 @@
     metrics = run_confined(time_artifacts, paths={"static": "policy_static.pt"}, ...)     # in a process of its own
     policies = load_confined(paths, threads=3)                                            # in time_artifacts
 
-`rover drive` has a process with a protocol of its own, for speed (see drive/inference.py).
+`rover drive` has a process with a protocol of its own, for speed (see drive/inference.py), which loads so too.
 """
 
 import importlib
@@ -52,12 +52,16 @@ def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None
 
 
 def load_confined(
-    paths: Mapping[str, Path | str], *, threads: int, spare_mb: float = 0
+    paths: Mapping[str, Path | str],
+    *,
+    threads: int,
+    spare_mb: float = 0,
+    notify: Callable[[str], object] = lambda reason: _log.warning("not confined: %s", reason),
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 
-    threads: of the engines. spare_mb: memory that the process needs besides. Logs a warning if the kernel confines
-    nothing. Raises ArtifactError as load_policy() does.
+    threads: of the engines. spare_mb: memory that the process needs besides. notify: told why, if the process is not
+    confined. Raises ArtifactError as load_policy() does.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
     with ExitStack() as unless_all_are_loaded:
@@ -66,7 +70,7 @@ def load_confined(
         reasons = [UNCONFINED[engine] for engine in map(import_engine, artifacts.values()) if engine in UNCONFINED]
         limit_mb = spare_mb + sum(memory_mb(path, threads) for path in paths.values())
         if reason := reasons[0] if reasons else confine(limit_mb):
-            _log.warning("not confined: %s", reason)
+            notify(reason)
         policies = {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}
         unless_all_are_loaded.pop_all()
     return policies, artifacts

@@ -150,9 +150,7 @@ def test_a_stop_ends_the_drive_before_its_next_command_and_is_logged(tmp_path, l
     assert (last["phase"], last["pins"]) == (f.ENDED, [1456, 120])  # from this the page knows that the car stands
 
 
-@pytest.mark.parametrize(
-    "message", [b"stop", b"arm", b"STOP 1.2.3.4", b"stop 1.2.3.4 arm", b"stop 1.2.3.4\n", b"stop " + b"1" * 60]
-)
+@pytest.mark.parametrize("message", [b"stop", b"arm", b"stop 1.2.3.4 arm", b"stop " + b"1" * 60])
 def test_nothing_else_does_anything(tmp_path, listener, alone, message):
     assert Bench(tmp_path, lambda: listener.say(message)).drive() == alone
 
@@ -162,15 +160,6 @@ def test_a_view_that_reads_nothing_costs_nothing(tmp_path, listener, alone):
     assert bench.drive() == alone
     assert f.LAST_S <= bench.clock() - bench.ended_s < 2 * f.LAST_S  # the last message waits shortly
     assert len(listener.messages()) == 1  # no message waits behind another
-
-
-def test_a_view_that_never_accepts_costs_nothing(tmp_path, listener, alone):
-    """A view that SIGSTOP has stopped is like this. Three others have connected earlier, and fill the backlog."""
-    with contextlib.ExitStack() as stack:
-        for _ in range(3):
-            other = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-            stack.enter_context(other).connect_ex(str(listener.place))
-        assert Bench(tmp_path).drive() == alone
 
 
 @pytest.mark.parametrize("stops", [False, True])
@@ -207,15 +196,15 @@ def test_what_cannot_be_shown_stops_no_drive(tmp_path, listener, alone, fails):
     assert len(told) == isinstance(fails, ValueError)
 
 
-def test_a_picture_that_is_no_jpeg_comes_in_points(tmp_path, listener):
+def test_a_picture_that_is_no_jpeg_comes_in_points_and_a_large_one_not_at_all(tmp_path, listener):
     image = np.arange(360 * 640 * 3, dtype=np.uint64).astype(np.uint8).reshape(360, 640, 3)
-    Bench(tmp_path, listener.hello, replace(FRAME, image=image, jpeg=None)).drive(ticks=1)
+    bench = Bench(tmp_path, listener.hello, replace(FRAME, image=image, jpeg=None))
+    bench.drive(ticks=1)
     message, picture = listener.messages()[0]
     assert message["shape"] == [120, 214, 3] and message["size"] == [640, 360]
     assert np.array_equal(np.frombuffer(picture, np.uint8).reshape(120, 214, 3), image[::3, ::3])
-
-
-def test_a_picture_that_is_too_large_is_left_out(tmp_path, listener):
+    listener.close()
+    listener.open()
     Bench(tmp_path, listener.hello, replace(FRAME, jpeg=bytes(400_000))).drive(ticks=1)
     message, picture = listener.messages()[0]
     assert picture == b"" and message["tick"]["throttle_us"] == 150

@@ -3,9 +3,6 @@
 import json
 import logging
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -72,12 +69,11 @@ def test_what_goes_in_comes_out(path, pi_host):
 
 def test_each_line_can_be_read_without_this_program(path):
     with FlightLog(path, header=HEADER, **LIMITS) as log:
-        log.tick(tick(12345, throttle=0.0912, latency_ms=1520.4, plan_age_ms=1520.4, late_ms=10.123))
+        log.tick(tick(12345, latency_ms=1520.4))
         log.event("camera unplugged", frame=812)
     header, machine, row, event = map(json.loads, path.read_text().splitlines())
     assert [r["kind"] for r in (header, machine, event)] == ["header", "machine", "event"]
     assert dict(zip(header["columns"], row, strict=True))["latency_ms"] == 1520.4
-    assert event["fields"] == {"frame": 812}
 
 
 def test_events_have_their_time_and_go_to_logging_too(path, caplog):
@@ -112,29 +108,6 @@ def test_it_stays_locked_after_a_rotation(path, quick):
             pytest.fail("it was let in")
 
 
-def test_without_a_file_events_are_still_said(caplog):
-    with FlightLog(None, header=HEADER, **LIMITS) as log:
-        log.tick(tick(0))
-        log.event("camera unplugged", level=logging.WARNING)
-    assert [r.message for r in caplog.records] == ["camera unplugged"] and not log._rows
-
-
-@pytest.mark.slow
-def test_a_power_cut_costs_a_second(path):
-    code = (
-        "import sys, time, os, signal\n"
-        "from rover_lib.onboard.drive.flight_log import FlightLog, Tick\n"
-        f"log = FlightLog(sys.argv[1], header={{}}, **{LIMITS}).__enter__()\n"
-        "while (t := time.monotonic() - log.start_s) < 1.8:\n"
-        f"    log.tick(Tick(*(t, *{tuple(tick(0))[1:]})))\n"
-        "    time.sleep(0.01)\n"
-        "os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", code, str(path)])
-    assert ended.returncode == -signal.SIGKILL
-    assert read_log(path).ticks["t_s"][-1] > 0.8
-
-
 def test_the_log_is_synced_with_what_it_has(path, monkeypatch, quick):
     synced = []
     monkeypatch.setattr(module.os, "fsync", lambda file: synced.append(os.fstat(file.fileno()).st_size))
@@ -145,7 +118,7 @@ def test_the_log_is_synced_with_what_it_has(path, monkeypatch, quick):
     assert module.SYNC_S < 1
 
 
-@pytest.mark.parametrize("bad", ["max_mb: '8'", "max_mb: .nan", "max_mb: 51", "max_mb: 0", "keep: 1.5", "keep: -1"])
+@pytest.mark.parametrize("bad", ["max_mb: '8'", "max_mb: .nan", "keep: -1"])
 def test_limits_of_params_that_make_no_sense(tmp_path, monkeypatch, bad):
     (tmp_path / "params.yml").write_text(f"flight_log: {{{bad}}}")
     monkeypatch.setenv("ROVER_PARAMS", str(tmp_path / "params.yml"))
@@ -188,18 +161,7 @@ def test_a_services_log_has_a_drive_for_each_arming(path):
             log.event("not armed: no transmitter")
             log.event(module.ARMED)
             log.tick(tick(k))
-    for k in range(3):
-        flight = read_log(path, k)
-        assert (flight.drives, flight.ticks["frame"].tolist()) == (3, [k])
-
-
-def test_a_drive_after_a_power_cut(path):
-    write(path, map(tick, range(5)))
-    path.write_bytes(path.read_bytes()[:-9])
-    write(path, [tick(7)])
-    assert read_log(path).ticks["frame"].tolist() == [7]
-    flight = read_log(path, 0)
-    assert (flight.ticks["frame"].tolist(), flight.damaged) == ([0, 1, 2, 3], 1)
+    assert [read_log(path, k).ticks["frame"].tolist() for k in range(3)] == [[0], [1], [2]]
 
 
 # ---- damage
@@ -221,12 +183,6 @@ def read_bytes(data, folder):
     return read_log(path)
 
 
-@given(data=st.binary(max_size=400))
-def test_random_bytes_are_no_log(tmp_path_factory, data):
-    with pytest.raises(RoverError):
-        read_bytes(data, tmp_path_factory.getbasetemp())
-
-
 @given(st.data())
 def test_a_cut_log_gives_what_is_complete(tmp_path_factory, good, data):
     end = data.draw(st.integers(good.index(b"\n") + 1, len(good)))
@@ -239,32 +195,22 @@ def test_a_cut_log_gives_what_is_complete(tmp_path_factory, good, data):
 
 
 TICK = [0.1, 0.2, "A", "a", 0, 0, 1456, 120, None, None, 0, None, None, 1, 0]
-NO_ROWS = {
-    "not a row": "7",
-    "without a kind": {},
-    "a machine without a time": {"kind": "machine"},
-    "a temperature in words": {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
-    "throttling in words": {"kind": "machine", "t_s": 1, "temperature_c": None, "throttled": "hot"},
-    "an event at the end of time": {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
-    "an event without fields": {"kind": "event", "t_s": 1, "event": "a", "fields": []},
-    "a gap of no size": {"kind": "event", "t_s": 1, "event": module.MISSING, "fields": {"ticks": "many"}},
-    "a header of no drive": {"kind": "header", "drive": [1]},
-    "a tick of too few values": TICK[:-1],
-    "a tick without a time": [None, *TICK[1:]],
-    "a tick at infinity": [TICK[0], float("inf"), *TICK[2:]],
-    "a tick of texts": ["a"] * 15,
-    "a state that is no text": [*TICK[:2], 7, *TICK[3:]],
-}
+NO_ROWS = [
+    7,
+    {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
+    {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
+    {"kind": "event", "t_s": 1, "event": module.MISSING, "fields": {"ticks": "many"}},
+    {"kind": "header", "drive": [1]},
+    TICK[:-1],
+    [None, *TICK[1:]],
+    ["a"] * 15,
+]
 
 
-@pytest.mark.parametrize("what", NO_ROWS)
-def test_a_line_of_another_form_is_skipped(tmp_path, good, what):
-    flight = read_bytes(good + json.dumps(NO_ROWS[what]).encode() + b"\n", tmp_path)
-    assert flight.damaged == 1 and flight.summary()["ticks"] == 40
-
-
-def test_a_line_that_is_nested_without_end_is_skipped(tmp_path, good):
-    assert read_bytes(good + b"[" * 200_000 + b"]" * 200_000, tmp_path).damaged == 1
+def test_lines_of_another_form_are_skipped(tmp_path, good):
+    lines = [json.dumps(row).encode() for row in NO_ROWS] + [b"[" * 200_000 + b"]" * 200_000, b"\xff"]
+    flight = read_bytes(good + b"\n".join(lines), tmp_path)
+    assert flight.damaged == len(lines) and flight.summary()["ticks"] == 40
 
 
 def test_what_cannot_be_read(tmp_path):
@@ -297,7 +243,7 @@ def test_a_full_disk_is_said_once_and_logging_goes_on_when_it_has_room(path, cap
     assert len(said) == 2 and "No space left" in said[0] and "written again" in said[1]
 
 
-@pytest.mark.parametrize("taken", [0, 5, -1])
+@pytest.mark.parametrize("taken", [0, -1])
 def test_a_disk_that_takes_a_part_of_a_line(path, monkeypatch, quick, taken):
     """None is lost and none is read twice: not even of a line that lacks only its end."""
     cut = []
@@ -328,23 +274,6 @@ def test_ticks_that_were_not_logged_are_not_missed(path, monkeypatch):
     assert (flight.summary()["ticks_not_logged"], flight.summary()["missed"]) == (150, 0)
 
 
-def test_a_writer_that_raises_anything_goes_on(path, caplog, quick):
-    failing = [RuntimeError("who knows")]
-
-    class Odd:
-        vcgencmd = "none"
-
-        def temperature_c(self):
-            if failing:
-                raise failing.pop()
-
-    write(path, [tick(0)], host=Odd())
-    with FlightLog(path, header=HEADER, **LIMITS, host=Odd()) as log:
-        log.tick(tick(1))
-    assert read_log(path).ticks["frame"].tolist() == [1]
-    assert "who knows" in caplog.text
-
-
 def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(path, monkeypatch, quick):
     monkeypatch.setattr(module, "CLOSE_S", 0.2)
     go_on = threading.Event()
@@ -353,29 +282,11 @@ def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(path, monkeypatch, q
     try:
         log = write(path, map(tick, range(5000)))
         assert time.monotonic() - start < 2 and len(log._rows) <= module.QUEUE_ROWS
+        with pytest.raises(RoverError, match="another drive"):  # it still writes
+            write(path)
     finally:
         go_on.set()
         log._writer.join()
-
-
-@pytest.mark.parametrize("fault", ["stuck", "raises"])
-def test_a_logger_that_is_stuck_or_raises_does_not_matter(path, monkeypatch, fault):
-    monkeypatch.setattr(module, "CLOSE_S", 0.5)
-    go_on, handler = threading.Event(), logging.Handler()
-    handler.emit = lambda record: go_on.wait(10) if fault == "stuck" else 1 / 0
-    logging.getLogger("rover").addHandler(handler)
-    start = time.monotonic()
-    try:
-        with FlightLog(path, header=HEADER, **LIMITS) as log:
-            for _ in range(1000):
-                log.event("two", level=logging.WARNING)
-            assert time.monotonic() - start < 0.5
-            log.tick(tick(0))
-        assert time.monotonic() - start < 2
-    finally:
-        go_on.set()
-        logging.getLogger("rover").removeHandler(handler)
-    assert len(read_log(path).events) == 1000 and len(read_log(path).ticks["t_s"]) == 1
 
 
 # ---- the summary
@@ -406,10 +317,3 @@ def test_summary(path, pi_host):
     assert found["seconds_in"] == pytest.approx({"not known": 1 / 3, "autonomous": 2.1, "manual": 1.0}, abs=2e-3)
     assert found["temperature_max_c"] == 61.35
     assert found["throttled_means"] == ["under-voltage since the start", "throttled since the start"]
-
-
-def test_summary_of_a_drive_without_ticks(path):
-    write(path)
-    found = read_log(path).summary()
-    assert (found["ticks"], found["missed"], found["seconds"], found["plans"]) == (0, 0, 0, 0)
-    assert found["jitter_p50_ms"] is found["plan_age_p95_ms"] is found["temperature_max_c"] is None

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,20 +119,17 @@ def test_a_loop_that_is_stopped_once_drives_on(link, clock):
     assert (report.ticks, report.missed) == (90, 6)
 
 
-def test_rates_of_no_car(link, clock):
-    for rate_hz in (9.9, 101, float("nan")):
-        with pytest.raises(ParamsError, match="10 to 100 Hz"):
-            go(Always(), link, clock, rate_hz=rate_hz)
-    assert link.said == []
-
-
-@pytest.mark.parametrize("rate_hz", [10, 50, 100])
+@pytest.mark.parametrize("rate_hz", [10, 100])
 def test_rates_of_a_car(link, clock, rate_hz):
-    go(Always(), link, clock, rate_hz=rate_hz, until=Until(ticks=10))
-    ticks = link.sent_at[0] + np.arange(10) / rate_hz
+    """Rarer commands are sent again meanwhile: the Arduino stops the car for a host that pauses for 100 ms twice."""
+    report = go(Always(), link, clock, rate_hz=rate_hz, until=Until(ticks=20))
+    ticks = link.sent_at[0] + np.arange(20) / rate_hz
     assert np.abs(np.subtract.outer(ticks, link.sent_at)).min(axis=1) == pytest.approx(0, abs=1e-6)
-    assert np.diff(link.sent_at).max() == pytest.approx(min(1 / rate_hz, KEEP_S))  # rarer ones are said again meanwhile
-    assert rate_hz < 30 or len(link.sent_at) == 10
+    assert np.diff(link.sent_at).max() == pytest.approx(min(1 / rate_hz, KEEP_S))
+    assert len(link.drives) == (20 if rate_hz > 30 else 20 * 3 - 2) and report.resent == 0
+    for wrong_hz in (9.9, 101, float("nan")):
+        with pytest.raises(ParamsError):
+            go(Always(), Link(clock), clock, rate_hz=wrong_hz)
 
 
 def test_ends_as_asked(link, clock):
@@ -144,19 +140,14 @@ def test_ends_as_asked(link, clock):
     stop = threading.Event()
     report = go(Always({7: stop.set}), link := Link(clock), clock, until=Until(stop=stop))
     assert (report.ticks, report.ended, link.said[-1]) == (7, "told to stop", "neutral")
+    assert go(Always(), link := Link(clock), clock, until=Until(stop=stop)).ticks == 0  # before it began
+    assert "arm" not in link.said
 
 
 def test_whoever_may_end_it_is_asked_at_each_tick(link, clock):
     asked = iter([None] * 4 + ["stopped from the view"])
     report = go(Always(), link, clock, until=Until(over=lambda: next(asked)))
     assert (report.ticks, report.ended, link.said[-1]) == (4, "stopped from the view", "neutral")
-
-
-def test_told_to_stop_before_it_began(link, clock):
-    stop = threading.Event()
-    stop.set()
-    assert go(Always(), link, clock, until=Until(stop=stop)).ticks == 0
-    assert "arm" not in link.said
 
 
 @pytest.mark.parametrize(
@@ -236,14 +227,6 @@ def test_the_arduino_has_the_last_word(link, clock, change, raised, match):
     assert link.said[-1] == "neutral"
 
 
-def test_the_arduino_hears_from_it_often_enough_at_any_rate(link, clock):
-    """It stops the car for a host that pauses for 100 ms twice, which a host of 10 Hz always does."""
-    report = go(Always(), link, clock, rate_hz=10, until=Until(ticks=20))
-    assert max(np.diff(link.sent_at)) < 0.045
-    assert len(link.drives) == 20 * 3 - 2
-    assert report.resent == 0
-
-
 def test_what_was_not_acknowledged_is_sent_again(clock):
     link = Link(clock, acknowledge=lambda n: n % 3 == 0)  # two of three get lost
     report = go(Always(), link, clock, until=Until(ticks=30))
@@ -253,39 +236,14 @@ def test_what_was_not_acknowledged_is_sent_again(clock):
     assert max(np.diff(link.sent_at)) < PERIOD + 1e-6
 
 
-def test_a_port_that_is_stuck_for_a_moment(link, clock):
-    def stuck():
-        link.fails = "the port took no data for 10 ms"
-
-    def free():
-        link.fails = None
-
-    log = Log()
-    report = go(Always({5: stuck, 8: free}), link, clock, log, until=Until(ticks=10))
-    assert report.ticks == 10
-    assert sum("not sent" in e for e in log.events) == 1
-
-
-def test_a_dry_run_drives_no_motor(clock):
-    log = Log()
-    report = go(Always(), None, clock, log, until=Until(ticks=5))
-    assert report.ticks == len(log.ticks) == 5
-    assert log.ticks[0].state == ""
-
-
-def test_each_second_is_watched(link, clock):
-    log = Log()
-    said = iter([["first"], [], ["third"]])
-    go(Always(), link, clock, log, until=Until(max_seconds=2.5), warnings=lambda: next(said))
+def test_a_dry_run_drives_no_motor_and_tells_its_hooks(clock):
+    log, said, rows = Log(), iter([["first"], [], ["third"]]), []
+    hooks = {"warnings": lambda: next(said), "record": lambda *row, **extra: rows.append((row, extra))}
+    report = go(Always(), None, clock, log, until=Until(max_seconds=2.5), **hooks)
+    assert report.ticks == len(log.ticks) == len(rows) and log.ticks[0].state == ""
     assert [e for e in log.events if e in ("first", "third")] == ["first", "third"]
-
-
-def test_a_recorder_gets_what_was_commanded(link, clock):
-    rows = []
-    go(Always(), link, clock, until=Until(ticks=3), record=lambda *row, **extra: rows.append((row, extra)))
     (_, arduino_ms, *pulses), extra = rows[0]
-    assert (arduino_ms, pulses) == (0, [1456, 150, 21316, 1016])
-    assert extra == {"plan_age_ms": 100.0}
+    assert (arduino_ms, pulses, extra) == (0, [1456, 150, 21316, 1016], {"plan_age_ms": 100.0})
 
 
 # ---- the pilot of a policy
@@ -388,9 +346,9 @@ def test_a_frozen_camera(pilot):
 
 def test_a_frozen_camera_while_the_car_reverses():
     sight = Sight(Eyes(), Settings())
-    sight.sent(0.0, -0.1)
+    sight.sent(0.9, -0.1)
     with pytest.raises(CameraError, match="frozen: "):
-        sight.watch(Frame(np.zeros((36, 64, 3), np.uint8), 1.0, 9, 8, 100.0, 50.0), 1.0)
+        sight.watch(Frame(np.zeros((36, 64, 3), np.uint8), 1.1, 9, 8, 100.0, 50.0), 1.1)
 
 
 def test_a_camera_that_froze_before_the_car_moved(pilot):
@@ -398,12 +356,6 @@ def test_a_camera_that_froze_before_the_car_moved(pilot):
     drives(pilot, 60, throttle=0.0, repeats=lambda i: i)
     with pytest.raises(CameraError, match="frozen: 1805 frames"):  # at the fifth tick, 0.13 s after the first
         drives(pilot, 1, start_s=60, repeats=lambda i: 1800 + i)
-
-
-def test_throttle_that_comes_and_goes_is_a_car_that_moves(pilot):
-    with pytest.raises(CameraError, match="frozen"):
-        for i in range(20):
-            drives(pilot, PERIOD, start_s=i * PERIOD, throttle=0.1 * (i % 2), repeats=lambda _, i=i: i)
 
 
 def test_a_car_that_stands_may_see_the_same_again(pilot):
@@ -448,79 +400,35 @@ def test_no_plan_in_time(pilot, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
-@pytest.mark.parametrize("ignored", [False, True])
-def test_signals_ask_it_to_stop(number, ignored):
-    """Ignored, as a script's & starts its programs: today's shells do so with SIGINT and SIGQUIT, nohup with SIGHUP."""
+def test_signals_ask_it_to_stop(number):
+    """Also where they are ignored, as a script's & and nohup start their programs."""
     earlier = signal.getsignal(number)
     try:
-        if ignored:
-            signal.signal(number, signal.SIG_IGN)
-        stop, log, before = threading.Event(), Log(), signal.getsignal(number)
-        with stop_on_signals(stop, log):
-            os.kill(os.getpid(), number)
-            time.sleep(0.01)
-            assert stop.is_set()
-        assert log.events == [f"{number.name}: stopping"]
-        assert signal.getsignal(number) is before
+        for before in (earlier, signal.SIG_IGN):
+            signal.signal(number, before)
+            stop, log = threading.Event(), Log()
+            with stop_on_signals(stop, log):
+                os.kill(os.getpid(), number)
+                time.sleep(0.01)
+                assert stop.is_set()
+            assert log.events == [f"{number.name}: stopping"] and signal.getsignal(number) is before
     finally:
         signal.signal(number, earlier)
 
 
-def test_what_is_ridden_through_is_said(link, monkeypatch):
-    report, spent, set_s = Report(), [100, 1000], [0.0]
-    link.garbled = 3
-    link.status = replace(STATUS, bad_lines=4)
-    monkeypatch.setattr(watch, "_spent", lambda: tuple(spent))
-    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 50.0, time=lambda: 1e9 + set_s[0]))
+def test_what_is_ridden_through_is_said(link):
+    report = Report()
+    link.garbled, link.status = 3, replace(STATUS, bad_lines=4)
     look = watch.HealthWatch(report, link, [os.getpid()])
     assert list(look()) == []  # what was before it is not its own
     assert report.memory_mb > 10
-
     report.late_ms.extend([0.1, 6.5, 0.2])
-    assert list(look()) == ["commands were up to 6.5 ms late"]
-
     link.status = replace(STATUS, bad_lines=6, old_commands=1)
-    link.garbled = 4
-    (said,) = look()
-    assert "0 commands were sent again, 1 lines came garbled; the Arduino had 2 garbled, 1 old and 0 out" in said
-    report.resent = watch.OFTEN
-    assert list(look()) == []  # now and then one is late
-    report.resent += watch.OFTEN + 1
-    assert "6 commands were sent again" in next(look())
+    late, said = look()
+    assert late == "commands were up to 6.5 ms late"
+    assert "0 commands were sent again, 0 lines came garbled; the Arduino had 2 garbled, 1 old and 0 out" in said
     link.status = replace(STATUS, bad_lines=1)  # of an Arduino that was reset: it counts from 0 again
     assert "the Arduino had 1 garbled, 0 old" in next(look())
-
-    said = []
-    for idle in (4, 4, 60, 4):  # what goes on is not said again
-        spent[:] = [spent[0] + idle, spent[1] + 100]
-        said.append(list(look()))
-    assert [len(s) for s in said] == [1, 0, 0, 1] and "idle for 4% of the time" in said[0][0]
-
-    set_s[0] = -3600.0
-    assert "the system's clock was set by -3600 s" in next(look())
-    assert list(look()) == []
-
-
-def test_this_machines_processors_and_memory():
-    idle, spent = watch._spent()
-    assert 0 < idle < spent
-    assert watch.memory_mb([2**22 + 1]) is None
-
-
-def test_frames_and_plans_that_are_late_are_said(pilot):
-    drives(pilot, 0.5)
-    assert list(pilot.warnings()) == []
-    last_s = 0.5 - PERIOD
-    pilot.order(last_s + 0.09)
-    assert list(pilot.warnings()) == []
-    pilot.plans.asking_s = 0.35
-    pilot.order(last_s + 0.13)
-    pilot.plans.asking_s = 0.0
-    drives(pilot, 0.2, start_s=1.0)
-    frames, policy = pilot.warnings()
-    assert frames == "no new frame for 0.13 s"
-    assert policy.startswith("the policy took 0.35 s or more")
-    assert list(pilot.warnings()) == []
 
 
 HEADER = '{"kind":"header","schema":1}'
@@ -531,56 +439,43 @@ ARMED, ENDED = (
 TICK, MACHINE = '[0.0333,0.1,"A","a"]', '{"kind":"machine"}'
 
 
-@pytest.mark.parametrize(
-    ("lines", "ended"),
-    [
-        ([HEADER, ARMED, TICK, MACHINE, TICK], False),
-        ([HEADER, ARMED], False),
-        ([HEADER, MACHINE, TICK, "[0.0666,0.1"], False),  # the log went on in another file, and was cut
-        ([HEADER, ARMED, TICK, ENDED, MACHINE], True),
-        ([HEADER, ARMED, TICK, ENDED, HEADER, MACHINE], True),  # could not begin
-        ([HEADER, MACHINE], True),
-        ([], True),
-    ],
-)
+ENDS = [
+    ([HEADER, ARMED, TICK, MACHINE, TICK], False),
+    ([HEADER, MACHINE, TICK, "[0.0666,0.1"], False),  # the log went on in another file, and was cut
+    ([HEADER, ARMED, TICK, ENDED, MACHINE], True),
+    ([HEADER, ARMED, TICK, ENDED, HEADER, MACHINE], True),  # could not begin
+]
+
+
+@pytest.mark.parametrize(("lines", "ended"), ENDS)
 def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
     path = tmp_path / "flight.log"
+    assert find_unfinished_drive(path) is None
     path.write_text("".join(f"{line}\n" for line in lines))
     said = find_unfinished_drive(path)
     assert (said is None) == ended
     assert ended or "no end" in said
 
 
-def test_a_log_that_is_none_or_a_fifo_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "flight.log")
-    for name in ("flight.log", "none.log"):
-        assert find_unfinished_drive(tmp_path / name) is None
-
-
 @pytest.mark.slow
 def test_a_loop_that_is_dead_ends_the_process():
     """In a process, since it ends that; a loop that ticks, or has ended, does not."""
     code = """
-import sys, threading, time
+import sys, time
 from rover_lib.onboard.drive import loop, watch
 watch.HUNG_S = 0.3
 class Log:
-    def event(self, text, **_): print(text, flush=True)
-    def close(self): print("closed", flush=True)
+    event = close = lambda self, *said, **_: print(*said, flush=True)
 report = loop.Report(ticks=0)
 with watch.exit_if_hung(report, Log()):
     time.sleep(0.6)  # not begun
-    for _ in range(30):
-        report.ticks += 1
+    for report.ticks in range(1, 30):
         time.sleep(0.03)
-    if sys.argv[1] == "ended":
-        report.ended = "done"
+    report.ended = sys.argv[1]
     time.sleep(1.5)
 print("alive")
 """
-    done = subprocess.run([sys.executable, "-c", code, "dead"], capture_output=True, text=True)
-    assert done.returncode == 3
-    assert "the loop has not ticked" in done.stdout
-    assert done.stdout.endswith("closed\n")
+    done = subprocess.run([sys.executable, "-c", code, ""], capture_output=True, text=True)
+    assert done.returncode == 3 and "the loop has not ticked" in done.stdout
     done = subprocess.run([sys.executable, "-c", code, "ended"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "alive\n")

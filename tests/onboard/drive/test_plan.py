@@ -42,25 +42,15 @@ def test_a_plan_is_used_by_time():
     assert f.command(10.15).steering == pytest.approx(0.0)
 
 
-def test_before_its_first_and_after_its_last_action_it_is_that_one():
-    plan = Plan(1, 0.0, 0.0, ramp())
-    assert (plan.at(-3)[0], plan.at(math.inf)[0]) == (0.0, pytest.approx(0.31))
-    assert Plan(1, 0.0, 0.0, ramp(chunk=1)).at(5)[0] == 0.0
-
-
 def test_nothing_to_drive_by():
     f = follower()
     assert f.command(0.0) is None
     f.add(Plan(1, 0.0, 0.1, ramp()), 0.1)
     assert f.command(0.99) is not None
     assert f.command(1.0) is None
-
-
-def test_a_short_chunk_ends_before_the_limit():
     f = follower()
-    f.add(Plan(1, 0.0, 0.0, ramp(chunk=8)), 0.0)
-    assert f.command(0.26) is not None
-    assert f.command(8 * STEP) is None
+    f.add(Plan(1, 0.0, 0.0, ramp(chunk=8)), 0.0)  # a short chunk ends earlier
+    assert f.command(0.26) is not None and f.command(8 * STEP) is None
 
 
 def test_the_throttle_fades_with_the_plans_age():
@@ -84,15 +74,6 @@ def test_an_older_frames_plan_is_left_aside():
     f.add(Plan(1, 1.0, 1.1, ramp(0.5)), 1.1)
     f.add(Plan(2, 0.9, 1.2, ramp(-0.5)), 1.2)
     assert f.plan.number == 1
-
-
-def test_a_fresh_plan_takes_over_in_steps():
-    f = follower(blend_ticks=3)
-    f.add(Plan(1, 0.0, 0.0, ramp(0.0, 0.0)), 0.0)
-    f.command(0.0)
-    f.add(Plan(2, 0.1, 0.1, ramp(0.4, 0.0)), 0.1)
-    found = [f.command(0.1 + i * STEP).steering for i in range(5)]
-    assert found == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.4])
 
 
 @given(
@@ -134,20 +115,13 @@ def test_ensembling_is_lerobots(coefficient):
         assert [command.steering, command.throttle] == pytest.approx(wanted.tolist(), abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "actions",
-    [
-        np.full((4, 2), np.nan),
-        np.array([[0.0, np.inf]]),
-        np.array([[-1.3, 0.0]]),
-        np.array([[0.0, -0.3]]),
-        np.zeros((4, 3)),
-        np.zeros((0, 2)),
-    ],
-)
+NO_PLANS = [[np.nan, 0.0]], [[0.0, np.inf]], [[-1.3, 0.0]], [[0.0, -0.3]], np.zeros((4, 3)), np.zeros((0, 2))
+
+
+@pytest.mark.parametrize("actions", NO_PLANS, ids=range(len(NO_PLANS)))
 def test_no_plan_of_what_must_not_drive(actions):
     with pytest.raises(PolicyError):
-        Plan(1, 0.0, 0.0, actions)
+        Plan(1, 0.0, 0.0, np.array(actions))
 
 
 def test_a_little_beyond_an_end_is_clipped():
@@ -181,19 +155,10 @@ def test_settings_of_params():
     assert Settings.of(params()["drive"], throttle_limit=0.05, ensemble=None).throttle_limit == 0.05
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"stop_s": math.nan},
-        {"fade_s": True},
-        {"blend_ticks": 1.5},
-        {"throttle_limit": 1.1},
-        {"frozen_frames": 1},
-        {"ensemble": -20.0},  # whose weights overflow
-        {"compensate": "false"},
-        {"speed": 1},
-    ],
-)
+WRONG = {"stop_s": math.nan}, {"fade_s": True}, {"frozen_frames": 1}, {"ensemble": -20.0}, {"speed": 1}, {"stop_s": 0.1}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_settings_that_make_no_sense(wrong):
     with pytest.raises(ParamsError, match=r"params\.yml"):
         Settings.of(wrong)
