@@ -43,9 +43,8 @@ class Mutant:
 
 
 def read_mutants() -> list[Mutant]:
-    """Read the tables of mutants: mutants.yml and those beside it, mutants_*.yml."""
-    tables = sorted(MUTANTS.parent.glob("mutants*.yml"))
-    return [Mutant(**row) for table in tables for row in yaml.safe_load(table.read_text())]
+    """Read the table of mutants."""
+    return [Mutant(**row) for row in yaml.safe_load(MUTANTS.read_text())]
 
 
 @dataclass(frozen=True)
