@@ -34,15 +34,13 @@ SHAPES = {
     "resnet34": {**TINY, "vision_backbone": "resnet34"},
     "pre-norm": {**TINY, "pre_norm": True, "n_encoder_layers": 2, "n_decoder_layers": 3},
     "no VAE": {**TINY, "use_vae": False},
-    "two cameras of two sizes": {
+    "two cameras of two odd sizes": {
         **TINY,
-        "cameras": {"observation.images.left": (96, 128), "observation.images.right": (128, 96)},
+        "cameras": {"observation.images.left": (75, 131), "observation.images.right": (128, 96)},
     },
     "one decoder layer, other latent and chunk": {**TINY, "n_decoder_layers": 1, "chunk_size": 100, "latent_dim": 16},
     "dilation": {**TINY, "vision_backbone": "resnet50", "replace_final_stride_with_dilation": True},
-    "gelu": {**TINY, "feedforward_activation": "gelu"},
-    "state and action of 6": {**TINY, "states": 6, "actions": 6},
-    "odd image": {**TINY, "cameras": {"observation.images.cam_front": (75, 131)}},
+    "gelu, state and action of 6": {**TINY, "feedforward_activation": "gelu", "states": 6, "actions": 6},
 }
 
 
@@ -53,8 +51,8 @@ def observation(policy, seed=0):
     return frames, state
 
 
-def image_stats(policy, mean=IMAGENET_MEAN, std=IMAGENET_STD):
-    stats = {"mean": torch.tensor(mean)[:, None, None], "std": torch.tensor(std)[:, None, None]}
+def image_stats(policy, mean=IMAGENET_MEAN):
+    stats = {"mean": torch.tensor(mean)[:, None, None], "std": torch.tensor(IMAGENET_STD)[:, None, None]}
     return {k: stats for k in policy.config.image_features}
 
 
@@ -68,17 +66,10 @@ def test_lerobots_policy_is_filled_as_if_it_had_been_made_first(tiny):
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[n], x) and ours[n].requires_grad == x.requires_grad for n, x in theirs.items())
     assert all(w.data_ptr() != tiny.weights[n].data_ptr() for n, w in filled.model.state_dict().items()), "copied"
-    with pytest.raises(RuntimeError, match="Missing key"):
-        lerobot_act(tiny.config, {k: v for k, v in tiny.weights.items() if k != "action_head.bias"})
 
 
 # LeRobot pads with normalised zeros. With this mean, zero is a whole pixel, so columns can be exact at the border too.
 WHOLE_MEAN = (124 / 255, 116 / 255, 104 / 255)
-
-
-def read(folder, for_int8: bool) -> ACT:
-    checkpoint = load_checkpoint(folder)
-    return ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
 
 
 # All of the user's layers take 2 GB, and say no more than the other shapes' one to three do at smaller widths.
@@ -91,7 +82,8 @@ def test_equals_lerobot(name, tmp_path):
     policy.save_pretrained(tmp_path)
     for for_int8, mean in ((False, IMAGENET_MEAN), (True, WHOLE_MEAN)):
         saved_processors(policy, tmp_path, image_stats(policy, mean))
-        model = read(tmp_path, for_int8)
+        checkpoint = load_checkpoint(tmp_path)
+        model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
         assert all(isinstance(m, Columns if for_int8 else Pixels) for m in model.image_input)
         frames, state = observation(policy, seed=int(for_int8))
         batch = {k: torch.from_numpy(normalise(f, mean))[None] for k, f in frames.items()}
@@ -123,7 +115,6 @@ def test_lerobots_processors_end_up_inside(mode, tmp_path):
     [
         (IMAGENET_MEAN, IMAGENET_STD, True),
         ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), True),
-        ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5), True),
         ((-0.1, 0.5, 0.5), (0.5, 0.5, 0.5), False),  # no colour normalises to zero
         ((0.5, 0.5, 1.01), (0.5, 0.5, 0.5), False),
     ],

@@ -105,8 +105,8 @@ class FlightLog:
     path: the file, to which the drive is appended. header: what the drive was started with; figures need hz, fade_s and
     stop_s in it. max_bytes: a file of this size is renamed to path.1, path.1 to path.2 and so on, and only `keep` older
     files stay. Raises RoverError on entering if another drive writes the file, and nothing later: if the disk is full
-    or gone, this is logged once, and tried again every second. Ticks must come from one thread; events may come from any,
-    and from the handlers of signals.
+    or gone, this is logged once, and tried again every second. Ticks must come from one thread; events may come from
+    any, and from the handlers of signals.
     """
 
     def __init__(

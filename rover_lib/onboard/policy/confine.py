@@ -2,10 +2,9 @@
 
     reason = confine(memory_mb("policy_static.pt", threads=3))    # "" if the kernel enforces it, otherwise why not
 
-Only operators of a closed list are accepted in an artifact, but torch is a million lines of code that may have bugs. So
-before a process runs an artifact, it gives up every right that a policy does not need. It can no longer open a file for
-writing, the serial port or a socket, start a program, or touch another process, and its memory has a limit. systemd's
-sandbox does some of this too, but for the service as a whole, whose control loop needs the serial port.
+Nobody can tell what an artifact's program does. So before a process runs it, it gives up every right that a policy does
+not need: it can no longer open a file for writing, the serial port or a socket, start a program, or touch another
+process, and its memory has a limit. systemd's sandbox is for the service as a whole, which needs the serial port.
 """
 
 import ctypes

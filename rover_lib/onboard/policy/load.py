@@ -112,10 +112,8 @@ def import_engine(artifact: Artifact) -> str:
 def load_policy(source: Path | str | Artifact, *, threads: int | None = None) -> Policy:
     """Load an artifact, a file or an open one, and prove that it computes the same here as where it was made.
 
-    threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged.
-    The file's checksums are checked, the form and the operators of its program, the manifest, the engine, and the
-    parity vectors (which also warm the kernels). Raises ArtifactError with one sentence if any of these fails, and
-    if root calls it, who has too much to lose.
+    threads: for the engine's kernels (with torch, of the whole process); None leaves their number unchanged. Raises
+    ArtifactError if checksums, manifest, engine or parity vectors (which also warm the kernels) fail, and for root.
     """
     refuse_root()
     if not isinstance(source, Artifact):

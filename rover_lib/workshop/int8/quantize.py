@@ -32,14 +32,8 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.workshop.act import ACT, EMBEDDINGS, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.observe import (
-    AGAIN,
-    Calibration,
-    RangeObserver,
-    qconfig_mapping,
-    restore_observed,
-    scale_model,
-)
+from rover_lib.workshop.int8 import observe
+from rover_lib.workshop.int8.observe import AGAIN, Calibration, RangeObserver, restore_observed, scale_model
 from rover_lib.workshop.int8.scales import projections
 from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.recordings.episodes import Sample
@@ -121,19 +115,16 @@ def forget_graphs() -> None:
 def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
     """Raise ArtifactError, naming the layers, unless every static INT8 layer dispatches to XNNPACK's SDOT kernels.
 
-    What torch 2.8 asks of a layer (`can_use_xnnp` in aten's qconv and qlinear) and XNNPACK of its scales: a qint8
-    input, symmetric qint8 weights in [-127, 127], per channel for convolutions only, and an output scale that is
-    neither 2^-32 nor 2^8 times the product of the others. Another layer would run QNNPACK's kernels, several times
-    slower on a Cortex-A76, or not at all.
+    Another layer would run QNNPACK's kernels, several times slower on a Cortex-A76, or not at all.
     """
-    slow: dict[str, str] = {}
+    slow: list[str] = []
     static = int8_layers(module)
     with ExitStack() as hooks:
         for name, layer in static.items():
 
             def watch(m: Int8Layer, args: tuple[Tensor, ...], name: str = name) -> None:
-                if reason := _why_slow(m, args[0]):
-                    slow[name] = reason
+                if not _is_fast(m, args[0]):
+                    slow.append(name)
 
             hooks.enter_context(layer.register_forward_pre_hook(watch))
         try:
@@ -143,25 +134,18 @@ def check_fast(module: nn.Module, example: tuple[Tensor, ...]) -> None:
             if not slow:
                 raise ArtifactError(f"the quantized policy does not run: {str(e).splitlines()[0][:200]}") from None
     if slow:
-        listed = "; ".join(f"{name}: {reason}" for name, reason in list(slow.items())[:5])
-        raise ArtifactError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {listed}")
+        named = ", ".join(slow[:5])
+        raise ArtifactError(f"{len(slow)} of {len(static)} layers would miss the fast kernels: {named}")
 
 
-def _why_slow(m: Int8Layer, x: Tensor) -> str | None:
+def _is_fast(m: Int8Layer, x: Tensor) -> bool:
+    """What torch 2.8 asks of a layer (`can_use_xnnp` in aten's qconv), and XNNPACK of its scales' ratio."""
     w = m.weight()
-    per_channel, scales, zero_points = _weight_qparams(w)
-    if x.dtype != torch.qint8:
-        return f"its input is {str(x.dtype).removeprefix('torch.')}, not qint8"
-    if w.dtype != torch.qint8 or w.int_repr().min() < -127:
-        return "its weights are not qint8 in [-127, 127]"
-    if zero_points.any():
-        return "its weights are not symmetric: a zero point is not 0"
-    if per_channel and isinstance(m, int8.Linear):
-        return "a linear with a scale per channel; it must be a 1x1 convolution, or have one scale"
-    ratio = scales.double() * x.q_scale() / m.scale
-    if not ((ratio >= 2**-32) & (ratio < 2**8)).all():
-        return f"its scales give a ratio of {ratio.max():.3g}, outside [2^-32, 2^8)"
-    return None
+    if x.dtype != torch.qint8 or w.dtype != torch.qint8 or not isinstance(m, int8.Conv2d):
+        return False
+    symmetric = w.int_repr().min() >= -127 and not w.q_per_channel_zero_points().any()
+    ratio = w.q_per_channel_scales().double() * x.q_scale() / m.scale
+    return bool(symmetric and ((ratio >= 2**-32) & (ratio < 2**8)).all())
 
 
 def _dynamic(checkpoint: Checkpoint, calibration: Calibration) -> nn.Module:
@@ -173,21 +157,14 @@ def _dynamic(checkpoint: Checkpoint, calibration: Calibration) -> nn.Module:
         return quantize_dynamic(model, spec, dtype=torch.qint8)
 
 
-def _weight_qparams(w: Tensor) -> tuple[bool, Tensor, Tensor]:
-    """Whether a quantized weight has a scale per channel, its scales and its zero points, (channels,) or (1,) each."""
-    if w.qscheme() in (torch.per_channel_affine, torch.per_channel_symmetric):
-        return True, w.q_per_channel_scales(), w.q_per_channel_zero_points()
-    return False, torch.tensor([w.q_scale()]), torch.tensor([w.q_zero_point()])
-
-
 def _layer_row(name: str, m: Int8Layer) -> dict[str, Any]:
-    per_channel, scales, _ = _weight_qparams(m.weight())
+    scales = m.weight().q_per_channel_scales()
     static = not isinstance(m, dynamic_int8.Linear)
     row: dict[str, Any] = {
         "name": name,
         "block": block_of(name),
         "kind": type(m).__name__,
-        "per_channel": per_channel,
+        "per_channel": True,
         "weight_scale_min": scales.min().item(),
         "weight_scale_max": scales.max().item(),
         "out_scale": float(m.scale) if static else None,
@@ -209,7 +186,7 @@ def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iter
         warnings.simplefilter("ignore")
         converted = convert_fx(
             copy.deepcopy(prepared, shared),
-            qconfig_mapping=qconfig_mapping(config, scheme, only),
+            qconfig_mapping=observe.qconfig_mapping(config, scheme, only),
             backend_config=get_qnnpack_backend_config(),
         )
     return _columns_are_int8(converted, KINDS[scheme.kind][0])

@@ -63,6 +63,12 @@ class WorstFrame:
     reference: np.ndarray
     other: np.ndarray
 
+    def summary(self) -> dict[str, Any]:
+        """The same for compare.json, without the picture."""
+        sample = {"episode": getattr(self.sample, "episode", None), "frame": getattr(self.sample, "frame_name", None)}
+        found = {"mode": self.mode, "action": self.action, "error_pct": self.error_pct}
+        return found | sample | {"fp32": self.reference, "int8": self.other}
+
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
@@ -267,9 +273,8 @@ def metrics(
 ) -> dict[str, Any]:
     """The metrics of compare.json: fp32, modes and what they were measured on.
 
-    policies: "fp32" and the modes, with .path and .manifest. trials: reports by mode (hits, trials,
-    wilson); modes that were not driven have None, not 0. on_drives: fidelity on the frames of those drives.
-    Sizes are artifact files on both sides, weights with weights: no optimizer state, no training-only part.
+    policies: "fp32" and the modes, with .path and .manifest. trials: reports by mode (hits, trials, wilson); modes that
+    were not driven have None, not 0. on_drives: fidelity on the frames of those drives. Sizes are artifact files.
     """
     own = {}
     for mode in ("fp32", *report.chunks):
@@ -296,14 +301,8 @@ def metrics(
         "frames": len(report.samples),
         "padded_steps_pct": 100 * report.is_pad.mean(),
         "driven_frames": len(on_drives.samples) if on_drives else 0,
-        "worst": [_plain_worst(w) for mode in report.chunks for w in report.worst(mode)],
+        "worst": [w.summary() for mode in report.chunks for w in report.worst(mode)],
     }
-
-
-def _plain_worst(worst: WorstFrame) -> dict[str, Any]:
-    sample = {"episode": getattr(worst.sample, "episode", None), "frame": getattr(worst.sample, "frame_name", None)}
-    found = {"mode": worst.mode, "action": worst.action, "error_pct": worst.error_pct}
-    return found | sample | {"fp32": worst.reference, "int8": worst.other}
 
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:

@@ -57,7 +57,9 @@ class Benchmarks:
         rows = []
         for host, b in self.by_host.items():
             m = b["metrics"]
-            state = (_shown(m.get("temperature_c"), 1), _shown(m.get("clock_mhz"), 0), m.get("throttled") or "-")
+            heat, clock = m.get("temperature_c"), m.get("clock_mhz")
+            sensed = ("-" if heat is None else f"{heat:.1f}", "-" if clock is None else f"{clock:.0f}")
+            state = (*sensed, m.get("throttled") or "-")
             for name, v in m["artifacts"].items():
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
                 rows.append((host, name, *times, str(v["n"]), *state))
@@ -136,7 +138,3 @@ def _name_by_mode(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[s
 
     series = [renamed(point) for point in metrics.get("series") or ()]
     return {**content, "metrics": {**renamed(metrics), "main": names[metrics["main"]], "series": series}}
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

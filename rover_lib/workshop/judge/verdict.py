@@ -108,7 +108,8 @@ def _list_missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: s
     rows = [r for r in gates(compared, limits, mode) if r["passed"] is False and r["gate"].startswith(f"{mode} ")]
     keys = " ".join(r["gate"] for r in rows)
     doubled = {"accuracy_loss_pct": "_mae_pct", "model_size_mb": " size_mb"}
-    return [_with_words(r) for r in rows if doubled.get(r["gate"].partition(" ")[2], "no gate") not in keys]
+    rows = [r for r in rows if doubled.get(r["gate"].partition(" ")[2], "no gate") not in keys]
+    return [{**r, "words": gate_in_words(r["gate"])} for r in rows]
 
 
 def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -159,10 +160,6 @@ def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
 # --- what failed ------------------------------------------------------------------------------------------------------
 
 
-def _with_words(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {**row, "words": gate_in_words(row["gate"])}
-
-
 def _list_failures(
     stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
@@ -174,12 +171,12 @@ def _list_failures(
     promised = limits["original"]["latency_mean_ms"][1]
     trained = gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32["trials"]))
     floor = gate(f"{GATED} floor_ms", static.get("floor_ms"), "<=", promised)
-    missed = [trained, *static.get("missed_gates", []), floor]
-    return [
-        _with_words(row) | {"remedies": advice.list_remedies(row["gate"], stages, params, names, rows)}
-        for row in missed
-        if row["passed"] is False
-    ]
+    failed = []
+    for row in (trained, *static.get("missed_gates", []), floor):
+        if row["passed"] is False:
+            remedies = advice.list_remedies(row["gate"], stages, params, names, rows)
+            failed.append({**row, "words": gate_in_words(row["gate"]), "remedies": remedies})
+    return failed
 
 
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:

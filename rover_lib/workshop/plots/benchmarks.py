@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rover_lib.workshop.plots import style
 from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, NAMES, NOW_BITS, OTHERS, RED, legend_below, new_figure
 
 
@@ -22,7 +23,7 @@ def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax, (host, stage) in zip(axes[:, 0], benchmarks.items(), strict=True):
         _times(ax, stage["metrics"]["artifacts"])
         env, n = stage["env"], next(iter(stage["metrics"]["artifacts"].values()))["n"]
-        ax.set_title(f"{host} ({env['machine']}, {env['cores']} cores), n = {n}, bar: p50", fontsize=11)
+        ax.set_title(f"{host} ({env['machine']}, {env['cores']} cores), n = {n}, bar: p50")
     first = axes[0, 0]
     axes[-1, 0].set_xlabel("latency of one inference, one plan of actions (ms)")
     first.text(1.01, 1.02, "p50 / p95 / p99", transform=first.transAxes, fontsize=9)
@@ -41,11 +42,9 @@ def _times(ax: Axes, artifacts: Mapping[str, Mapping[str, Any]]) -> None:
         ax.plot(p99, y, "|", color=BLACK, ms=7, mew=1.5)
         if v.get("floor_ms") is not None:
             ax.plot(v["floor_ms"], y, "D", color=RED, mec="white", ms=6)
-        text = f"{p50:.1f} / {p95:.1f} / {p99:.1f} ms"
-        ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        style.annotate_row(ax, y, f"{p50:.1f} / {p95:.1f} / {p99:.1f} ms")
     ax.set_yticks(range(len(artifacts)), [NAMES.get(n, n) for n in artifacts])
-    ax.set_ylim(len(artifacts) - 0.5, -0.5)
-    ax.set_xlim(0, None)
+    ax.set(xlim=(0, None), ylim=(len(artifacts) - 0.5, -0.5))
 
 
 def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -74,9 +73,8 @@ def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
     temperature.set_ylabel("temperature\n(°C)")
     clock.set_ylabel("clock of the\nslowest core (MHz)")
     held.set_yticks(range(len(benchmarks)), list(benchmarks))
-    held.set_ylim(len(benchmarks) - 0.5, -0.5)
-    held.set_title("held back by the firmware: under-voltage, capped clock, throttled or too warm", fontsize=9)
-    held.set_xlabel("time (min)")
+    what = "held back by the firmware: under-voltage, capped clock, throttled or too warm"
+    held.set(xlabel="time (min)", title=what, ylim=(len(benchmarks) - 0.5, -0.5))
     legend_below(fig, times, 3)
     return fig
 

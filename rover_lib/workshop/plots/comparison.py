@@ -9,7 +9,7 @@ from matplotlib.patches import Circle
 
 from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.plots import style
-from rover_lib.workshop.plots.style import COLOURS, GREY, MOST_ACTIONS, NAMES, Note, legend_below, line_of, new_figure
+from rover_lib.workshop.plots.style import COLOURS, GREY, MOST_ACTIONS, Note, legend_below, line_of, new_figure
 
 AHEAD = "step of the plan (s ahead)"
 
@@ -17,8 +17,7 @@ AHEAD = "step of the plan (s ahead)"
 def sizes(metrics: Mapping[str, Any]) -> Figure:
     """Draw the sizes of the artifact files, which hold weights without an optimizer. metrics: those of compare.json."""
     sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
-    fig, axes = new_figure(1, height_in=1.3 + 0.34 * len(sizes_mb))
-    ax = axes[0, 0]
+    fig, ax = style.bars_figure(len(sizes_mb), 1.3)
     ax.barh(range(len(sizes_mb)), list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
     style.bar_values(ax, range(len(sizes_mb)), sizes_mb.values(), "{:.1f} MB")
     style.name_rows(ax, sizes_mb)
@@ -34,7 +33,7 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     fig, fields = style.figure_of(len(actions), min(max(len(actions), 2), MOST_ACTIONS), 3.6)
     times_s = np.arange(steps) / rate_hz
     for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
-        ax.set_title(action, fontsize=11)
+        ax.set_title(action)
         if (pct := report.pct(action)) is None:
             style.note(ax, "never changes in these\nrecordings: not judged")
             continue
@@ -54,8 +53,7 @@ def worst_frames(
 ) -> Figure | Note:
     """Draw the frames on which a mode differs most from FP32: the picture, both plans, and what was recorded.
 
-    For a policy with many actions, only the worst action of each frame is drawn. first: how many of the worst frames to
-    skip.
+    Of many actions, only the worst of each frame is drawn. first: how many of the worst frames to skip.
     """
     frames = report.worst(mode, first + count)[first:]
     if not frames:
@@ -89,18 +87,15 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
     metrics: those of compare.json.
     """
     rows = {m: v for m, v in ({"fp32": metrics["fp32"]} | dict(metrics["modes"])).items() if v["trials"]}
-    fig, axes = new_figure(1, height_in=1.5 + 0.36 * max(len(rows), 1))
-    ax = axes[0, 0]
+    fig, ax = style.bars_figure(max(len(rows), 1), 1.5)
     for y, (mode, v) in enumerate(rows.items()):
         colour = COLOURS.get(mode, GREY)
         ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
         ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
-        text = f"{v['hits']} of {v['trials']}"
-        ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=10)
-    ax.set_ylim(-0.5, len(rows) - 0.5)
-    style.name_rows(ax, rows)
+        style.annotate_row(ax, y, f"{v['hits']} of {v['trials']}")
     lows = [100 * v["hits_wilson_low"] for v in rows.values()]
-    ax.set_xlim(max(0, min(lows, default=0) - 5), 101)
+    ax.set(xlim=(max(0, min(lows, default=0) - 5), 101), ylim=(-0.5, len(rows) - 0.5))
+    style.name_rows(ax, rows)
     ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
     return fig
 
@@ -126,10 +121,8 @@ def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
         x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
         ax.add_patch(Circle((-y, x), 0.16, color=style.RED))
         ax.set_aspect("equal", adjustable="datalim")
-        ax.set_xlabel("to the right (m)")
-        missed = [NAMES.get(m, m) for m, t in trials.items() if not t.per_world[i].hit]
-        outcome = "all hit" if not missed else f"{len(missed)} of {len(trials)} missed"
-        ax.set_title(f"{100 * apart(i):.0f} cm apart, {outcome}", fontsize=9)
+        hit = sum(t.per_world[i].hit for t in trials.values())
+        ax.set(xlabel="to the right (m)", title=f"{100 * apart(i):.0f} cm apart, {hit} of {len(trials)} hit")
     axes[0, 0].set_ylabel("ahead of the start (m)")
     legend_below(fig, axes[0, 0], 5)
     return fig

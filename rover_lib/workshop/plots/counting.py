@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots.style import NAMES, legend, name_rows, new_figure, simd_bars
+from rover_lib.workshop.plots.style import NAMES, bars_figure, legend, name_rows, simd_bars
 
 # Instructions of one inference of the full policy (15 GMAC, 360x640), in 1e9: label, all instructions, and the SIMD
 # instructions among them. Notebook 03 shows them for a run that `make count` has not counted. Source: `make count
@@ -45,10 +45,9 @@ def instruction_counts(metrics: Mapping[str, Any] | None = None) -> Figure:
         floor_g, gmac = (next(iter(counted.values()))[key] for key in ("floor_g", "gmac"))
         rows.append(("dot-product instructions alone", floor_g, floor_g))
         title = f"this run's artifacts, {gmac:.3g} GMAC"
-    fig, axes = new_figure(1, height_in=1.2 + 0.36 * len(rows))
-    ax, y = axes[0, 0], np.arange(len(rows))
+    fig, ax = bars_figure(len(rows), 1.2)
     total, simd = (np.array([row[i] for row in rows]) for i in (1, 2))
-    simd_bars(ax, y, total, simd)
+    simd_bars(ax, np.arange(len(rows)), total, simd)
     name_rows(ax, [row[0] for row in rows])
     ax.set_xlabel("instructions of one inference (10^9)")
     ax.set_title(f"{title}; counted on an emulated Cortex-A76", fontsize=10, loc="right")

@@ -42,13 +42,12 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
             left.scatter(peaks, y, color=colour, marker=marker, s=16, label=f"{where}, {label}")
     style.name_rows(left, shown)
     left.tick_params(axis="y", labelsize=8)
-    left.set(xscale="log", xlabel="largest channel / median channel")
-    left.set_title(f"the {len(shown)} most uneven projections", fontsize=11)
+    uneven_title = f"the {len(shown)} most uneven projections"
+    left.set(xscale="log", xlabel="largest channel / median channel", title=uneven_title)
     for key, colour, label in ((f"{side}_max", MIST, "before"), (f"{side}_max_scaled", SLATE, "after channel scales")):
         x = np.sort(np.asarray(layers[worst][key]))[::-1]
         right.plot(np.arange(1, len(x) + 1), 100 * x / x[0], color=colour, lw=1.8, label=label)
-    right.set(xlabel="channel, largest first", ylabel="activation (% of the largest)", ylim=(0, 105))
-    right.set_title(f"{worst}, {side}put", fontsize=11)
+    right.set(xlabel="channel, largest first", ylabel="activation (% of the largest)", title=f"{worst}, {side}put")
     legend(right)
     legend_below(fig, left, 4)
     return fig
@@ -57,13 +56,11 @@ def outlier_channels(calibration: Calibration, count: int = 16) -> Figure:
 def errors_by_choice(table: Errors, title: str, budget_pct: float | None = None) -> Figure:
     """Draw the error of each action for each choice, say of observers. table: {choice: {<action>_mae_pct}}."""
     table, what = style.few_actions(table)
-    fig, axes = new_figure(1, height_in=1.6 + 0.42 * len(table))
-    ax = axes[0, 0]
+    fig, ax = style.bars_figure(len(table), 1.6)
     style.draw_errors(ax, table, style.judged_keys(ax, next(iter(table.values()))), values=True)
     if budget_pct is not None:
         ax.axvline(budget_pct, color=BLACK, ls="--", lw=1, label=f"limit, {budget_pct:g} %")
-    ax.set_xlabel(f"{what} against FP32 (% of the recorded range)")
-    ax.set_title(title, fontsize=11)
+    ax.set(xlabel=f"{what} against FP32 (% of the recorded range)", title=title)
     legend(ax, loc="upper left", bbox_to_anchor=(1, 1))
     return fig
 
@@ -82,12 +79,11 @@ def sensitivity(table: Errors, steps: Sequence[Mapping[str, Any]], budget_pct: f
     for i, key in enumerate(keys):
         costs, errors = [s["cost_pct"] for s in steps], [s[key] for s in shown.values()]
         right.plot(costs, errors, "o-", color=style.action_colour(key, i), label=key.removesuffix("_mae_pct"))
-    left.set_xlabel(f"{what} (% of the recorded range)")
-    left.set_title("this block alone in INT8", fontsize=11)
+    left.set(xlabel=f"{what} (% of the recorded range)", title="this block alone in INT8")
     right.axhline(budget_pct, color=BLACK, ls="--", lw=1, label=f"budget, {budget_pct:g} %")
     right.set(xlabel="more instructions (%, computed)", ylabel="mean error (% of the recorded range)", ylim=(0, None))
     right.margins(x=0.15)
-    right.set_title("blocks left in float, one by one", fontsize=11)
+    right.set_title("blocks left in float, one by one")
     legend(right)
     return fig
 
@@ -101,12 +97,11 @@ def layers(rows: Sequence[Mapping[str, Any]], clipped_warn_pct: float) -> Figure
     upper, lower = axes[:, 0]
     colours = style.part_colours(r["block"] for r in rows)
     upper.bar(range(len(rows)), [r["snr_db"] for r in rows], color=colours)
-    upper.set_ylabel("signal to noise (dB)")
-    upper.set_title("higher is better; errors from earlier layers are included", fontsize=11)
+    upper.set(ylabel="signal to noise (dB)", title="higher is better; errors from earlier layers are included")
     lower.bar(range(len(rows)), [r["clipped_pct"] for r in rows], color=colours)
     lower.axhline(clipped_warn_pct, color=RED, ls="--", lw=1.2, label="warning")
-    lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data")
-    lower.set_ylim(0, 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows)))
+    most_pct = 1.25 * max(clipped_warn_pct, *(r["clipped_pct"] for r in rows))
+    lower.set(ylabel="clipped (% of values)", xlabel="INT8 layer, in the order of the data", ylim=(0, most_pct))
     style.label_parts(lower, style.PARTS | {"image_project": GREY})
     legend_below(fig, lower, 5)
     return fig

@@ -27,8 +27,8 @@ def checkpoint_size(report: Mapping[str, Any]) -> Figure:
         "optimizer state": (report["optimizer_mb"], OTHERS[1]),
         "everything else": (other_mb, GREY),
     }
-    fig, axes = new_figure(1, height_in=3.1)
-    ax, left = axes[0, 0], 0.0
+    fig, ax = style.bars_figure(3, 2.0)
+    left = 0.0
     for name, (size_mb, colour) in parts.items():
         if size_mb > 0.005 * report["file_mb"]:
             ax.barh(0, size_mb, left=left, color=colour, label=name)
@@ -106,16 +106,13 @@ def faults(recordings: Recordings) -> Figure | Note:
     if not bars:
         return Note(f"{used}; no fault was found in them")
     colours = dict(zip(HANDLED, (BLUE, SLATE, OTHERS[1], RED), strict=True))
-    fig, axes = new_figure(1, height_in=1.6 + 0.28 * len(bars))
-    ax = axes[0, 0]
+    fig, ax = style.bars_figure(len(bars), 1.6)
     ax.barh(range(len(bars)), counts, color=[colours[handled] for *_, handled in bars])
     style.bar_values(ax, range(len(bars)), counts, "{:d}")
     style.name_rows(ax, [kind.replace("_", " ") for kind in kinds])
-    ax.set_xlabel("times")
+    ax.set(xlabel="times", title=used)
     style.label_parts(ax, {handled: colours[handled] for handled in counted})
     legend(ax, loc="lower right")
-    totals = ", ".join(f"{sum(kinds.values())} {handled}" for handled, kinds in counted.items())
-    ax.set_title(f"{used}; faults: {totals}", fontsize=11)
     return fig
 
 
@@ -131,16 +128,14 @@ def calibration_coverage(
         first = np.stack([s.chunk[0] for s in samples])
         x, y = first[:, 0], first[:, len(first_two) - 1]
         fields[0].scatter(x, y, s=10, c=colour, marker="x" if label == "held out" else "o", label=f"{label} ({len(x)})")
-    fields[0].set(xlabel=f"{first_two[0]}{unit}", ylabel=f"{first_two[-1]}{unit}")
-    fields[0].set_title("one point per frame", fontsize=11)
+    fields[0].set(xlabel=f"{first_two[0]}{unit}", ylabel=f"{first_two[-1]}{unit}", title="one point per frame")
     for i, ax in enumerate(fields[1:]):
         every = np.concatenate([s.chunk[:, i] for s in pool])
         bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
         for samples, colour, kind in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
             values = np.concatenate([s.chunk[:, i] for s in samples])
             ax.hist(values, bins, weights=np.full(len(values), 100 / len(values)), color=colour, histtype=kind, lw=1.5)
-        ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)")
-        ax.set_title(f"{names[i]} over whole plans", fontsize=11)
+        ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)", title=f"{names[i]} over whole plans")
     legend_below(fig, fields[0], 3)
     return fig
 
@@ -175,9 +170,7 @@ def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
                 ax.axvline(x, color=SLATE, ls=dashes, lw=1.6, label=name if i == 0 else None)
         low, high = ranges["minmax"]
         ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
-        ax.set_yscale("log")
-        ax.set_title(layer, fontsize=10)
-        ax.set_xlabel("activation (no unit)")
+        ax.set(yscale="log", title=layer, xlabel="activation (no unit)")
     axes[0, 0].set_ylabel("values seen (%, logarithmic)")
     legend_below(fig, axes[0, 0], 3)
     return fig

@@ -88,7 +88,14 @@ def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: A
     for ax in axes.flat:
         ax.spines[["top", "right"]].set_visible(False)
         ax.tick_params(labelsize=9)
+        ax.title.set_fontsize(11)
     return fig, axes
+
+
+def bars_figure(rows: int, height_in: float) -> tuple[Figure, Axes]:
+    """Make a figure of one row of axes, with room for so many horizontal bars. height_in: of the rest."""
+    fig, axes = new_figure(1, height_in=height_in + 0.36 * rows)
+    return fig, axes[0, 0]
 
 
 def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any]]:
@@ -144,6 +151,11 @@ def bar_values(ax: Axes, y: Iterable[float], x: Iterable[Any], form: str) -> Non
     for at, value in zip(y, x, strict=True):
         ax.annotate(form.format(value), (value, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
     ax.margins(x=0.16)
+
+
+def annotate_row(ax: Axes, y: float, text: str) -> None:
+    """Write a text to the right of the axes, at the height of a row."""
+    ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9)
 
 
 def note(ax: Axes, text: str) -> None:

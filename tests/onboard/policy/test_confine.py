@@ -152,9 +152,8 @@ def test_the_numbers_are_the_kernels(processor):
     given = {**confine.ALLOWED, "openat": confine.OPENAT, "clone": confine.CLONE, "clone3": confine.CLONE3,
              "prlimit64": confine.PRLIMIT, "seccomp": confine.SECCOMP, "open": confine.OPEN}  # fmt: skip
     column, _ = confine.PROCESSORS[processor]
-    assert {name: call[column] for name, call in given.items() if call[column] is not None} == {
-        name: numbers.get(name) for name, call in given.items() if call[column] is not None
-    }
+    ours = {name: call[column] for name, call in given.items() if call[column] is not None}
+    assert ours.items() <= numbers.items()
 
 
 def test_where_the_kernel_cannot_the_reason_is_said(monkeypatch):

@@ -16,7 +16,7 @@ from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, read_manifest
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.workshop.act import ACT, blocks, inputs_of, predictions
+from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
@@ -61,9 +61,11 @@ def test_channel_scales_are_exact_in_float(variant, tmp_path):
 
 @pytest.mark.parametrize("smooth", [0.0, 1.0])
 def test_smooth_1_evens_out_activations_and_0_weights(tiny, smooth):
-    model, seen = ACT(tiny.config, tiny.weights), inputs(tiny, 3)
-    apply_channel_scales(model, channel_maxima(model, seen), smooth)
-    name = "encoder.0.feed_forward.up"
+    model, seen, name = ACT(tiny.config, tiny.weights), inputs(tiny, 3), "encoder.0.feed_forward.up"
+    maxima, one_by_one = channel_maxima(model, seen), [channel_maxima(model, [x])[name] for x in seen]
+    for key, found in maxima[name].items():
+        assert torch.equal(found, torch.stack([each[key] for each in one_by_one]).amax(0))
+    apply_channel_scales(model, maxima, smooth)
     even, uneven = channel_maxima(model, seen)[name]["in_max"], model.get_submodule(name).weight.abs().amax(0)
     if smooth == 0:
         even, uneven = uneven, even
@@ -108,22 +110,20 @@ def slow_layers():
     torch.backends.quantized.engine = ENGINE  # weights are packed for it
     steps, zeros = torch.full((16,), 0.02), torch.zeros(16, dtype=torch.long)
 
-    def linear(weight):
-        m = q.int8.Linear(16, 16)
-        m.set_weight_bias(weight, torch.zeros(16))
-        m.scale, m.zero_point = 0.1, 0
-        return m
+    linear = q.int8.Linear(16, 16)
+    linear.set_weight_bias(torch.quantize_per_tensor(torch.randn(16, 16), 0.02, 0, torch.qint8), torch.zeros(16))
+    linear.scale, linear.zero_point = 0.1, 0
 
-    def conv(zero_point: int = 0, scale: float = 0.1):
-        w = torch.randn(16, 16, 1, 1).clamp(-1, 1)
+    def conv(zero_point: int = 0, scale: float = 0.1, largest: float = 1.0):
+        w = torch.randn(16, 16, 1, 1).clamp(-1, 1) * largest
         m = q.int8.Conv2d(16, 16, 1)
         m.set_weight_bias(torch.quantize_per_channel(w, steps, zeros + zero_point, 0, torch.qint8), None)
         m.scale, m.zero_point = scale, 0
         return m
 
-    w, tokens, picture = torch.randn(16, 16).clamp(-1, 1), torch.randn(1, 4, 16), torch.randn(1, 16, 3, 3)
-    yield linear(torch.quantize_per_channel(w, steps, zeros, 0, torch.qint8)), tokens, torch.qint8, 0.05
-    yield linear(torch.quantize_per_tensor(w - 9, 0.02, 0, torch.qint8)), tokens, torch.qint8, 0.05  # -128 is in it
+    picture = torch.randn(1, 16, 3, 3)
+    yield linear, torch.randn(1, 4, 16), torch.qint8, 0.05
+    yield conv(largest=9.0), picture, torch.qint8, 0.05  # -128 is in it
     yield conv(), picture, torch.quint8, 0.05
     yield conv(zero_point=3), picture, torch.qint8, 0.05
     yield conv(scale=2**-12), picture, torch.qint8, 2000.0
@@ -197,7 +197,7 @@ def test_refusals(tiny, calibration, tmp_path):
 
 
 def test_inspect_layers_sees_clipping_at_either_end(tiny, calibration):
-    quantized, few = quantize(tiny, Scheme(observer="minmax"), calibration), memory_samples(12)
+    quantized, few = quantize(tiny, Scheme(observer="minmax"), calibration), memory_samples(12)[:4]
     rows = {r["name"]: r for r in q.inspect_layers(quantized, tiny, calibration, few)}
     assert len(rows) == quantized.report["int8_modules"]
     # The calibration's own samples, min-max: nothing is clipped, and every layer carries a signal.
@@ -209,13 +209,16 @@ def test_inspect_layers_sees_clipping_at_either_end(tiny, calibration):
     layer.scale = float(layer.scale) / 4
     rows = q.inspect_layers(quantized, tiny, calibration, few[:1])
     low, high = ((end - layer.zero_point + beyond) * layer.scale for end, beyond in ((-128, -0.5), (127, 0.5)))
-    given = {}
-    prepared = restore_observed(tiny, Scheme(observer="minmax"), calibration)
-    prepared.get_submodule(name).register_forward_hook(lambda m, args, out: given.update(x=out))
-    prepared(*inputs_of(few[0], tiny.config))
-    below, above = ((given["x"] < low).float().mean().item(), (given["x"] > high).float().mean().item())
+    given = []
+    for module in (restore_observed(tiny, Scheme(observer="minmax"), calibration), quantized.module):
+        module.get_submodule(name).register_forward_hook(lambda m, args, out: given.append(out.dequantize()))
+        module(*inputs_of(few[0], tiny.config))
+    x, y = given
+    below, above = (x < low).float().mean().item(), (x > high).float().mean().item()
     assert below > 0.01 and above > 0.01
-    assert next(r for r in rows if r["name"] == name)["clipped_pct"] == pytest.approx(100 * (below + above))
+    row = next(r for r in rows if r["name"] == name)
+    assert row["clipped_pct"] == pytest.approx(100 * (below + above))
+    assert row["snr_db"] == pytest.approx(10 * np.log10((x.square().sum() / (x - y).square().sum()).item()), rel=1e-4)
     assert any(name in w for w in q.warn_of_clipping(rows, 1.0))
 
 
@@ -231,6 +234,18 @@ def test_an_error_is_a_weighted_mean_in_percent_of_the_range():
     errors, weights = torch.tensor([[0.1, 0.1], [0.3, 0.0]]), torch.tensor([3.0, 1.0])
     found = mae_pct(errors, weights, RANGE | {"throttle": (0.0, 0.25)})
     assert found == pytest.approx({"steering_mae_pct": 15.0, "throttle_mae_pct": 30.0})
+
+
+def test_a_frames_error_is_the_mean_of_its_plans_steps(tiny, chooser):
+    off = torch.linspace(0, 0.02, tiny.config.chunk)[None, :, None]
+
+    class Off(torch.nn.Module):
+        def forward(self, *x):
+            return predictions(ACT(tiny.config, tiny.weights), [x]) - off
+
+    found = chooser.error(Off())
+    assert found == pytest.approx({"steering_mae_pct": 1.0, "throttle_mae_pct": 2.0}, rel=1e-3)
+    assert chooser.error_by_kind(Off()) == {"usual": pytest.approx(found)}
 
 
 @pytest.mark.slow
@@ -423,6 +438,9 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     assert tolerance["steering"] == pytest.approx(0.04, rel=1e-3)
     assert tolerance["throttle"] == LARGEST_TOLERANCE["int8"]  # what it loses is for the gates to judge
     assert found.manifest["calibration"]["samples"] == 12 and found.manifest["mode"] == "static"
+    act = exporter.float_policy
+    assert found.manifest["gmac"] == pytest.approx(sum(multiply_accumulates(act).values()) / 1e9)
+    assert found.manifest["weights_mb"] == pytest.approx(4 * sum(p.numel() for p in act.parameters()) / 1e6)
     export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "b.pt", memory_samples(2))
     assert "car" not in read_manifest(tmp_path / "b.pt")
     assert read_manifest(tmp_path / "b.pt")["parity"]["tolerance"]["steering"] == pytest.approx(1e-4)

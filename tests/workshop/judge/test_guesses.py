@@ -13,11 +13,11 @@ CHUNK, RANGE = 8, {"steering": (-1.0, 1.0), "throttle": (0.0, 0.1)}
 GUESSES = ["a constant action", "the last action again", "the mean plan"]
 
 
-def drive(episode, frames=60):
+def drive(episode, frames=60, rise=200):
     """One drive's samples: steering follows what is seen, throttle rises from a stand."""
     rng = np.random.default_rng(episode)
     times = np.arange(frames + CHUNK)
-    actions = np.stack([0.8 * np.sin(times / 9 + rng.uniform(0, 6)), np.minimum(times / 200, 0.1)], 1)
+    actions = np.stack([0.8 * np.sin(times / 9 + rng.uniform(0, 6)), np.minimum(times / rise, 0.1)], 1)
     pads = np.arange(frames)[:, None] + np.arange(CHUNK) >= frames
     return [
         SimpleNamespace(
@@ -31,8 +31,8 @@ def drive(episode, frames=60):
     ]
 
 
-def judge(plan, episodes=6, action_range=RANGE):
-    """plan: of a sample. Judged on `episodes` drives, and it could learn from four others."""
+def judge(plan, episodes=6, action_range=RANGE, rise=200):
+    """plan: of a sample. Judged on `episodes` drives, and it could learn from four others, of this rise in throttle."""
     samples = [s for e in range(episodes) for s in drive(e)]
     report = Fidelity(
         action_names=("steering", "throttle"),
@@ -44,7 +44,7 @@ def judge(plan, episodes=6, action_range=RANGE):
         is_pad=np.stack([s.is_pad for s in samples]),
         car=Car(),
     )
-    return against_guesses(report, [s for e in range(10, 14) for s in drive(e)])
+    return against_guesses(report, [s for e in range(10, 14) for s in drive(e, rise=rise)])
 
 
 def noisy(sample):
@@ -85,8 +85,8 @@ def test_a_guess_is_beaten_only_in_every_action(far):
 
 def test_the_guesses_know_only_what_could_be_learned_from():
     """By hand: the mean action, and the mean plan, of four other drives, and the state, which is the last action."""
-    judged, seen = judge(lambda s: s.chunk), [s for e in range(6) for s in drive(e)]
-    learned = [s for e in range(10, 14) for s in drive(e)]
+    judged, seen = judge(lambda s: s.chunk, rise=400), [s for e in range(6) for s in drive(e)]
+    learned = [s for e in range(10, 14) for s in drive(e, rise=400)]
     every = np.concatenate([s.chunk[~s.is_pad] for s in learned])
     steps = np.stack([np.mean([s.chunk[i] for s in learned if not s.is_pad[i]], 0) for i in range(CHUNK)])
 

@@ -102,8 +102,7 @@ def test_the_table_says_how_hot_and_how_fast(folders):
 
 
 @pytest.mark.parametrize(
-    "spoil",
-    [lambda c: "{", lambda c: json.dumps({**c, "schema": 9}), lambda c: json.dumps({**c, "metrics": {}})],
+    "spoil", [lambda c: "{", lambda c: json.dumps({**c, "schema": 9}), lambda c: json.dumps({**c, "metrics": {}})]
 )
 def test_a_damaged_or_foreign_file_is_named(folders, spoil):
     written(folders[1], "rover1", 60.0)

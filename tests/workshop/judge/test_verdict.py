@@ -1,32 +1,24 @@
 """The rule of the verdict, on the JSON of the demo's run as it is, and with one thing changed."""
 
-import copy
-import shutil
 from pathlib import Path
 
 import pytest
-from recorded import real_episode
 
-from rover_lib.onboard.care.limits import check_gates
-from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge import verdict as v
-from rover_lib.workshop.judge.advice import Names, gate_in_words
-from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.judge.advice import Names
 
-RESULTS = Path(__file__).parents[3] / "results"
+DEMO = Path(__file__).parents[3] / "results" / "demo"
 NAMES = Names("runs/mine", "best model.pth", "episodes")
 PARAMS = params()
 
 
 @pytest.fixture
 def demo():
-    folder = RESULTS / "demo"
-    files = {stage: folder / f"{stage}.json" for stage in ("load", "quantize", "compare")}
-    stages = {stage: read_stage(path, stage)["metrics"] for stage, path in files.items()}
-    (path,) = folder.glob("benchmark-*.json")
-    stages = copy.deepcopy(stages | {"benchmark": read_stage(path, "benchmark")["metrics"]})
+    (benchmark,) = DEMO.glob("benchmark-*.json")
+    stages = {stage: read_stage(DEMO / f"{stage}.json", stage)["metrics"] for stage in ("load", "quantize", "compare")}
+    stages["benchmark"] = read_stage(benchmark, "benchmark")["metrics"]
     timed = stages["benchmark"]["artifacts"]
     # What the rule makes of these is tested, not how busy the machine was that published them, nor what mixed needed.
     stages["quantize"]["modes"]["mixed"]["float_blocks"] = ["encoder.0.attention"]
@@ -54,6 +46,7 @@ def miss(stages, throttle_pct, *modes):
 
 
 def test_the_demo_deploys_static(demo):
+    demo["benchmark"]["peak_memory_mb"] = demo["benchmark"]["latency_mean_ms"] = 5000.0  # a workstation's: not judged
     judged = judge(demo)
     assert judged["deploy"] == "static" and judged["artifact"] == "policy_static.pt" and not judged["failed"]
     assert "no better" in because(judged, "mixed") and "times as long" in because(judged, "fp32")
@@ -84,13 +77,8 @@ FP32 = row("fp32", 30.0, 0.0, 80.0)
         ([FP32, row("static", missed=["a gate"]), row("mixed") | {"float_blocks": []}], "fp32"),  # static again
     ],
 )
-def test_the_rule_takes_the_fastest_then_the_truest_then_the_smallest(rows, deployed):
+def test_of_the_fastest_and_truest_the_smaller_is_deployed(rows, deployed):
     assert v._best(rows, PARAMS["verdict"])["mode"] == deployed
-
-
-def test_what_a_workstation_measures_of_memory_fails_nothing(demo):
-    demo["benchmark"]["peak_memory_mb"] = demo["benchmark"]["latency_mean_ms"] = 5000.0
-    assert judge(demo)["failed"] == []
 
 
 def test_a_throttle_that_misses_its_gate_is_healed_by_mixed(demo):
@@ -119,15 +107,12 @@ def test_a_mixed_that_is_useless_leaves_fp32(demo):
 
 
 def test_a_mixed_beside_a_static_that_keeps_its_gates_is_not_worth_its_time(demo):
-    demo["compare"]["modes"]["mixed"]["size_mb"] = 43.8
+    """What does more work and was faster by chance, on a busy machine, is not called faster."""
     timed = demo["benchmark"]["artifacts"]
-    timed["mixed"]["latency_p50_ms"] = 4.8 * timed["static"]["latency_p50_ms"]
-    judged = judge(demo)
-    assert judged["deploy"] == "static" and because(judged, "mixed").startswith("takes 4.8 times")
-    # What does more work and was faster by chance, on a busy machine, is not called faster.
-    timed["mixed"]["latency_p50_ms"] = 0.8 * timed["static"]["latency_p50_ms"]
-    judged = judge(demo)
-    assert judged["deploy"] == "static" and "noise" in because(judged, "mixed")
+    for times, why in ((4.8, "takes 4.8 times"), (0.8, "noise")):
+        timed["mixed"]["latency_p50_ms"] = times * timed["static"]["latency_p50_ms"]
+        judged = judge(demo)
+        assert judged["deploy"] == "static" and why in because(judged, "mixed")
     assert len({row["times_faster"] for row in judged["modes"] if row["mode"] in ("static", "mixed")}) == 1
 
 
@@ -150,16 +135,12 @@ def test_what_does_not_drive_is_not_deployed(demo):
     ],
 )
 def test_a_policy_that_is_not_ready_gets_no_command_that_drives(demo, stage, change, says):
+    demo["compare"]["looking"] |= {"steering_by_picture_pct": 5.0, "throttle_by_picture_pct": 0.0}
+    assert judge(demo)["deploy"] == "static"  # one action that follows the camera is enough
     demo[stage] |= change
     judged = judge(demo)
     assert judged["deploy"] is None and says in judged["why"][0]
     assert not any(word in " ".join(commands(judged)) for word in ("ansible", "rover drive", "deploy.yml"))
-
-
-def test_one_action_that_follows_the_camera_is_enough(demo):
-    looking = demo["compare"]["looking"]
-    looking |= {"steering_by_picture_pct": 5.0, "throttle_by_picture_pct": 0.0}
-    assert judge(demo)["deploy"] == "static"
 
 
 @pytest.mark.parametrize(
@@ -197,17 +178,15 @@ def test_what_weakens_a_verdict_is_said(demo):
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
-    demo["compare"]["modes"]["static"]["size_mb"] = 120.0
-    (failed,) = judge(demo)["failed"]  # not once more by the original's limit
-    assert failed["limit"] == PARAMS["gates"]["size_full_mb"]
-    assert "--size 64x36 --name mine-small" in failed["remedies"][0]
-
-
-def test_a_promise_that_no_pi_can_keep_is_named(demo):
+    """And a promise that no Pi can keep is named, though the car drives all the same."""
     demo["benchmark"]["artifacts"]["static"]["floor_ms"] = 48.8
     judged = judge(demo)
-    assert judged["failed"][0]["gate"] == "static floor_ms"
-    assert judged["deploy"] == "static" and "deploy.yml" in commands(judged)[1]  # it drives all the same
+    assert [row["gate"] for row in judged["failed"]] == ["static floor_ms"] and judged["deploy"] == "static"
+    assert "deploy.yml" in commands(judged)[1]
+    demo["compare"]["modes"]["static"]["size_mb"] = 120.0
+    failed, _ = judge(demo)["failed"]  # not once more by the original's limit
+    assert failed["limit"] == PARAMS["gates"]["size_full_mb"]
+    assert "--size 64x36 --name mine-small" in failed["remedies"][0]
 
 
 def test_counted_instructions_go_before_times_of_a_workstation(demo):
@@ -238,19 +217,8 @@ def test_on_a_busy_machine_the_least_times_are_compared(demo):
     assert any("p95 is 3.0 times" in line for line in judge(demo)["cautions"])
 
 
-def test_the_real_sample_is_too_little_to_be_sure(demo, tmp_path):
-    """As it is here, two of its frames exist and nothing can be judged. Whole, it is one drive that judges itself."""
-    sample = real_episode()
-    copied = tmp_path / sample.name
-    shutil.copytree(sample, copied)
-    with pytest.raises(EpisodeError):
-        split(load_recordings(tmp_path))
-    picture = sorted((sample / "frames").glob("*.jpg"))[0]
-    (copied / "frames").mkdir(exist_ok=True)
-    for k in range(1, 177):
-        shutil.copyfile(picture, copied / f"frames/frame_{k:06d}.jpg")
-    recordings = load_recordings(tmp_path, chunk=8)
-    demo["load"] |= {"recordings": recordings.summary(), "split": split(recordings).episodes}
+def test_one_drive_that_judges_itself_is_too_little_to_be_sure(demo):
+    demo["load"]["split"] = {"calibration": ["a"], "held_out": ["a"]}
     assert "1 episode, which were also used to calibrate: too few" in judge(demo)["cautions"][0]
 
 
@@ -266,13 +234,3 @@ def test_odd_frames_are_named(demo):
         assert part in said
     remedies = " ".join(judged["failed"][0]["remedies"])
     assert "leave out drives" in remedies
-
-
-def test_every_gate_of_the_repository_has_words():
-    names = {row["gate"] for row in check_gates({}, PARAMS["gates"]["original"])}
-    for path in RESULTS.rglob("*.json"):
-        metrics = read_stage(path, None)["metrics"]
-        found = [*metrics.get("gates", []), *metrics.get("recommendation", {}).get("gates", [])]
-        names |= {row["gate"] for row in found if isinstance(row, dict)}
-    assert len(names) > 10 and not [name for name in names if "_" in gate_in_words(name)]
-    assert gate_in_words("policy_static_180x320.onnx simd_g") == "static INT8 180x320.onnx: SIMD instructions, 10^9"

@@ -9,6 +9,7 @@ from policies import memory_samples
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
+from rover_lib.workshop.int8.export import Parity
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -29,8 +30,14 @@ def test_the_recipe_is_what_params_yml_says():
     recipe = Recipe.of(p)
     assert (recipe.samples, recipe.seed) == (p["calibration"]["samples"], p["calibration"]["seed"])
     assert (recipe.scheme.kind, recipe.scheme.smooth) == (p["quantization"]["scheme"], p["quantization"]["smooth"])
-    assert (recipe.parity.tolerance, recipe.parity.vectors) == (p["parity"]["fp32"], p["parity"]["vectors"])
-    assert Recipe.of(p, samples=7).samples == 7
+    assert recipe.scheme.percentile == p["quantization"]["percentile"] and recipe.scheme.mode == "static"
+    assert recipe.parity == Parity(p["parity"]["fp32"], p["parity"]["int8_errors"], p["parity"]["vectors"])
+    assert Recipe.of(p, samples=7).samples == 7 and recipe.observers == tuple(p["quantization"]["observers"])
+    schemes = pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed", float_blocks=("head",)))
+    assert {name: (s.mode, s.kind) for name, s in schemes.items()} == {
+        "dynamic": ("dynamic", "symmetric"), "static": ("static", "symmetric"), "mixed": ("mixed", "symmetric"),
+        "static_affine": ("static", "affine"),
+    }  # fmt: skip
 
 
 @pytest.mark.slow
