@@ -94,7 +94,7 @@ class Stage:
 
         self.world.at(self.world.now_ms + happening.for_ms, back)
 
-    def again_and_again(self, happening: Happening, every_ms: int, what: Callable[[], None]) -> None:
+    def again_and_again(self, happening: Happening, every_ms: int, what: Callable[[], object]) -> None:
         for ms in range(0, happening.for_ms, every_ms):
             self.world.at(self.world.now_ms + ms, what)
 
@@ -119,7 +119,7 @@ class Stage:
         world.at(world.now_ms + 140, let_go)
 
 
-Happen = Callable[[Stage, Happening], None]
+Happen = Callable[[Stage, Happening], object]
 HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
 TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone (rows.py): no random drive has them
 A_WHILE, LONG, ONCE = (20, 2500), (20, 4000), (0, 0)

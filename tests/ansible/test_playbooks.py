@@ -86,17 +86,6 @@ def test_the_defaults_are_those_of_the_specs():
     assert DEFAULTS["rover_while_driving"] == "refuse"
 
 
-def test_each_task_file_has_its_arguments_and_uses_no_others():
-    files = {p.stem: p.read_text() for p in (ROLE / "tasks").glob("*.yml")}
-    own = set(files) - {"bring_home", "episode", "not_driving", "restart"}  # which are parts of others
-    known = {name for s in SPECS.values() for name in s["options"]}
-    assert own == set(SPECS)
-    for name in own:
-        assert set(re.findall(r"\brover_[a-z_]+", files[name])) & known <= set(SPECS[name]["options"]), name
-    used = "".join(p.read_text() for p in [*ROLE.glob("t*/*"), *ANSIBLE.glob("*.yml")])
-    assert known == {name for name in known if re.search(rf"\b{name}\b", used)}
-
-
 PI = {
     "architecture": "aarch64", "os_family": "Debian", "distribution": "Debian", "distribution_version": "12.9",
     "distribution_major_version": "12", "python_version": "3.11.2", "memtotal_mb": 7900,
