@@ -180,24 +180,6 @@ def test_an_episode_comes_home_and_leaves_the_rover_unless_another_would_be_lost
     assert came == [[b"of today"], [b"of yesterday"], [b"of today"]]
 
 
-def test_what_an_earlier_run_left_to_do_is_done_by_the_next_and_once(tmp_path):
-    """A run that is cut off before its handlers leaves a mark."""
-    handlers = [row["name"] for row in yaml.safe_load((ROLE / "handlers" / "main.yml").read_text())]
-    begin = next(t for t in yaml.safe_load((ROLE / "tasks" / "system.yml").read_text()) if "notify" in t)
-    end = yaml.safe_load((ANSIBLE / "provision.yml").read_text())[0]["post_tasks"]
-    tasks = json.loads(json.dumps([begin, begin, *end, begin]).replace("/run/", f"{tmp_path}/"))
-    flush = {"name": "Flush", "ansible.builtin.meta": "flush_handlers"}
-    book = {"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False}
-    book["tasks"] = [task for given in tasks for task in (given, flush)]
-    book["handlers"] = [{"name": name, "ansible.builtin.debug": {"msg": name}} for name in handlers]
-    (tmp_path / "play.yml").write_text(json.dumps([book]).replace('"root"', f'"{Path.home().owner()}"'))
-    found = run("ansible-playbook", "-i", "localhost,", tmp_path / "play.yml", tmp=tmp_path)
-    ran = re.findall(r"^RUNNING HANDLER \[(.*?)\]", found.stdout, re.MULTILINE)
-    later = {"Name the Arduino", "Restart the view"}  # another handler, or view.yml's last task, does that
-    assert sorted(ran) == sorted(set(handlers) - later), found.stdout + found.stderr
-    assert " changed=1 " in found.stdout and (tmp_path / "rover-provisioning").exists(), found.stdout
-
-
 # The units, as they are on a rover
 
 
