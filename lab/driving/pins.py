@@ -142,7 +142,11 @@ def periods_of(car: Car) -> dict[str, int]:
 def row_of(
     fault: Any, verdict: Verdict, code: int | None, line: str | None, recovered: bool, method: str, **more: Any
 ) -> dict[str, Any]:
-    """Return a row of metrics.faults. line: tells of the fault. method: how it was done."""
+    """Return a row of metrics.faults. line: tells of the fault, None if none does. method: how it was done."""
+    if line is None:
+        verdict.wrong.append(f"no line tells of it (wanted: {fault.message})")
+    if not recovered:
+        verdict.wrong.append("the car was not driven again")
     row = {"fault": fault.name, "kind": fault.kind, "expected": fault.expected, **verdict.figures}
     row |= {"recovered": recovered, "log_line": line, "exit_code": code, "injected": method}
     row |= {"attempts": 1, "stalled_ms": 0.0, "wrong": verdict.wrong} | more

@@ -22,7 +22,6 @@ from rover_lib.onboard.car.servo_link import Telemetry, parse
 from rover_lib.workshop.cache import cache_folder, key_of
 
 BOARD = Path(__file__).with_name("board.c")
-LIBRARY = "board.so"
 BYTES_PER_MS = 11.52
 FRAME_MS = 33.3
 WATCHDOG_MS = 60
@@ -51,17 +50,16 @@ def library(human: str = "receiver") -> Path:
 
     human: as in `make -C firmware HUMAN=gamepad`.
     """
-    sources = [BOARD, *sorted(p for p in (FIRMWARE / "rover").iterdir() if p.is_file())]
+    rover = FIRMWARE / "rover"
+    sources = [BOARD, *sorted(p for p in rover.iterdir() if p.is_file())]
     key = key_of({"names": [source.name for source in sources], "human": human}, *sources)
-    return cache_folder("board", key, functools.partial(compile_sketch, FIRMWARE, human=human)) / LIBRARY
 
+    def make(folder: Path) -> None:
+        gamepad = ["-DHUMAN_GAMEPAD"] * (human == "gamepad")
+        compiled = ("-x", "c", BOARD, rover / "protocol.c", rover / "vehicle.c")
+        compile_c(*CC, *gamepad, "-shared", "-fPIC", "-I", rover, "-o", folder / "board.so", *compiled)
 
-def compile_sketch(firmware: Path, folder: Path, human: str = "receiver") -> None:
-    """Compile the sketch to LIBRARY in a folder. firmware: the folder with the sketch's sources."""
-    rover = firmware / "rover"
-    sources = ("-x", "c", BOARD, rover / "protocol.c", rover / "vehicle.c")
-    gamepad = ["-DHUMAN_GAMEPAD"] * (human == "gamepad")
-    compile_c(*CC, *gamepad, "-shared", "-fPIC", "-I", rover, "-o", folder / LIBRARY, *sources)
+    return cache_folder("board", key, make) / "board.so"
 
 
 class Board:

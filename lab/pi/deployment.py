@@ -27,7 +27,7 @@ from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import debian_image
-from lab.pi.emulation import emulation, require
+from lab.pi.emulation import emulation, interruptible, require
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
@@ -52,6 +52,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
     require()
     output.parent.mkdir(parents=True, exist_ok=True)
     with (
+        interruptible(),
         emulation(),
         tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
         output.with_suffix(".log").open("w") as log,

@@ -86,17 +86,6 @@ def test_the_defaults_are_those_of_the_specs():
     assert DEFAULTS["rover_while_driving"] == "refuse"
 
 
-def test_each_task_file_has_its_arguments_and_uses_no_others():
-    files = {p.stem: p.read_text() for p in (ROLE / "tasks").glob("*.yml")}
-    own = set(files) - {"bring_home", "episode", "not_driving", "restart"}  # which are parts of others
-    known = {name for s in SPECS.values() for name in s["options"]}
-    assert own == set(SPECS)
-    for name in own:
-        assert set(re.findall(r"\brover_[a-z_]+", files[name])) & known <= set(SPECS[name]["options"]), name
-    used = "".join(p.read_text() for p in [*ROLE.glob("t*/*"), *ANSIBLE.glob("*.yml")])
-    assert known == {name for name in known if re.search(rf"\b{name}\b", used)}
-
-
 PI = {
     "architecture": "aarch64", "os_family": "Debian", "distribution": "Debian", "distribution_version": "12.9",
     "distribution_major_version": "12", "python_version": "3.11.2", "memtotal_mb": 7900,
@@ -189,24 +178,6 @@ def test_an_episode_comes_home_and_leaves_the_rover_unless_another_would_be_lost
     assert [rover.is_dir() for rover in rovers] == [False, True, False]
     came = [[p.read_bytes() for p in home.parent.rglob("*.jpg")] for home in homes]
     assert came == [[b"of today"], [b"of yesterday"], [b"of today"]]
-
-
-def test_what_an_earlier_run_left_to_do_is_done_by_the_next_and_once(tmp_path):
-    """A run that is cut off before its handlers leaves a mark."""
-    handlers = [row["name"] for row in yaml.safe_load((ROLE / "handlers" / "main.yml").read_text())]
-    begin = next(t for t in yaml.safe_load((ROLE / "tasks" / "system.yml").read_text()) if "notify" in t)
-    end = yaml.safe_load((ANSIBLE / "provision.yml").read_text())[0]["post_tasks"]
-    tasks = json.loads(json.dumps([begin, begin, *end, begin]).replace("/run/", f"{tmp_path}/"))
-    flush = {"name": "Flush", "ansible.builtin.meta": "flush_handlers"}
-    book = {"name": "Test", "hosts": "localhost", "connection": "local", "gather_facts": False}
-    book["tasks"] = [task for given in tasks for task in (given, flush)]
-    book["handlers"] = [{"name": name, "ansible.builtin.debug": {"msg": name}} for name in handlers]
-    (tmp_path / "play.yml").write_text(json.dumps([book]).replace('"root"', f'"{Path.home().owner()}"'))
-    found = run("ansible-playbook", "-i", "localhost,", tmp_path / "play.yml", tmp=tmp_path)
-    ran = re.findall(r"^RUNNING HANDLER \[(.*?)\]", found.stdout, re.MULTILINE)
-    later = {"Name the Arduino", "Restart the view"}  # another handler, or view.yml's last task, does that
-    assert sorted(ran) == sorted(set(handlers) - later), found.stdout + found.stderr
-    assert " changed=1 " in found.stdout and (tmp_path / "rover-provisioning").exists(), found.stdout
 
 
 # The units, as they are on a rover

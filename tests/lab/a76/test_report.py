@@ -59,7 +59,6 @@ def test_gates_of_the_cars_policy_hold():
     ("changed", "failing"),
     [
         ({"instructions_g": 1.47, "tenth_g": 1.47}, "instructions_g"), ({"simd_g": 1.11}, "simd_g"),
-        ({"throttle_mae_pct": 0.211}, "error on the emulated core, times the workstation's"),
         ({"workstation_steering_mae_pct": 0.0}, "error on the emulated core, times the workstation's"),
         ({"frames_on_the_core": 49}, "frames judged on the emulated core"),
         ({"tenth_g": 1.38}, "cost of the tenth plan against the third, %"),

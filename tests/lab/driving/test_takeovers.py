@@ -1,7 +1,6 @@
-"""Who drove, as a recording says it, against the firmware's own pins: in virtual time exactly, and in simavr whole."""
+"""Who drove, as a recording says it, against the firmware's own pins, in virtual time."""
 
 import functools
-import time
 from bisect import bisect_right
 from dataclasses import replace
 
@@ -9,13 +8,10 @@ import needs
 import numpy as np
 import pytest
 
-from balloon_world.simulated_arduino import REST_US
-from lab.driving.on_pins import END_S, PinBench
 from lab.driving.virtual import FRAME_MS, LIVE, LOST, World
 from lab.driving.virtual_host import Process
 from rover_lib.onboard.drive.takeover import LET_GO_S
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-from rover_lib.workshop.recordings.episodes import load_recordings
 
 # ---- in virtual time: the real firmware's state machine, link, loop and plans
 
@@ -128,24 +124,3 @@ def test_every_frame_of_a_mixed_drive_says_who_drove():
                 farthest_ms = max(farthest_ms, min(abs(frame_ms - ms) for ms in changes))
     print(f"{judged} moments judged; who drove is wrong for at most {farthest_ms:.1f} ms beside a change")
     assert judged > 10_000 and farthest_ms <= FRAME_MS
-
-
-# ---- whole: `rover drive --record`, the real firmware in simavr, real time
-
-
-@pytest.mark.emulated
-@pytest.mark.slow
-@needs.simavr
-def test_a_real_drive_records_its_takeover(tmp_path):
-    with PinBench() as bench:
-        bench.start("", "--record", tmp_path)
-        moved_s = time.monotonic()
-        for steering_us in (144, -180, 0):
-            bench.arduino.transmitter(REST_US[0] + steering_us, REST_US[1])
-            bench.wait(0.6)
-        bench.wait(LET_GO_S + 0.5)
-        assert bench.drive.wait(END_S) == 4, bench.drive.last_words()
-        assert not [c for c in bench.cable.commands if c.at_s > moved_s + 0.3]  # nothing to a car that is the human's
-    recordings = load_recordings(tmp_path, chunk=4)
-    drivers = [sample.driver for sample in recordings.samples]
-    assert drivers.count(POLICY) > 10 and drivers.count(HUMAN) > 20
