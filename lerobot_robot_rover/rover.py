@@ -37,7 +37,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 class RoverConfig(RobotConfig):
     """The rover's settings in LeRobot.
 
-    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder, FIFO or .mjpeg of JPEGs. camera_name:
+    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder or a FIFO of JPEGs. camera_name:
     the picture is `observation.images.<camera_name>` in the dataset. width, height: size of the pictures that LeRobot
     gets, in pixels; camera frames are resized to it as they are for a policy (prepare_frame). throttle_limit: in
     [0, 1]; None: that of params.yml. log: file of the flight log; None: where `rover drive` writes it.

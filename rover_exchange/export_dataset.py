@@ -2,17 +2,13 @@
 
     report = export_dataset("episodes", "my_dataset")
 
-A row of that format is a picture, the state before it and the action at it, at a fixed rate; an episode has no holes.
-What our reader repairs (readings that came in a burst, single lost pulses) is therefore repaired in the dataset. Where
-a frame must be left out (a damaged picture, a hole in time, no measured pulse), the episode ends and another begins.
-The report counts each of these, and stays in the dataset's folder. Read back, the dataset gives the samples of the
-recordings.
+A row of that format is a picture, the state before it and the action at it, at a fixed rate. What our reader repairs is
+repaired in the dataset. Where a frame must be left out (a damaged picture, a hole in time, no measured pulse, nobody
+who drove), the episode ends and another begins. The report counts each of these, and stays in the dataset's folder.
 
 If a policy drove in one of the recordings, each frame says in `intervention` whether a human had taken over from it, as
-`lerobot-rollout` writes it when it collects corrections. A demonstration is no intervention. Frames at which nobody
-drove are left out like a hole: the car did not do what the pulses beside its picture say, and whoever trains on a
-LeRobotDataset trains on all of it. If every recording was labelled, the last frame of each episode says how its drive
-ended, in LeRobot's `next.success`, `next.reward` and `next.done`.
+`lerobot-rollout` writes it. If every recording was labelled, the last frame of each episode says how its drive ended,
+in LeRobot's `next.success`, `next.reward` and `next.done`.
 """
 
 import json
@@ -74,15 +70,13 @@ def export_dataset(
 ) -> dict[str, Any]:
     """Write all usable samples to `out`, a new folder, and return what was written and left out.
 
-    episodes: the recordings, or the folder that has them.
+    episodes: the recordings, or the folder that has them. video: True writes AV1, LeRobot's default, which is far
+    smaller but loses detail; False writes PNG inside parquet, which loses nothing. size: (height, width) to which the
+    pictures are resized, as a rover resizes what its camera gives; None keeps the recorded size. The folder appears
+    only when it is complete.
 
-    video: True writes AV1, LeRobot's default, which is far smaller but loses detail; False writes PNG inside parquet,
-    which loses nothing. size: (height, width) to which the pictures are resized, as a rover resizes what its camera
-    gives; None keeps the recorded size. The folder appears only when it is complete.
-
-    Raises EpisodeError for recordings that cannot be used, that are of several cars or rates or, without `size`, have
-    several picture sizes, for a size that no artifact takes, and if `out` exists; RoverError while another process
-    makes `out`.
+    Raises EpisodeError for recordings that cannot be used, that are of several cars, rates or (without `size`) picture
+    sizes, for a size that no artifact takes, and if `out` exists; RoverError while another process makes `out`.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -117,12 +111,9 @@ def usual_rate_hz(recordings: Recordings) -> int:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
     usual_hz = float(np.median(list(rates.values())))
     if odd := {name: found for name, found in rates.items() if is_another_rate(found, usual_hz)}:
-        name, found_hz = next(iter(odd.items()))
-        raise EpisodeError(
-            f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate",
-            found=f"{found_hz:.1f} in {name}",
-            remedy="export those of each rate by themselves",
-        )
+        what = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
+        name, rate_hz = next(iter(odd.items()))
+        raise EpisodeError(what, found=f"{rate_hz:.1f} in {name}", remedy="export those of each rate by themselves")
     return max(round(usual_hz), 1)
 
 
@@ -149,11 +140,8 @@ def _parts(
             left_out["pictures_not_whole"] += 1
             continue
         if size is None and frame.shape != recorded:
-            raise EpisodeError(
-                f"{sample.frame_path}: a picture of {frame.shape[1]}x{frame.shape[0]} among those of "
-                f"{recorded[1]}x{recorded[0]}",
-                remedy="export the episodes of each size by themselves, or all at one: --size",
-            )
+            sizes = f"{frame.shape[1]}x{frame.shape[0]} among those of {recorded[1]}x{recorded[0]}"
+            raise EpisodeError(f"{sample.frame_path}: a picture of {sizes}", remedy="export all at one --size")
         rows.append((sample, prepare_frame(frame, *(size or recorded[:2]))))
     yield rows
 

@@ -100,11 +100,8 @@ def _in_order(records: Iterable[_Record], throttle: str | None, tub: Path, fault
     ordered = [by_index[index] for index in sorted(by_index)]
     negative, moving = sum(r.throttle < 0 for r in ordered), sum(r.throttle != 0 for r in ordered)
     if throttle is None and 4 * negative > 3 * moving:
-        raise EpisodeError(
-            f"{tub}: most throttles are negative",
-            found=f"{negative} of {moving}",
-            remedy="--throttle negated if its car drives forward by them, --throttle as-recorded if it drove backwards",
-        )
+        remedy = "--throttle negated if its car drives forward by them, --throttle as-recorded if it drove backwards"
+        raise EpisodeError(f"{tub}: most throttles are negative", found=f"{negative} of {moving}", remedy=remedy)
     return [replace(r, throttle=-r.throttle) for r in ordered] if throttle == "negated" else ordered
 
 

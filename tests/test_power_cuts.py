@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -61,10 +61,19 @@ def disk(tmp_path):
 
 
 @contextmanager
-def after_a_power_cut(disk):
-    """Yield the folder of the file system as a power cut now would leave it, once it is mounted again."""
-    copy = disk.with_name("copy")
-    subprocess.run(["cp", "--sparse=always", disk.with_name("disk"), copy], check=True)
+def after_a_power_cut(disk, child):
+    """Yield the folder of the file system as a power cut now would leave it, once it is mounted again.
+
+    Meanwhile the child stands still: else a block of the copy would be older than another.
+    """
+    image, copy = disk.with_name("disk"), disk.with_name("copy")
+    os.killpg(child, signal.SIGSTOP)
+    for _ in range(10):  # until nothing else writes meanwhile either
+        written_ns = image.stat().st_mtime_ns
+        subprocess.run(["cp", "--sparse=always", image, copy], check=True)
+        if image.stat().st_mtime_ns == written_ns:
+            break
+    os.killpg(child, signal.SIGCONT)
     with mounted(copy) as folder:
         yield folder
 
@@ -72,9 +81,12 @@ def after_a_power_cut(disk):
 def start(work, *args):
     """Do the work in a fork, and return its process id."""
     if child := os.fork():
+        with suppress(PermissionError):
+            os.setpgid(child, child)
         return child
     code = 1
     try:
+        os.setpgid(0, 0)
         quiet = os.open(os.devnull, os.O_WRONLY)
         os.dup2(quiet, 1), os.dup2(quiet, 2)
         training.SAVING_SHARE = 1e9  # save after each step
@@ -143,7 +155,7 @@ def cut_a_recording(disk, count, logged):
         for _ in range(count):
             time.sleep(rng.uniform(0.0, 0.3))
             cut_s = time.time()
-            with after_a_power_cut(disk) as folder:
+            with after_a_power_cut(disk, child) as folder:
                 check_kept(folder, cut_s)
     except (AssertionError, EpisodeError, FileNotFoundError):
         if (longest_s := max(map(float, durations.read_text().split()), default=0)) > SLOW_DISK_S:
@@ -238,7 +250,7 @@ def test_what_a_power_cut_leaves_is_whole_or_not_there(inputs, disk, work, monke
         while not ended(child):
             time.sleep(rng.uniform(0, min(2 * whole_s / 30, 3)))
             cuts += 1
-            with after_a_power_cut(disk) as copy:
+            with after_a_power_cut(disk, child) as copy:
                 found.append(content_of(copy / name))
                 if work is finish:
                     there = {path.name.removeprefix(".").removesuffix(".part") for path in (copy / name).glob("*e*")}

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 from lab.arduino import emulator as arduino
 from rover_lib.onboard.car import car
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
 REPOSITORY = arduino.REPOSITORY
 symbol = arduino.symbol
@@ -94,7 +95,6 @@ FIELDS = [
 def status_of(body: str) -> SimpleNamespace:
     kind, *values = body.split(" ")
     assert kind == "<S"
-    assert len(values) == len(FIELDS)
     return SimpleNamespace(**{k: int(v) if v.isdigit() else v for k, v in zip(FIELDS, values, strict=True)})
 
 
@@ -133,12 +133,7 @@ class Uno:
         assert state == 0, f"the firmware stopped: simavr's state {state}"
         buffer, new = (_Event * 512)(), []
         while n := self._c.uno_events(self._uno, buffer, 512):
-            new += [
-                SimpleNamespace(
-                    kind=e.kind, channel=e.channel, at_us=e.at_us, pulse_us=e.pulse_us, period_us=e.period_us
-                )
-                for e in buffer[:n]
-            ]
+            new += [SimpleNamespace(**{name: getattr(e, name) for name, _ in _Event._fields_}) for e in buffer[:n]]
         self.events += new
         text = ctypes.create_string_buffer(4096)
         while n := self._c.uno_read(self._uno, text, len(text)):
@@ -229,3 +224,25 @@ def pulses(events: list[SimpleNamespace], pin: str, after_us: float = 0) -> list
 
 def widths(events: list[SimpleNamespace], pin: str, after_us: float = 0) -> set[float]:
     return {e.pulse_us for e in pulses(events, pin, after_us)}
+
+
+EDGE_US = 0.3  # an instruction of simavr takes up to four cycles of 0.0625 us
+STEP_US = ARDUINO_STEP_US + EDGE_US
+ANSWER_MS = 25  # a command takes up to 4 ms on the wire, a status 7, and may wait for one that is under way
+
+
+def arm(board: Uno) -> None:
+    board.wiggle()
+    board.command("A")
+    board.run_ms(ANSWER_MS)
+    assert (board.status.state, board.status.reason, board.status.result) == ("A", "a", "k"), board.lines[-3:]
+
+
+def on_pins(
+    events: list, steering_us: float, throttle_us: float, after_us: float = 0, within_us: float = EDGE_US
+) -> None:
+    """Check that there are pulses of both pins, and that all are these."""
+    for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
+        measured = widths(events, pin, after_us)
+        assert measured, f"no {pin} pulses"
+        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"

@@ -116,12 +116,12 @@ static bool human_gives_throttle(const struct vehicle *vehicle) {
     return vehicle->state == MANUAL && vehicle->throttle_free && vehicle->throttle_off_rest;
 }
 
-/* What the pins get of the human's pulse. A gamepad's comes from the host too, and gets no more throttle than that does. */
-static uint16_t passed_us(const struct vehicle *vehicle, enum channel channel) {
-    uint16_t pulse_us = vehicle->received[channel].pulse_us;
+/* What the pins get of the human's throttle. A gamepad's comes from the host too, and gets no more than that does. */
+static uint16_t passed_us(const struct vehicle *vehicle) {
+    uint16_t pulse_us = vehicle->received[THROTTLE].pulse_us;
 #ifdef HUMAN_GAMEPAD
-    const struct servo *servo = &vehicle->car.servos[channel];
-    if (channel == THROTTLE) pulse_us = towards(servo->neutral_us, pulse_us, vehicle->cap_us);
+    const struct servo *servo = &vehicle->car.servos[THROTTLE];
+    pulse_us = towards(servo->neutral_us, pulse_us, vehicle->cap_us);
     if (pulse_us < servo->min_us) return servo->min_us;
     if (pulse_us > servo->max_us) return servo->max_us;
 #endif
@@ -365,8 +365,8 @@ void vehicle_tick(struct vehicle *vehicle, uint32_t now_ms) {
         vehicle->steering_us = towards(vehicle->steering_us, wanted_us[STEERING], ms * STEERING_SLEW_US_PER_MS);
         vehicle->throttle_us = towards(vehicle->throttle_us, wanted_us[THROTTLE], ms * THROTTLE_SLEW_US_PER_MS);
     } else if (vehicle->state == MANUAL && has_signal(vehicle)) {
-        vehicle->steering_us = passed_us(vehicle, STEERING);
-        vehicle->throttle_us = vehicle->throttle_free ? passed_us(vehicle, THROTTLE) : neutral_us(vehicle, THROTTLE);
+        vehicle->steering_us = vehicle->received[STEERING].pulse_us;
+        vehicle->throttle_us = vehicle->throttle_free ? passed_us(vehicle) : neutral_us(vehicle, THROTTLE);
     } else {
         vehicle->steering_us = neutral_us(vehicle, STEERING);
         vehicle->throttle_us = neutral_us(vehicle, THROTTLE);
@@ -408,7 +408,7 @@ uint8_t vehicle_status(const struct vehicle *vehicle, uint32_t now_ms, struct li
     for (uint8_t channel = STEERING; channel <= THROTTLE; channel++) {
         const struct received *received = &vehicle->received[channel];
         if (received->present) {
-            line_number(line, passed_us(vehicle, (enum channel)channel));
+            line_number(line, channel == THROTTLE ? passed_us(vehicle) : received->pulse_us);
             line_number(line, received->period_us);
         } else {
             line_text(line, "-");

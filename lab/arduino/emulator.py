@@ -60,9 +60,8 @@ def missing_packages() -> list[str]:
 def build(human: str = "receiver") -> Built:
     """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
 
-    human: as in `make -C firmware HUMAN=gamepad`.
-
-    Raises RoverError if Debian packages or the repository's sources are missing, or if the compiler fails.
+    human: as in `make -C firmware HUMAN=gamepad`. Raises RoverError if Debian packages or the repository's sources are
+    missing, or if the compiler fails.
     """
     if missing := " ".join(missing_packages()):
         raise RoverError(
@@ -77,9 +76,8 @@ def build(human: str = "receiver") -> Built:
         compile_c("make", "-C", FIRMWARE, f"HUMAN={human}", f"BUILD={folder}/firmware")
         compile_c(*CC, "-DPROGRAM", "-o", folder / "arduino", *WITH_SIMAVR)
 
-    folder = cache_folder(
-        "arduino", key_of({"names": [source.name for source in sources], "human": human}, *sources), make
-    )
+    key = key_of({"names": [source.name for source in sources], "human": human}, *sources)
+    folder = cache_folder("arduino", key, make)
     return Built(folder / "firmware" / "rover.elf", folder / "arduino")
 
 
@@ -89,11 +87,10 @@ def compile_c(*command: object) -> None:
 
 
 @functools.cache
-def symbol(name: str, human: str = "receiver") -> int:
-    """Return the address of one of the firmware's functions in flash memory. human: as for build()."""
-    firmware = build(human).firmware
-    table = run("avr-nm", firmware, error=RoverError)
-    line = re.search(rf"^([0-9a-f]+) \w {name}$", table, re.M)
+def symbol(name: str) -> int:
+    """Return the address of one of the firmware's functions in flash memory."""
+    firmware = build().firmware
+    line = re.search(rf"^([0-9a-f]+) \w {name}$", run("avr-nm", firmware, error=RoverError), re.M)
     if not line:
         raise RoverError(f"{firmware}: the firmware has no function {name}")
     return int(line[1], 16)
@@ -105,11 +102,7 @@ def eeprom_of(car: Car, version: int = 1) -> bytes:
 
 
 def _set_nice(pid: int, nice: int) -> None:
-    """Set the priority of a process that leads a session, as far as this user may.
-
-    If autogroups are on, Linux shares the processors among sessions first, and then among the processes of each. So
-    both priorities are set; see sched(7).
-    """
+    """Set the priority of a process that leads a session, and that of its session (sched(7)), as far as one may."""
     with contextlib.suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, pid, nice)
     with contextlib.suppress(OSError):
@@ -129,30 +122,24 @@ class EmulatedArduino:
         every_pulse: bool = True,
         transmitter: tuple[float, float] = (0.0, 0.0),
         ready: bool = False,
-        boot_s: float = BOOT_S,
         nice: int = 0,
-        eeprom: bytes | None = None,
-        human: str = "receiver",
     ):
         """Start the process.
 
         every_pulse: whether pulses() returns each pulse, about a thousand a second, or only those that differ from the
-        one before. transmitter: its pulses from the start on, see transmitter(); their periods are this_car()'s. ready:
-        see ready(). nice: scheduling priority; NICE comes close to a processor of its own. Below 0 it works only for
-        root, and is silently left out for others.
-        human: as for build().
+        one before. transmitter: its pulses from the start on; their periods are this_car()'s. ready: see ready(). nice:
+        scheduling priority; NICE comes close to a processor of its own, and is left out for others than root.
         Raises RoverError as build() does, and if the program does not start.
         """
-        built, self._human = build(human), human
+        built = build()
         # The program makes this link, and removes it even if the present process was killed.
         self.port = str(Path(tempfile.gettempdir()) / f"rover-arduino-{secrets.token_hex(8)}")
         self._reading = threading.Lock()
         self._rest = b""
         options = ["--link", self.port, "--log", "all" if every_pulse else "changes", "--reset-on-open"]
-        options += ["--boot-ms", f"{boot_s * 1000:.0f}"]
-        numbers = this_car().numbers
-        options += ["--periods", str(numbers[0]), str(numbers[4])]
-        options += ["--eeprom", (eeprom_of(this_car()) if eeprom is None else eeprom).hex()]
+        car = this_car()
+        options += ["--boot-ms", f"{BOOT_S * 1000:.0f}", "--periods", str(car.numbers[0]), str(car.numbers[4])]
+        options += ["--eeprom", eeprom_of(car).hex()]
         self._process = Child(
             "the emulated Arduino", built.program, built.firmware, *options, error=RoverError, talks=True
         )
@@ -205,7 +192,7 @@ class EmulatedArduino:
 
     def hang(self) -> None:
         """Make the firmware's loop() an endless loop until the next reset."""
-        self._process.send_line(f"hang {symbol('loop', self._human):x}")
+        self._process.send_line(f"hang {symbol('loop'):x}")
 
     def pulses(self) -> list[PinEvent]:
         """Return what happened since the last call, ordered by when it ended.

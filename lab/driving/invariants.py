@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, Asked, Seen
+from lab.driving.virtual import HELD, LIVE, LOST, Asked, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -31,6 +31,7 @@ BLIND_MS = 250  # how long the car may drive by pictures that show nothing new
 SPARE_MS = 250  # a line's way, and turns of the loops
 GESTURE_MS, SIDES_MS, LET_GO_MS = 30_000, 3000, 1000
 SIDE_US, LET_GO_US = 200, 100 + 24
+UNSEEN_MS = 350  # what a gamepad does is relayed and heard sooner, if its human is heard at all
 GLIMPSE_MS = 30  # a stick that is back sooner may not have been seen, if few pulses come
 NEUTRAL_US = {"steering": 1456, "throttle": 120}
 STOP_MS = 250  # from what ends a drive to throttle off; if lines are lost, the firmware's time limit
@@ -103,10 +104,9 @@ def _first(bad: np.ndarray) -> int | None:
 def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
-    for check in (
-        *(_asked_for, _capped, _slewed, _not_blind, _human_wins, _human_keeps, _armed_by_people, _told),
-        *(_ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends, _answered, _in_time),
-    ):
+    checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
+    with_pad, with_receiver = (_armed_at_rest,), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
+    for check in (*(with_pad if seen.gamepad else with_receiver), *checks, _answered, _in_time):
         if (what := check(run)) is not None:
             yield f"{check.__name__[1:]}: {what}"
 
@@ -223,6 +223,17 @@ def _armed_by_people(run: Run) -> str | None:
         if _for_ms(held, GLIMPSE_MS).any() or not any(ms <= SIDES_MS + 60 for ms in _gaps(*sides)):
             return f"armed at {armed} ms without a gesture since {since} ms (they were at {run.seen.wiggled})"
         used = armed
+    return None
+
+
+def _armed_at_rest(run: Run) -> str | None:
+    """A gamepad whose throttle is off rest, or whose L1 is up, arms nothing: what was never seen is not at rest."""
+    off_rest = np.abs(run.stick["throttle"] - NEUTRAL_US["throttle"]) > DEAD_BAND_US["throttle"]
+    let_go = _each_ms(run.seen.hands, len(off_rest), lambda hand: hand.receiver == LOST) == 1
+    for what, holds in (("off rest", off_rest), ("without L1", let_go)):
+        for armed in run.armed:
+            if _for_ms(holds, UNSEEN_MS)[armed]:
+                return f"armed at {armed} ms with a gamepad's throttle {what}"
     return None
 
 

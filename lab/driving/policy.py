@@ -47,7 +47,7 @@ def make_artifact(path: Path, *, camera: str = "front", size: tuple[int, int] = 
         "parity": {"tolerance": dict.fromkeys(names, 1e-6), "reason": "constant"},
         "versions": {"torch": torch.__version__, "rover_lib": ""},
     }
-    seen = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
+    seen: dict[str, np.ndarray] = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
     graph = torch.jit.trace(Constant().eval(), (torch.zeros(1, 2), torch.zeros((*size, 3), dtype=torch.uint8)))
     save_artifact(path, torch.jit.freeze(graph), manifest, seen | {"chunk": np.full((1, CHUNK, 2), PLAN, np.float32)})
 

@@ -16,12 +16,13 @@ from typing import Any
 
 import yaml
 
-from lab.driving.virtual import HELD, LIVE, LOST, PRESET, Killed, Seen, World
+from lab.driving.virtual import DROPPING, GONE, HELD, LIVE, LOST, PRESET, SILENT, Killed, Seen, World
 from lab.driving.virtual_host import PLAN, Process
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import frame
 
 WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 1500, 2100, 4800, 5400
+GAMEPAD_MS = 2000  # how much later with a gamepad the gesture is, the request and the stop
 LONGER_MS = 32_000  # of a drive that takes longer than a gesture and a request last
 
 
@@ -42,7 +43,8 @@ class Story:
     wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
     asks it to arm the car. limited, heartbeat: see Process. terminal: whether the drive waits for the gesture.
     longer_ms: how much later it is stopped, and if `late`, begun. clock_ms: the Arduino's clock when it is switched on.
-    steady: whether the policy always goes, instead of going and braking in turn.
+    steady: whether the policy always goes, instead of going and braking in turn. gamepad: whether the human has one,
+    which counts only while a link is open, so that the gesture and the request come later.
     """
 
     happenings: tuple[Happening, ...] = ()
@@ -55,6 +57,7 @@ class Story:
     longer_ms: int = 0
     late: bool = False
     steady: bool = False
+    gamepad: bool = False
 
 
 # ---- what may happen
@@ -91,7 +94,7 @@ class Stage:
 
         self.world.at(self.world.now_ms + happening.for_ms, back)
 
-    def again_and_again(self, happening: Happening, every_ms: int, what: Callable[[], None]) -> None:
+    def again_and_again(self, happening: Happening, every_ms: int, what: Callable[[], object]) -> None:
         for ms in range(0, happening.for_ms, every_ms):
             self.world.at(self.world.now_ms + ms, what)
 
@@ -116,7 +119,7 @@ class Stage:
         world.at(world.now_ms + 140, let_go)
 
 
-Happen = Callable[[Stage, Happening], None]
+Happen = Callable[[Stage, Happening], object]
 HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
 TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone (rows.py): no random drive has them
 A_WHILE, LONG, ONCE = (20, 2500), (20, 4000), (0, 0)
@@ -267,6 +270,8 @@ def _pull(stage: Stage, h: Happening) -> None:
     stage.during(h, hand, sticks=[hand.sticks[0], stage.world.throttle_us(h.amount)])
 
 
+for _fault in (GONE, SILENT, DROPPING):
+    _may(f"the gamepad: {_fault}", for_ms=A_WHILE)(during("hand", pad=_fault))
 _may("the human wiggles the stick")(lambda stage, h: stage.wiggle())
 _may("the process is stopped", for_ms=A_WHILE)(lambda stage, h: stage.world.pause(h.for_ms))
 _may("the machine is suspended", for_ms=(200, 40_000))(lambda stage, h: stage.world.suspend(h.for_ms))
@@ -357,10 +362,9 @@ def random_story(seed: int) -> Story:
     path = rng.choice(["service", "service", "terminal", "at once"])
     limits = rng.random() < 0.2, rng.random() < 0.2
     clock_ms = rng.choice([0, 2**32 - 2000])
-    return Story(
-        *(in_order, rng.random() < 0.8, path == "service", clock_ms, path == "terminal", *limits),
-        *(longer_ms, bool(longer_ms) and rng.random() < 0.5),
-    )
+    wiggled, late, gamepad = rng.random() < 0.8, bool(longer_ms) and rng.random() < 0.5, rng.random() < 0.2
+    terminal = path == "terminal" or (gamepad and path == "at once")
+    return Story(in_order, wiggled, path == "service", clock_ms, terminal, *limits, longer_ms, late, gamepad=gamepad)
 
 
 def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
@@ -375,22 +379,23 @@ def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
 
 def drive_story(story: Story, car: Car | None = None) -> Seen:
     """Drive a story, in some hundredths of a second, and return what was seen. Raises RoverError without gcc."""
-    stage = Stage(story.clock_ms, car)
+    stage = Stage(story.clock_ms, Car(human="gamepad") if story.gamepad else car)
     world = stage.world
     world.mind.throttle = PLAN[1] if story.steady else None
+    later_ms = story.longer_ms * story.late
+    pad_ms = GAMEPAD_MS * story.gamepad
     if story.wiggled:
-        world.at(WIGGLE_MS, stage.wiggle)
+        world.at(WIGGLE_MS + (later_ms + pad_ms if story.gamepad else 0), stage.wiggle)
     for h in story.happenings:
         happen = TOLD[h.what] if h.what in TOLD else HAPPENINGS[h.what][0]
         world.at(h.at_ms, partial(happen, stage, h))
-    stop_ms = STOP_MS + story.longer_ms
-    later_ms = story.longer_ms * story.late
+    stop_ms = STOP_MS + story.longer_ms + pad_ms
     start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (stop_ms, "stop")))
     world.at(START_MS + later_ms, lambda: _start(stage, start))
     world.at(stop_ms, lambda: _stop(stage, stop))
     if story.service:
-        world.at(ASK_MS + later_ms, lambda: _start(stage, start))
-    while world.now_ms < END_MS + story.longer_ms:
+        world.at(ASK_MS + later_ms + pad_ms, lambda: _start(stage, start))
+    while world.now_ms < stop_ms + END_MS - STOP_MS:
         world.advance(world.now_ms + 1)
         if stage.start_due and world.now_ms < stop_ms:
             stage.start_due = False

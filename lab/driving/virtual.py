@@ -30,7 +30,7 @@ BOOT_MS = 300  # how long the boot loader runs
 LATENCY_MS = 90  # how long a plan takes
 STEERING, THROTTLE = range(2)
 LIVE, LOST, HELD, PRESET = "live", "lost", "held", "preset"  # what the receiver sends
-GONE, SILENT, STUCK = "pulled out", "out of reach", "its L1 held since before"  # faults of a gamepad
+GONE, SILENT, STUCK, DROPPING = "pulled out", "out of reach", "its L1 held since before", "its events dropped"
 
 
 class Event(ctypes.Structure):
@@ -134,7 +134,7 @@ class Hand:
     sticks: list[int]  # as pulses: steering, throttle; us
     sent: list[int]  # pulses of a receiver that holds or sends presets
     receiver: str = LIVE
-    pad: str = ""  # GONE, SILENT or STUCK
+    pad: str = ""  # a gamepad's fault: GONE, SILENT, STUCK or DROPPING
     throttle_wire: bool = True
     steering_wire: bool = True
     one_in: int = 1
@@ -201,6 +201,7 @@ class Planned(NamedTuple):
 class Seen:
     """What really happened, for the invariants. All times are in milliseconds; what lasts is noted when it begins."""
 
+    gamepad: bool  # whether the human has one
     pins: list[tuple[int, Event | None]] = field(default_factory=list)  # with the board's reasons; None: they float
     hands: list[tuple[int, Hand]] = field(default_factory=list)  # what human and receiver do
     commands: list[Asked] = field(default_factory=list)
@@ -208,7 +209,6 @@ class Seen:
     wiggled: list[int] = field(default_factory=list)  # when a gesture was complete
     starts: list[int] = field(default_factory=list)  # of the sketch
     hung: list[tuple[int, int]] = field(default_factory=list)  # from when to when the sketch's loop hung
-    phases: list[tuple[int, str]] = field(default_factory=list)  # what the host is doing
     drives: list[tuple[int, int, str | None]] = field(default_factory=list)  # begin, end, last sentence; None: killed
     errors: list[tuple[int, BaseException | None]] = field(default_factory=list)  # that ended a process; None: as asked
     log: list[tuple[int, str]] = field(default_factory=list)  # the flight log's events
@@ -236,7 +236,7 @@ class World:
         self.now_ms = 0
         self.wall_step_s = 0.0
         self.rng = random.Random(0)
-        self.seen = Seen()
+        self.seen = Seen(self.car.human == "gamepad")
         self.hand = Hand(list(self.rest_us), list(self.rest_us))
         self.lens, self.mind = Lens(), Mind()
         self.board: Board | None = None
@@ -251,7 +251,7 @@ class World:
         self.written: list[bytes] = []
         self._unread: list[bytes] = []
         self._boot = 0
-        self._due: list[tuple[int, int, Callable[[], None]]] = []
+        self._due: list[tuple[int, int, Callable[[], object]]] = []
         self._count = 0
         self._started_ms = self._hung_ms = 0
         self.view_stop = self.operator_gone = False
@@ -274,7 +274,7 @@ class World:
         """Return the time in seconds, in place of host.boottime()."""
         return self.now_ms / 1e3
 
-    def at(self, at_ms: int, what: Callable[[], None]) -> None:
+    def at(self, at_ms: int, what: Callable[[], object]) -> None:
         """Do something at a time; it must not let time pass itself."""
         self._count += 1
         heapq.heappush(self._due, (max(at_ms, self.now_ms), self._count, what))
@@ -300,10 +300,6 @@ class World:
         if self.failing:
             error, self.failing = self.failing, None
             raise error
-
-    def phase(self, name: str) -> None:
-        """Note what the host is doing from now on."""
-        self.seen.phases.append((self.now_ms, name))
 
     def suspend(self, ms: int) -> None:
         """Suspend the host's machine for a while."""

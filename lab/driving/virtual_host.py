@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lab.driving.virtual import FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
+from lab.driving.virtual import DROPPING, FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
 from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
@@ -64,7 +64,10 @@ class _Waiting:
 
 
 class VirtualPad(gamepad.Gamepad):
-    """The real Gamepad, which reads what the world's hand does from two pipes."""
+    """The real Gamepad, which reads what the world's hand does from two pipes.
+
+    As from the kernel, only changes come as events, and none of the time before it was opened.
+    """
 
     FULL = 32767
 
@@ -74,7 +77,8 @@ class VirtualPad(gamepad.Gamepad):
         for end in (pad, motion):
             os.set_blocking(end, False)
         super().__init__("virtual", pad, motion, read=self._where)
-        self._known: tuple[bool, list[int]] | None = None  # what its events have told
+        self._known: tuple[bool, list[int]] = False, list(world.hand.sticks)  # what its events need not tell
+        self._dropped = False
 
     def close(self) -> None:
         super().close()
@@ -85,13 +89,10 @@ class VirtualPad(gamepad.Gamepad):
         if hand.pad == GONE:
             self._pull_out()
         elif hand.pad == SILENT:
-            self._known = None
+            self._known = False, []
         elif self._to_pad >= 0:
             self._send(self._to_motion, gamepad.ABS, 0, self._world.now_ms)
-            known = hand.receiver != LOST, list(hand.sticks)
-            if known != self._known:
-                self._tell(known[0])
-                self._known = known
+            self._tell(hand.receiver != LOST, list(hand.sticks))
         return super().sticks(self._world.clock())
 
     def _where(self, fd: int, axis: int) -> tuple[int, int, int]:
@@ -101,12 +102,22 @@ class VirtualPad(gamepad.Gamepad):
         way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
         return round(math.copysign(way, x) * self.FULL), -self.FULL, self.FULL
 
-    def _tell(self, held: bool) -> None:
-        for axis in gamepad.AXES:
-            self._send(self._to_pad, gamepad.ABS, axis, self._where(-1, axis)[0])
-        if not self._known or self._known[0] != held:
+    def _tell(self, held: bool, sticks_us: list[int]) -> None:
+        if self._world.hand.pad == DROPPING:
+            self._dropped = True
+            return
+        was_held, before_us = self._known
+        if self._dropped:  # what the kernel's full buffer leaves of it: nobody knows how old it is
+            self._send(self._to_pad, gamepad.SYN, gamepad.DROPPED, 0)
+        for i, axis in enumerate(gamepad.AXES):
+            if sticks_us[i : i + 1] != before_us[i : i + 1] and not self._dropped:
+                self._send(self._to_pad, gamepad.ABS, axis, self._where(-1, axis)[0])
+        if was_held != held:
             age_s = 1.0 if self._world.hand.pad == STUCK else 0.0
             self._send(self._to_pad, gamepad.KEY, gamepad.BTN_L1, int(held), age_s)
+        if self._dropped:
+            self._send(self._to_pad, gamepad.SYN, 0, 0)
+        self._known, self._dropped = (held, sticks_us), False
 
     def _send(self, end: int, kind: int, code: int, value: int, age_s: float = 0.0) -> None:
         at_s = self._world.clock() - age_s
@@ -185,7 +196,7 @@ class Eyes:
 
     def __init__(self, world: World):
         self._world = world
-        self.camera = Camera("the virtual camera", clock=world.clock, wall_clock=functools.partial(wall_clock, world))
+        self.camera = Camera("the virtual camera", clock=world.clock)
         condition: Any = _Waiting(world)
         self.camera._changed = condition
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
@@ -380,20 +391,12 @@ class _Session(Session):
 
         return of_the_drive
 
-    def _arm(self, arming: Arming, stop: threading.Event, said: str) -> Telemetry | None:
-        self.process.world.phase("disarmed")
-        return super()._arm(arming, stop, said)
-
     def attempt(self, arming: Arming) -> Telemetry | None:
-        world = self.process.world
-        world.phase("arming")
         try:
             telemetry = super().attempt(arming)
         except RoverError as error:
-            world.phase("disarmed")
             self.log.event(f"not armed: {error}")
             raise
-        world.phase("driving")
         self.process.armed()
         return telemetry
 
@@ -478,7 +481,6 @@ class Process:
             error = raised
         finally:
             world.seen.errors.append((world.now_ms, error))
-            world.phase("off")
             world.paused_until_ms = world.now_ms
             world.failing = None
             self.eyes.close()
@@ -488,7 +490,6 @@ class Process:
     def _told(self) -> Iterator[None]:
         """Note a drive's begin, end and closing sentence."""
         world, begin_ms = self.world, self.world.now_ms
-        world.phase("opening")
         try:
             yield
         except Exception as error:

@@ -34,18 +34,15 @@ def write_kit(
     """Write the kit of a run to the new folder `out`.
 
     loaded: what the run was made of. run_dir: the run's folder, with its artifacts. samples: how many frames the
-    calibration set has. Raises ArtifactError if `out` exists or too few frames were recorded, and
-    ArtifactError without the run's artifacts. After an error nothing of the kit is left.
+    calibration set has. Raises ArtifactError if `out` exists, too few frames were recorded or an artifact is missing.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
         raise ArtifactError(f"{out}: exists already", remedy="give a folder that does not")
     chosen, _ = Recipe.of(params(), samples).choose(loaded.parts.calibration)
     if len(chosen) < samples:
-        raise ArtifactError(
-            f"a calibration set of {samples} frames is wanted, {len(chosen)} are usable for it",
-            remedy="record more; or say --samples, and expect more of an error",
-        )
+        what = f"a calibration set of {samples} frames is wanted, {len(chosen)} are usable for it"
+        raise ArtifactError(what, remedy="record more; or say --samples, and expect more of an error")
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
     front, rest = networks(policy)
     with build_folder(out) as folder:

@@ -82,8 +82,10 @@ drive_options = with_options(  # on the rover and in the balloon world
         type=Output(appended=True),
         help="Write a summary of the drive to this file; - prints it.",
     ),
-    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder, FIFO or .mjpeg."),
-    click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
+    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
+    click.option(
+        "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
+    ),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
 

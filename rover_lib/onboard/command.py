@@ -17,7 +17,7 @@ MOST_THREADS = 256  # torch takes any number, and the process crashes where the 
 LONG_LIST = 12  # longer lists are for programs, and not printed for people
 # Options that several commands share:
 CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder, FIFO or .mjpeg."
+    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder or FIFO."
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")

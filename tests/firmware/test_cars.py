@@ -46,18 +46,14 @@ def away_ms(board, pins):
     return away[-1] + 1 if away else 0
 
 
-def test_each_action_is_its_cars_pulse(armed):
+def test_each_action_is_its_cars_pulse_up_to_the_cap_on_either_side(armed):
     car = armed.car
     for steering, throttle in ((1, 0.06), (-1, 0.0), (0.5, car.cap), (0, -0.1 if car.reverses else 0.0)):
         wanted = car.pwm.pulses(steering, throttle)
         assert armed.drive(wanted.steering_us, wanted.throttle_us, 400)[-1] == (wanted.steering_us, wanted.throttle_us)
-
-
-def test_the_cap_is_as_far_from_neutral_on_either_side(armed):
-    least_us, neutral_us, most_us, cap_us = armed.car.numbers[5:]
-    steering_us = armed.car.numbers[2]
-    assert max(us for _, us in armed.drive(steering_us, most_us, 600)) == neutral_us + cap_us
-    assert min(us for _, us in armed.drive(steering_us, least_us, 600)) == max(least_us, neutral_us - cap_us)
+    least_us, neutral_us, most_us, cap_us = car.numbers[5:]
+    assert max(us for _, us in armed.drive(car.numbers[2], most_us, 600)) == neutral_us + cap_us
+    assert min(us for _, us in armed.drive(car.numbers[2], least_us, 600)) == max(least_us, neutral_us - cap_us)
     assert armed.status.state is State.AUTONOMOUS
     assert armed.status.cap_us == neutral_us + cap_us
 
@@ -92,31 +88,24 @@ def test_a_board_that_keeps_no_car_does_nothing_before_it_is_told():
 
 def test_a_board_that_keeps_the_default_need_not_be_told_of_it():
     board = NativeArduino()
-    assert set(board.run(50)) == {(1456, 120)}
-    assert board.hello.car == Car().id
+    assert set(board.run(50)) == {(1456, 120)} and board.hello.car == Car().id
     board.wiggle()
-    board.car = CRAWLER
-    assert board.command("A") == "c"
-    board.car = Car()
-    assert board.command("A") == "k"
+    for board.car, result in ((CRAWLER, "c"), (Car(), "k")):
+        assert board.command("A") == result
 
 
 def test_the_car_is_kept_only_while_it_rests(armed):
     assert not armed.may_keep
-    armed.sticks[STEERING] += 120
-    armed.run(400)
-    assert armed.status.state is State.MANUAL
-    assert armed.may_keep
-    armed.sticks[THROTTLE] += 60
-    armed.run(50)
-    assert not armed.may_keep
+    for channel, moved_us, may_keep in ((STEERING, 120, True), (THROTTLE, 60, False)):
+        armed.sticks[channel] += moved_us
+        armed.run(400)
+        assert armed.status.state is State.MANUAL and armed.may_keep is may_keep
 
 
 def test_no_other_car_while_armed(armed):
     before = neutral_of(armed)
     assert armed.command("C", *Car().numbers) == "i"
-    assert armed.status.state is State.AUTONOMOUS
-    assert armed.hello.car == armed.car.id
+    assert armed.status.state is State.AUTONOMOUS and armed.hello.car == armed.car.id
     armed.command("N")
     assert armed.run(1) == [before]
     assert armed.command("C", *Car().numbers) == "k"
@@ -150,27 +139,12 @@ def test_after_a_reset_it_must_be_told_again(kept):
     assert board.command("A") == "k"
 
 
-def test_another_car_raises_no_cap_again():
+def test_another_car_raises_no_cap_again_and_is_within_the_compiled_limits():
     board = NativeArduino()
     board.run(50)
+    assert [board.command("C", *CRAWLER.numbers[:8], 119), board.hello.car] == ["r", Car().id]
+    assert board.status.out_of_range == 1
     assert board.command("L", 160) == "k"
     for car, cap_us in ((CRAWLER, 1540), (Car(), 160), (BOAT, 1040)):
         assert board.command("C", *car.numbers) == "k"
         assert board.status.cap_us == cap_us
-
-
-LIMITS = {  # by the place of the number: the last values on either side that are none
-    **{0: (2999, 25001), 1: (799, 1251), 2: (1299, 1701), 3: (1749, 2201)},
-    **{4: (999, 25001), 5: (799, 1501), 6: (899, 1701), 7: (1499, 2201), 8: (0, 119)},
-}
-
-
-@pytest.mark.parametrize(("index", "bad"), [(i, bad) for i, values in LIMITS.items() for bad in values])
-def test_a_car_beyond_the_compiled_limits_is_refused(index, bad):
-    board = NativeArduino(car=CRAWLER)
-    numbers = list(CRAWLER.numbers)
-    numbers[index] = bad
-    before = board.status.out_of_range
-    assert board.command("C", *numbers) == "r"
-    assert board.status.out_of_range == before + 1
-    assert board.hello.car == CRAWLER.id

@@ -32,20 +32,16 @@ def fuzz(program, lines, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [100_000, pytest.param(10_000_000, marks=pytest.mark.release)])
-def test_random_and_mutated_lines(count):
+@pytest.mark.parametrize("human", ["receiver", "gamepad"])
+def test_random_and_mutated_lines(count, human):
     """Never an unsafe pulse, no stuck state, no access out of bounds: tests/firmware/fuzz.c says what is unsafe."""
-    program = uno.compiled("fuzz", *SANITIZE, FUZZ, *SOURCES)
-    done = fuzz(program, count, 1)
+    gamepad = ["-DHUMAN_GAMEPAD"] * (human == "gamepad")
+    done = fuzz(uno.compiled(f"fuzz-{human}", *SANITIZE, *gamepad, FUZZ, *SOURCES), count, 1)
     assert done.returncode == 0, done.stderr
-    lines, commands, driven, *kinds, starts, clock_wraps, sequence_wraps, cars = map(
-        int, re.findall(r"\d+", done.stdout)
-    )
-    assert lines >= count
-    assert commands > 0.4 * count
-    assert driven > 0.1 * count
-    assert min(kinds) > 0.1 * count
-    assert cars > count / 1000
-    assert min(starts, clock_wraps, sequence_wraps) > count / 50_000
+    numbers = map(int, re.findall(r"\d+", done.stdout))
+    lines, commands, driven, *kinds, starts, clock_wraps, sequence_wraps, cars = numbers
+    assert lines >= count and commands > 0.4 * count and driven > 0.05 * count and cars > count / 1000
+    assert min(kinds) > 0.1 * count and min(starts, clock_wraps, sequence_wraps) > count / 50_000
 
 
 @pytest.mark.parametrize(
@@ -55,7 +51,6 @@ def test_random_and_mutated_lines(count):
         ("car's cap", "vehicle.c", "within(car->cap_us, 1, CAP_MAX_US)", "within(car->cap_us, 1, 200)"),
         ("told", "vehicle.c", "!vehicle->car_told ||", ""),
         ("slew", "vehicle.c", "ms * STEERING_SLEW_US_PER_MS", "ms * 5"),
-        ("by hand", "vehicle.c", "if (vehicle->throttle_off_rest) forget", "if (false) forget"),
         ("replay", "vehicle.c", "!within(ahead, 1, SEQUENCE_WINDOW)", "ahead == 0"),
         ("crc", "protocol.c", "if (end[i] != hex(crc & 15))", "if (i == 1 && end[i] != hex(crc & 15))"),
         ("overflow", "protocol.c", "reader->length == HOST_LINE_MAX", "reader->length == HOST_LINE_MAX + 40"),
@@ -105,15 +100,11 @@ def read(data: bytes) -> list[Command]:
 
 
 NUMBER = st.integers(0, 2**32 - 1)
-LINES = st.one_of(
-    st.builds(lambda *v: servo_link.frame(">D " + " ".join(map(str, v))), NUMBER, NUMBER, NUMBER, NUMBER, NUMBER),
-    st.builds(lambda *v: servo_link.frame(">A " + " ".join(map(str, v))), *[NUMBER] * 5),
-    st.builds(
-        lambda boot, sequence, car: servo_link.frame(f">C {boot} {sequence} " + " ".join(map(str, car))),
-        NUMBER,
-        NUMBER,
-        st.lists(st.integers(0, 65535), min_size=9, max_size=9),
-    ),
+SENT = (("D", 5, NUMBER), ("A", 5, NUMBER), ("C", 11, st.integers(0, 65535)))
+LINES = st.sampled_from(SENT).flatmap(
+    lambda sent: st.lists(sent[2], min_size=sent[1], max_size=sent[1]).map(
+        lambda numbers: servo_link.frame(f">{sent[0]} " + " ".join(map(str, numbers)))
+    )
 )
 
 
@@ -122,17 +113,10 @@ def test_crc_is_zlibs(data):
     assert native().crc32(data, len(data)) == zlib.crc32(data)
 
 
-FIELDS = {
-    "A": ["heard_ms", "asked_ms", "car"],
-    "N": [],
-    "L": ["throttle_us"],
-    "D": ["heard_ms", "steering_us", "throttle_us"],
-}
-
-
 @given(st.sampled_from("ANDL"), st.lists(NUMBER, min_size=5, max_size=5))
 def test_what_the_host_sends_is_what_the_firmware_reads(kind, numbers):
-    sent = dict(zip(["boot", "sequence", *FIELDS[kind]], numbers, strict=False))
+    fields = {"A": "heard_ms asked_ms car", "N": "", "L": "throttle_us", "D": "heard_ms steering_us throttle_us"}
+    sent = dict(zip(["boot", "sequence", *fields[kind].split()], numbers, strict=False))
     (command,) = read(servo_link.frame(f">{kind} " + " ".join(map(str, sent.values()))))
     assert command.kind.decode() == kind
     for name in ("boot", "sequence", "heard_ms", "steering_us", "throttle_us", "asked_ms", "car"):
@@ -149,14 +133,14 @@ def test_up_to_three_flipped_bits_are_no_command(text, data):
     assert read(bytes(bad)) == []
 
 
-NEARLY = (
-    *("<D 0 1 2 1900 232", ">D  0 1 2 1900 232", ">D 0 1 2 1900 232 ", ">D 0 1 2 1900 232 0", ">D 0 1 2 1900"),
-    *(f">D 0 1 2 {n} 232" for n in ("+1900", "01900", "-1900", "1900.0", "0x76C", 1900 + 2**32, "1900" + " " * 60)),
-    *(">d 0 1 2 1900 232", ">X 0 1 2 1900 232", "S1900T600", ">", ""),
+@pytest.mark.parametrize(
+    "body",
+    [
+        *("<D 0 1 2 1900 232", ">D  0 1 2 1900 232", ">D 0 1 2 1900 232 ", ">D 0 1 2 1900 232 0", ">D 0 1 2 1900", ">"),
+        *(f">D 0 1 2 {n} 232" for n in ("+1900", "01900", "-1900", "0x76C", 1900 + 2**32, "1900" + " " * 60)),
+        *(">d 0 1 2 1900 232", ">X 0 1 2 1900 232", ""),
+    ],
 )
-
-
-@pytest.mark.parametrize("body", NEARLY)
 def test_what_is_nearly_a_line_is_no_command(body):
     assert read(servo_link.frame(body)) == []  # with the right checksum
     good = servo_link.frame(">D 0 1 2 1900 232")
@@ -179,11 +163,9 @@ def test_both_sides_have_the_same_limits():
     ]
     assert (*servos[0], *servos[1], limit["CAP_MAX_US"]) == car.DEFAULT_NUMBERS
     assert car.DEFAULT_NUMBERS[6] + limit["CAP_MAX_US"] == standin.CAP_US
-    names = ["PERIOD_MIN", "PERIOD_MAX", "FAST_PERIOD_MIN", "FAST_PERIOD_MAX", "FAST_NEUTRAL_MIN", "FAST_NEUTRAL_MAX"]
-    names += ["PULSE_MIN", "PULSE_MAX", "STEERING_NEUTRAL_MIN", "THROTTLE_NEUTRAL_MIN", "NEUTRAL_MAX", "STEERING_THROW"]
-    assert {name: limit[f"{name}_US"] for name in [*names, "CAP_MAX"]} == {
-        name: getattr(car, f"{name}_US") for name in [*names, "CAP_MAX"]
-    }
+    shared = [name for name in limit if hasattr(car, name) and name != "FAST_PULSE_MAX_US"]  # there, a receiver's
+    assert {name: limit[name] for name in shared} == {name: getattr(car, name) for name in shared}
+    assert len(shared) == 13
     assert limit["THROTTLE_MAX_US"] == car.FAST_PULSE_MAX_US
     assert int(re.search(r"LATE_MS = (\d+)", text)[1]) == standin.LATE_MS == servo_link.LATE_S * 1000
 
@@ -197,13 +179,14 @@ def test_both_sides_allow_the_same_cars(data):
     fast = st.integers(30, 1000)
     steering = data.draw(st.tuples(period, *[pulse] * 3))
     throttle = data.draw(st.one_of(st.tuples(period, *[pulse] * 3), st.tuples(st.integers(990, 1030), *[fast] * 3)))
-    keys = ["period_us", "right_us", "neutral_us", "left_us", "period_us", "reverse_us", "neutral_us", "forward_us"]
-    values = dict(zip(keys[:4], steering, strict=True)), dict(zip(keys[4:], throttle, strict=True))
+    keys = "period_us", "right_us", "neutral_us", "left_us"
+    content = {"steering": dict(zip(keys, steering, strict=True))}
+    keys = "period_us", "reverse_us", "neutral_us", "forward_us"
+    content["throttle"] = dict(zip(keys, throttle, strict=True)) | {"cap_us": data.draw(st.integers(0, 150))}
     if data.draw(st.booleans()):
-        del values[1]["reverse_us"]
-    values[1]["cap_us"] = data.draw(st.integers(0, 150))
+        del content["throttle"]["reverse_us"]
     try:
-        found = car.Car.of({"steering": values[0], "throttle": values[1]})
+        found = car.Car.of(content)
     except RoverError:
         return
     numbers = CarNumbers(*found.numbers)

@@ -65,19 +65,14 @@ def test_each_loss_stops_within_200_ms(board, stop, autonomous):
     assert not moved_after_ms(board.run(500))
 
 
-def test_arming_wants_a_young_whole_gesture_and_uses_it_up(board):
+def test_arming_wants_a_young_whole_gesture(board):
     assert board.command("A") == "w"  # a button that is stuck is none
     board.sticks[STEERING] = 2012
     board.run(5000)
     assert board.command("A") == "w"
     board.sticks[STEERING] = 1456
     board.wiggle()
-    board.run(31000)
-    assert board.command("A") == "w"
-    board.wiggle()
     assert board.command("A") == "k"
-    board.command("N")
-    assert board.command("A") == "w"
 
 
 @pytest.mark.parametrize("again", ["the same line", "older", "another boot", "too old", "from the future"])

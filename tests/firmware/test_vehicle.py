@@ -67,16 +67,13 @@ def test_a_takeover_by_throttle_passes_once_it_was_at_rest(armed):
 
 def test_arming_asks_for_one_thing_after_the_other():
     board = NativeArduino()
-    for present in ([0, 0], [0, 124], [1460, 0]):
-        board.sticks = present
+    for sticks, missing in (
+        *(([0, 0], "s"), ([0, 124], "s"), ([1460, 0], "s")),
+        *(([1460, 300], "t"), ([1460, 124], "w")),
+    ):
+        board.sticks = sticks
         board.run(200)
-        assert (board.command("A"), board.status.missing) == ("s", "s")
-    board.sticks = [1460, 300]
-    board.run(200)
-    assert (board.command("A"), board.status.missing) == ("t", "t")
-    board.sticks = [1460, 124]
-    board.run(200)
-    assert (board.command("A"), board.status.missing) == ("w", "w")
+        assert (board.command("A"), board.status.missing) == (missing, missing)
     board.wiggle()
     assert board.status.missing == "-"
     assert board.command("N") == "i"  # a human drives, and goes on
@@ -101,10 +98,10 @@ def drive_by_hand(board, steering_us, throttle_us, ms):
     board.run(ms)
 
 
-@pytest.mark.parametrize("between_ms", [100, 1400, 9000])
+@pytest.mark.parametrize("between_ms", [100, 9000])
 def test_driving_by_hand_is_no_gesture(board, between_ms):
     """It was: each side could be 30 s old, with throttle in between, and 9 ms at rest sufficed."""
-    for turn in range(20):
+    for turn in range(6):
         drive_by_hand(board, (1750, 1150)[turn % 2], 200, 400)
         drive_by_hand(board, 1456, 120 if turn % 3 else 180, between_ms)
         assert board.command("A") in ("t", "w")
@@ -146,22 +143,18 @@ def test_a_human_who_drives_keeps_the_car_when_another_is_told(board, throttle_u
 
 
 @pytest.mark.parametrize(("channel", "off", "missing"), [(0, 1.2, "w"), (0, 1.3, "s"), (1, 1.2, "w"), (1, 1.3, "s")])
-def test_the_period_of_a_signal_may_be_off_by_a_quarter(channel, off, missing):
-    board = NativeArduino()
-    periods = list(board.periods_us)
-    periods[channel] = round(off * periods[channel])
-    board.periods_us = tuple(periods)
+def test_the_period_of_a_signal_may_be_off_by_a_quarter(board, channel, off, missing):
+    board.periods_us = tuple(round(us * (off if i == channel else 1)) for i, us in enumerate(board.periods_us))
     board.run(400)
     assert board.status.missing == missing
 
 
 def test_a_throttle_at_rest_frees_nothing_while_the_steering_is_lost(board):
-    board.sticks = [0, 0]
-    board.run(200)
-    board.sticks = [0, 120]
-    board.run(300)
-    board.sticks = [1500, 300]
-    assert set(throttles(board.run(400))) == {120}
+    pins = []
+    for sticks, ms in (([0, 0], 200), ([0, 120], 300), ([1500, 300], 400)):
+        board.sticks = sticks
+        pins = board.run(ms)
+    assert set(throttles(pins)) == {120}
 
 
 def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):
@@ -171,9 +164,7 @@ def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):
     board.run(1_500)
     assert board.command("A") == "w"
     board.wiggle()
-    assert board.command("A") == "k"
-    board.command("N")
-    assert board.command("A") == "w"
+    assert [board.command(kind) for kind in "ANA"] == ["k", "k", "w"]
 
 
 # ---- the host is not trusted
@@ -188,11 +179,8 @@ def test_the_throttle_has_a_cap(armed, asked_us):
 
 
 def test_the_cap_goes_down_and_never_up(board):
-    assert board.status.cap_us == CAP_US
-    assert (board.command("L", 180), board.status.cap_us) == ("k", 180)
-    assert (board.command("L", 200), board.status.cap_us) == ("k", 180)
-    assert (board.command("L", 119), board.status.cap_us) == ("r", 180)
-    assert (board.command("L", 712), board.status.cap_us) == ("r", 180)
+    for asked_us, result, cap_us in ((180, "k", 180), (200, "k", 180), (119, "r", 180), (712, "r", 180)):
+        assert (board.command("L", asked_us), board.status.cap_us) == (result, cap_us)
     board.wiggle()
     board.command("A")
     assert (board.command("L", 150), board.status.cap_us) == ("i", 180)
@@ -273,34 +261,28 @@ def test_a_host_that_pauses_again_and_again_stops_the_car(armed, phase_ms):
 def test_one_pause_is_no_reason_to_stop(armed, phase_ms):
     for _ in range(3):
         armed.drive(1456, 200, 495 + phase_ms)
-        assert set(throttles(armed.run(100))) == {200}
-        assert set(throttles(armed.drive(1456, 200, 99) + armed.run(8))) == {200}
-        assert set(throttles(armed.drive(1456, 200, 600))) == {200}
+        pins = armed.run(100) + armed.drive(1456, 200, 99) + armed.run(8) + armed.drive(1456, 200, 600)
+        assert set(throttles(pins)) == {200}
     assert armed.status.state is State.AUTONOMOUS
 
 
 # ---- near the wraps of clock and sequence
 
 
-@pytest.mark.parametrize("before_ms", [1, 400, 1000])
+@pytest.mark.parametrize("before_ms", [1, 1000])
 def test_nothing_happens_when_the_clock_wraps(before_ms):
     board = NativeArduino(now_ms=(1 << 32) - before_ms)
-    board.sequence = 0
     board.run(120)
     board.wiggle()
     assert board.command("A") == "k"
     assert set(throttles(board.drive(1456, 150, 1200)[20:])) == {150}
-    assert board.status.uptime_ms < 3000
-    assert board.status.state is State.AUTONOMOUS
-    assert moved_after_ms(board.run(400)) <= 150
-    assert board.status.reason == "t"
+    assert board.status.uptime_ms < 3000 and board.status.state is State.AUTONOMOUS
+    assert moved_after_ms(board.run(400)) <= 150 and board.status.reason == "t"
 
 
-@pytest.mark.parametrize("before", [1, 5])
-def test_a_sequence_that_wraps_is_new(before):
-    board = NativeArduino(sequence=(1 << 32) - before)
+def test_a_sequence_that_wraps_is_new():
+    board = NativeArduino(sequence=(1 << 32) - 5)
     board.run(120)
-    for _ in range(10):
-        assert board.command("N") == "i"
-    assert board.status.sequence == 10 - before
-    assert board.command("N", sequence=(1 << 32) - before) == "o"
+    assert {board.command("N") for _ in range(10)} == {"i"}
+    assert board.status.sequence == 5
+    assert board.command("N", sequence=(1 << 32) - 5) == "o"

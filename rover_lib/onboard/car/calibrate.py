@@ -9,7 +9,7 @@ of car are tried, these two get the neutral of each. So the wheels must be off t
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,8 +17,6 @@ from rover_lib.onboard.car.car import (
     DEFAULT,
     FAST_PULSE_MAX_US,
     PERIOD_MIN_US,
-    STEERING_THROW_US,
-    THROTTLE_THROW_US,
     Car,
     yaml_of,
 )
@@ -39,13 +37,9 @@ NAMES = ("steering", "throttle")
 
 def _slow(steering_us: int, throttle_us: int) -> Car:
     """Return a car with about these periods, used only to receive pulses."""
-    return Car.of(
-        {
-            "name": "any car",
-            "steering": {"period_us": steering_us, "right_us": 1000, "neutral_us": 1500, "left_us": 2000},
-            "throttle": {"period_us": throttle_us, "neutral_us": 1500, "forward_us": 2000, "cap_us": 1},
-        }
-    )
+    steering = {"period_us": steering_us, "right_us": 1000, "neutral_us": 1500, "left_us": 2000}
+    throttle = {"period_us": throttle_us, "neutral_us": 1500, "forward_us": 2000, "cap_us": 1}
+    return Car.of({"steering": steering, "throttle": throttle})
 
 
 # The Arduino accepts periods within a quarter of the car's. Together these cover 3 to 25 ms; the likely come first.
@@ -96,7 +90,6 @@ def measure(
         ends[where] = held.throttle_us if where in ("forward", "back") else held.steering_us
         notify(f"{where}: {ends[where]} us")
     ask("Let go of both sticks.")
-    _check_throws(rest, ends)
     fast = rest.throttle_period_us < PERIOD_MIN_US
     if fast and ends["forward"] > FAST_PULSE_MAX_US:
         notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
@@ -109,65 +102,29 @@ def measure(
         "positive": positive or ("right" if ends["right"] > ends["left"] else "left"),
     }
     throttle = {"period_us": rest.throttle_period_us, "neutral_us": rest.throttle_us, "forward_us": ends["forward"]}
-    if _goes_back(rest, ends) and not fast:
+    if abs(ends["back"] - rest.throttle_us) > RETURNS_US and not fast:
         throttle["reverse_us"] = ends["back"]
-    return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
-
-
-def _check_throws(rest: Held, ends: Mapping[str, int]) -> None:
-    """Raise CarError if a stick hardly moved, or if steering moved the same way for left and right.
-
-    ends: the stick's pulse in microseconds where it was held: "left", "right", "forward" and "back".
-    """
-    for name, ways, neutral_us, least_us in (
-        ("steering", ("left", "right"), rest.steering_us, STEERING_THROW_US),
-        ("throttle", ("forward",), rest.throttle_us, THROTTLE_THROW_US),
-    ):
-        for where in ways:
-            if abs(ends[where] - neutral_us) < least_us:
-                raise CarError(
-                    f"{name} hardly moved {where}: it must be {least_us} us from rest at least",
-                    found=f"{neutral_us} us at rest and {ends[where]} us {where}",
-                    remedy="hold the stick at its end, and set the transmitter's dual rate and end points to 100 %",
-                )
-    if (ends["left"] > rest.steering_us) == (ends["right"] > rest.steering_us):
-        raise CarError(
-            "both ends of steering are on the same side of its centre",
-            found=f"left {ends['left']}, rest {rest.steering_us} and right {ends['right']} us",
-            remedy="let go of the stick before it is measured at rest, and set the trim to its middle",
-        )
-
-
-def _goes_back(rest: Held, ends: Mapping[str, int]) -> bool:
-    """Whether the throttle has a reverse. Raises CarError if it moved the same way backwards as forwards."""
-    backwards_us = (rest.throttle_us - ends["back"]) * (1 if ends["forward"] > rest.throttle_us else -1)
-    if backwards_us < -RETURNS_US:
-        raise CarError(
-            "the throttle went the same way backwards as forwards",
-            found=f"rest {rest.throttle_us}, forward {ends['forward']} and back {ends['back']} us",
-            remedy="move the stick from its rest to the other end",
-        )
-    return backwards_us > RETURNS_US
+    try:
+        return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
+    except CarError as error:
+        remedy = "let go of a stick for its rest, hold it at its end, and set dual rate and end points to 100 %"
+        raise CarError(error.what, found=error.found, remedy=remedy) from None
 
 
 def _find(link: "ServoLink", sleep: Callable[[float], None]) -> None:
-    """Tell the Arduino of one kind of car after the other until it receives both signals.
-
-    Raises CarError if no kind lets it receive both.
-    """
-    seen: dict[str, int] = {}
+    """Tell the Arduino of one kind of car after the other until it receives both signals. Raises CarError."""
+    seen: set[str] = set()
     for kind in KINDS:
         link.tell(kind)
         for _ in range(round(LOOK_S / STEP_S)):
             sleep(STEP_S)
             pulses = _pulses(link.latest())
-            seen |= {name: us for name, us in zip(NAMES, pulses, strict=True) if us is not None}
+            seen |= {name for name, us in zip(NAMES, pulses, strict=True) if us is not None}
             if None not in pulses:
                 return
     silent = [name for name in NAMES if name not in seen]
     raise CarError(
         f"no pulse of {' and '.join(silent) or 'both channels at a time'} came from the receiver",
-        found=", ".join(f"{name} {us} us" for name, us in seen.items()) or "nothing on either channel",
         remedy="is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?",
     )
 
@@ -178,29 +135,28 @@ def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
 
 def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> Held:
     """Measure both channels for MEASURE_S. Raises CarError if a signal is lost or a stick moves."""
-    rows: list[tuple[int, ...]] = []
+    rows = []
     for _ in range(round(MEASURE_S / STEP_S)):
         sleep(STEP_S)
         status = link.latest()
         for name, pulse_us in zip(NAMES, _pulses(status), strict=True):
-            if status is None or pulse_us is None:
+            if pulse_us is None:
                 raise CarError(
-                    f"no pulse of {name} {where}",
-                    found="none that a servo would take, 800 to 2200 us",
+                    f"no pulse of {name} {where} that a servo would take, 800 to 2200 us",
                     remedy="set the transmitter's end points to 100 %, and keep it on",
                 )
         assert status is not None
-        values = (status.receiver_steering_us, status.receiver_throttle_us)
-        periods = (status.receiver_steering_period_us, status.receiver_throttle_period_us)
-        rows.append(tuple(v or 0 for v in (*values, *periods)))
-    for name, column in zip(NAMES, zip(*rows, strict=True), strict=False):
+        periods = status.receiver_steering_period_us or 0, status.receiver_throttle_period_us or 0
+        rows.append([us or 0 for us in (*_pulses(status), *periods)])
+    columns = list(zip(*rows, strict=True))
+    for name, column in zip(NAMES, columns, strict=False):
         if max(column) - min(column) > STEADY_US:
             raise CarError(
                 f"{name} moved while it was measured {where}",
                 found=f"{min(column)} to {max(column)} us",
                 remedy="hold the stick still, and start again",
             )
-    return Held(*(round(statistics.median(column)) for column in zip(*rows, strict=True)))
+    return Held(*(round(statistics.median(column)) for column in columns))
 
 
 def refuse_existing(path: Path, force: bool) -> None:

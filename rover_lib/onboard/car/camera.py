@@ -3,9 +3,8 @@
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
 
-The same reader accepts substitutes for a camera: a folder of frames, a file of JPEGs, or JPEGs through a FIFO.
-A picture from a camera counts as a frame only if it is complete and new. Single bad pictures are left out; a few bad
-ones in a row mean that the camera has failed.
+Substitutes for a camera are a folder of JPEGs, and JPEGs through a FIFO. A picture counts as a frame only if it is
+complete and new. Single bad pictures are left out; a few bad ones in a row mean that the camera has failed.
 """
 
 import contextlib
@@ -16,30 +15,37 @@ import stat
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.csi import is_csi, read_csi
-from rover_lib.onboard.car.picture import LEAST, MOST_BYTES, block_sums, brightness, decode_jpeg, is_squeezed
-from rover_lib.onboard.errors import CameraError
+from rover_lib.onboard.car.csi import is_csi, newest_jpeg, read_csi
+from rover_lib.onboard.car.picture import (
+    LEAST,
+    MOST_BYTES,
+    block_sums,
+    brightness,
+    decode_jpeg,
+    is_squeezed,
+)
+from rover_lib.onboard.errors import CameraError, sentence_of
 
 FIRST_FRAME_S = 5.0
 STALLED_S = 1.0
 CLOSE_S = 1.0
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # a JPEG's data contains no FF D9: there 00 follows each FF
+UNPLUGGED = "is the camera unplugged?"
 PICTURES = (".jpg", ".jpeg")
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-MONOTONIC, WALL, NO_CLOCK = "monotonic", "wall", "no"  # the clock that time stamps come from
+MONOTONIC, NO_CLOCK = "monotonic", "no"  # the clock that time stamps come from
 REFUSED_MOST = 4  # bad pictures in a row mean that the camera has failed; 0.13 s at 30 Hz
 # A picture repeats another if this share of its blocks is equal. Six real recordings leave 0.02 at most and a sensor's
 # noise alone 0.37; a strip of 5 % of a picture, which still changes, touches 2 of 9 rows and leaves 0.78.
 SAME = 0.6
 REMEMBERED = 32  # pictures; a driver has at most this many buffers that it could repeat (VIDEO_MAX_FRAME)
-DECIDING = 5  # frames after which it is decided which clock the time stamps come from
+DECIDING = 5  # frames after which it is decided whether time stamps are the machine's
 OLD_S = 0.5  # a frame this old is of no use: a plan's throttle begins to fade at this age
 AHEAD_S = 0.01  # a time stamp may lie this far in the future, because it may be rounded
 USUAL_SIZES = ((640, 360), (640, 480))  # (width, height) that nearly every USB camera gives
@@ -89,10 +95,9 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO or .mjpeg
-    file with one JPEG after another. size: (width, height) to request from a camera. rate_hz: frames per second to
-    request, and the rate at which folders and files are shown. clock, wall_clock: the two clocks that a camera's time
-    stamps may come from. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO with one
+    JPEG after another. size: (width, height) to request from a camera. rate_hz: frames per second to request, and the
+    rate at which a folder is shown. Any thread may call any method.
     """
 
     def __init__(
@@ -102,14 +107,13 @@ class Camera:
         size: tuple[int, int] = (640, 360),
         rate_hz: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
-        wall_clock: Callable[[], float] = time.time,
         held: bool = False,
     ):
-        """held: a folder or a file of pictures is repeated until begin() is called, and from then on shown once."""
+        """held: a folder is repeated until begin() is called, and from then on shown once."""
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._clock = clock
-        self._stamps = _Stamps(clock, wall_clock)
+        self._stamps = _Stamps(clock)
         self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' block_sums(), one row each
         self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: CameraError | None = None
@@ -117,11 +121,10 @@ class Camera:
         self._held = held
         if not held:
             self._begun.set()
-        self._changed = threading.Condition()  # guards the five below
+        self._changed = threading.Condition()  # guards the three below
         self._frame: Frame | None = None
         self._arrived_s = 0.0  # when it came, by `clock`
         self._failure: CameraError | None = None
-        self._first_s = 0.0
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> "Camera":
@@ -137,13 +140,9 @@ class Camera:
         self._thread.start()
         try:
             if self.wait(0, FIRST_FRAME_S) is None:
-                what = f"{self.source}: no frame within {FIRST_FRAME_S:g} s"
-                if refusal := self._refusal:
-                    raise CameraError(f"{what}: {refusal.what}", found=refusal.found, remedy=refusal.remedy)
-                raise CameraError(
-                    what,
-                    remedy="is it a camera, and does no other program use it? ('rover doctor' looks at all of them)",
-                )
+                why = self._refusal or CameraError("none came", remedy="is it a camera that no other program uses?")
+                what = f"{self.source}: no frame within {FIRST_FRAME_S:g} s: {why.what}"
+                raise CameraError(what, found=why.found, remedy=why.remedy)
         except BaseException:
             self.close()
             raise
@@ -182,7 +181,7 @@ class Camera:
             raise self._failure
         silent_s = self._clock() - self._arrived_s
         if self._frame and silent_s > STALLED_S and not self._closing.is_set():
-            raise CameraError(f"{self.source}: no frame for {silent_s:.1f} s", remedy="plug the camera in again")
+            raise CameraError(f"{self.source}: no new frame came for {silent_s:.1f} s", remedy="plug it in again")
 
     @property
     def frames(self) -> int:
@@ -190,17 +189,8 @@ class Camera:
         return self._frame.number if self._frame else 0
 
     @property
-    def rate_hz(self) -> float | None:
-        """Frames per second, measured since the first frame; None before the second."""
-        with self._changed:
-            frame = self._frame
-            if frame is None or frame.number < 2 or frame.captured_s <= self._first_s:
-                return None
-            return (frame.number - 1) / (frame.captured_s - self._first_s)
-
-    @property
     def time_stamps(self) -> str:
-        """The clock of the camera's time stamps: "monotonic" or "wall"; "no" if frames get their time of arrival."""
+        """The clock of the camera's time stamps: "monotonic", or "no" if frames get their time of arrival."""
         return self._stamps.kind or NO_CLOCK
 
     def _read(self, reader: Reader) -> None:
@@ -222,15 +212,11 @@ class Camera:
                     refused = 0
                     if captured_s is not None:
                         self.add(image, captured_s, picture if isinstance(picture, bytes) else None)
-                raise CameraError(
-                    f"{self.source}: it ended after {self.frames} frames", remedy="is the camera unplugged?"
-                )
+                raise CameraError(f"{self.source}: it ended after {self.frames} frames", remedy=UNPLUGGED)
         except CameraError as error:
             failure = error
         except Exception as error:  # whatever goes wrong in a driver, the drive must learn of it
-            failure = CameraError(
-                f"{self.source}: reading failed ({type(error).__name__}: {error})", remedy="check the camera"
-            )
+            failure = CameraError(f"{self.source}: reading failed ({sentence_of(error)})", remedy=UNPLUGGED)
         with self._changed:
             self._failure = failure
             self._changed.notify_all()
@@ -242,10 +228,8 @@ class Camera:
             raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
         (h, w), (h0, w0) = image.shape[:2], (before.image if before else image).shape[:2]
         if (h, w) != (h0, w0):
-            raise CameraError(
-                f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}",
-                remedy="is another program using the camera?",
-            )
+            what = f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}"
+            raise CameraError(what, remedy="is another program using the camera?")
         if w < LEAST[0] or h < LEAST[1]:
             raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
         shown, number = block_sums(image), self.frames + 1
@@ -260,23 +244,21 @@ class Camera:
         frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
         with self._changed:
             self._frame, self._arrived_s = frame, self._clock()
-            self._first_s = self._first_s or captured_s
             self._changed.notify_all()
 
 
 class _Stamps:
     """Finds out when frames were captured, from the time stamps that the camera gives.
 
-    The first frames decide which clock the time stamps come from. After that, a time stamp that is old, in the future
-    or does not change is a fault of the camera. kind: "monotonic" or "wall" clock, "no" for neither; "" before the
-    decision.
+    The first frames decide whether these come from the machine's monotonic clock. After that, one that is old, in the
+    future or does not change is a fault of the camera. kind: MONOTONIC or NO_CLOCK; "" before the decision.
     """
 
-    def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]):
-        self._clock, self._wall_clock = clock, wall_clock
+    def __init__(self, clock: Callable[[], float]):
+        self._clock = clock
         self.kind = ""
         self._last_s = -math.inf
-        self._first: deque[tuple[float, float, float]] = deque(maxlen=DECIDING)  # time stamp, age by either clock
+        self._first: deque[tuple[float, float]] = deque(maxlen=DECIDING)  # time stamp and age
 
     def captured_s(self, stamp_s: float | None) -> float | None:
         """Return when a frame that has just arrived was captured, seconds by `clock`; None before the decision.
@@ -286,40 +268,30 @@ class _Stamps:
         Raises CameraError for a stamp that cannot be right.
         """
         now_s = self._clock()
-        if stamp_s is None or self.kind == NO_CLOCK:
-            return now_s
-        wall_age_s = self._wall_clock() - stamp_s
-        if not self.kind:
-            self._first.append((stamp_s, now_s - stamp_s, wall_age_s))
-            self._last_s = -math.inf
+        if stamp_s is not None and not self.kind:
+            self._first.append((stamp_s, now_s - stamp_s))
             if len(self._first) < DECIDING:
                 return None
-            self.kind = self._decided()
-            if self.kind == NO_CLOCK:
-                return now_s
-        age_s = now_s - stamp_s if self.kind == MONOTONIC else wall_age_s
+            self._decide()
+        if stamp_s is None or self.kind == NO_CLOCK:
+            return now_s
         stands, self._last_s = stamp_s <= self._last_s, stamp_s
-        if stands or not -AHEAD_S <= age_s <= OLD_S:
-            raise _bad_stamp(stands, age_s)
-        return now_s - max(0.0, age_s)
+        _check_stamp(stands, now_s - stamp_s)
+        return min(now_s, stamp_s)
 
-    def _decided(self) -> str:
+    def _decide(self) -> None:
         """Decide by the medians of the first frames, because one of them may have come late."""
-        stamps, *ages = np.array(self._first).T
-        stands = float(np.median(np.diff(stamps))) <= 0
-        monotonic_s, wall_s = (float(np.median(age)) for age in ages)
-        for kind, age_s in ((MONOTONIC, monotonic_s), (WALL, wall_s)):
-            if not stands and -AHEAD_S <= age_s <= OLD_S:
-                return kind
-        nearest_s = min(monotonic_s, wall_s, key=abs)
-        if abs(nearest_s) < NEAR_S:
-            raise _bad_stamp(stands, nearest_s)
-        return NO_CLOCK
+        stamps, ages = np.array(self._first).T
+        age_s = float(np.median(ages))
+        if abs(age_s) < NEAR_S:
+            _check_stamp(float(np.median(np.diff(stamps))) <= 0, age_s)
+        self.kind = MONOTONIC if abs(age_s) < NEAR_S else NO_CLOCK
 
 
-def _bad_stamp(stands: bool, age_s: float) -> CameraError:
-    found = "the same again" if stands else f"one of {abs(age_s):.2f} s {'ago' if age_s > 0 else 'ahead'}"
-    return CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
+def _check_stamp(stands: bool, age_s: float) -> None:
+    if stands or not -AHEAD_S <= age_s <= OLD_S:
+        found = "the same again" if stands else f"one of {abs(age_s):.2f} s {'ago' if age_s > 0 else 'ahead'}"
+        raise CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
 
 
 def path_of(source: str, dev: Path = Path("/dev")) -> Path:
@@ -337,20 +309,17 @@ def _reader(
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise CameraError(
-            f"{source}: no such camera ({error.strerror})", remedy="'rover doctor' lists those that are"
-        ) from None
+        what = f"{source}: no such camera ({error.strerror})"
+        raise CameraError(what, remedy="'rover doctor' lists those that are") from None
     if stat.S_ISCHR(mode):
         return _v4l2(source, size, rate_hz)
     if stat.S_ISFIFO(mode):
         return _fifo(path, closing)
     if stat.S_ISDIR(mode):
-        return _pace(_folder(path), rate_hz, closing, begun)
-    if path.suffix == ".mjpeg":
-        return _pace(lambda: _split(_contents(path)), rate_hz, closing, begun)
+        return _folder(path, rate_hz, closing, begun)
     raise CameraError(
-        f"{source}: neither a camera nor a folder, a FIFO or an .mjpeg file of JPEGs",
-        remedy=f"ffmpeg -i {path.name} -q:v 3 {path.stem}.mjpeg makes one of a video",
+        f"{source}: neither a camera nor a folder or a FIFO of JPEGs",
+        remedy=f"ffmpeg -i {path.name} -q:v 3 FOLDER/%06d.jpg makes pictures of a video",
     )
 
 
@@ -358,9 +327,8 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
     device = cv2.VideoCapture(source, cv2.CAP_V4L2)
     try:
         if not device.isOpened():
-            raise CameraError(
-                f"{source}: cannot be opened", remedy="is the user in group video, and does nobody else use it?"
-            )
+            remedy = "is the user in group video, and does nobody else use it?"
+            raise CameraError(f"{source}: cannot be opened", remedy=remedy)
         device.set(cv2.CAP_PROP_FOURCC, MJPG)  # raw pictures at 30 Hz are too much for USB 2
         device.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         device.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
@@ -370,57 +338,41 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
         while True:
             ok, image = device.read()
             if not ok:
-                raise CameraError(f"{source}: gives no more frames", remedy="is the camera unplugged?")
+                raise CameraError(f"{source}: gives no more frames", remedy=UNPLUGGED)
             stamp_s = device.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the driver's time of the buffer
             yield image.tobytes() if jpegs else image, stamp_s or None
     finally:
         device.release()
 
 
-def _folder(path: Path) -> Callable[[], Iterator[bytes]]:
+def _folder(path: Path, rate_hz: float, closing: threading.Event, begun: threading.Event) -> Reader:
+    """Yield a folder's JPEGs at a camera's rate: again and again until `begun` is set, and then once."""
     folder = path / "frames" if (path / "frames").is_dir() else path
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
     if not files:
-        raise CameraError(
-            f"{folder}: no pictures in it ({', '.join(PICTURES)})", remedy="give /dev/videoN or another folder"
-        )
-    return lambda: (next(_contents(f, MOST_BYTES + 1), b"") for f in files)
+        what = f"{folder}: no pictures in it ({', '.join(PICTURES)})"
+        raise CameraError(what, remedy="give /dev/videoN or another folder")
+    return _pace(files, rate_hz, closing, begun)
 
 
-def _contents(path: Path, piece: int = 1 << 20) -> Iterator[bytes]:
-    """Yield a file's bytes in pieces."""
-    with path.open("rb") as file:
-        while data := file.read(piece):
-            yield data
-
-
-def _pace(
-    pictures: Callable[[], Iterable[bytes]], rate_hz: float, closing: threading.Event, begun: threading.Event
-) -> Reader:
-    """Yield stored pictures at a camera's rate: again and again until `begun` is set, and then once."""
+def _pace(files: list[Path], rate_hz: float, closing: threading.Event, begun: threading.Event) -> Reader:
     last = False
     while not last:
-        last, start, count = begun.is_set(), time.monotonic(), 0
-        for jpeg in pictures():
+        last, start = begun.is_set(), time.monotonic()
+        for count, path in enumerate(files):
             if closing.wait(max(0.0, start + count / rate_hz - time.monotonic())):
                 return
-            count += 1
             if begun.is_set() and not last:
                 break
-            yield jpeg, None
-        last |= not count  # an empty file has nothing to repeat
+            with path.open("rb") as file:
+                yield file.read(MOST_BYTES + 1), None
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:
     """Yield JPEGs from a FIFO; of several that wait there, only the last. The camera ends when the FIFO does."""
-    for jpeg in _split(_pieces(path, closing), newest=True):
-        yield jpeg, None
-
-
-def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        began = False
+        began, pending = False, bytearray()
         while not closing.is_set():
             if not select.select([fd], [], [], 0.05)[0]:
                 continue
@@ -428,35 +380,14 @@ def _pieces(path: Path, closing: threading.Event) -> Iterator[bytes]:
                 data = os.read(fd, 1 << 20)
             except BlockingIOError:
                 continue
-            if data:
-                began = True
-                yield data
-            elif began:
+            if not data and began:
                 return
-            else:
+            if not data:
                 closing.wait(0.01)  # no writer has opened the FIFO yet
+                continue
+            began = True
+            pending += data
+            if jpeg := newest_jpeg(pending)[0]:
+                yield jpeg, None
     finally:
         os.close(fd)
-
-
-def _split(pieces: Iterator[bytes], newest: bool = False) -> Iterator[bytes]:
-    """Yield the complete JPEGs in a stream. newest: of several that arrive together, only the last."""
-    pending = bytearray()
-    for piece in pieces:
-        searched = max(0, len(pending) - 1)  # where an end marker may have been cut in two
-        pending += piece
-        last = None
-        while (end := pending.find(JPEG_END, searched)) >= 0:
-            start = pending.find(JPEG_START, 0, end)
-            if start >= 0:
-                if last is not None and not newest:
-                    yield last
-                last = bytes(pending[start : end + 2])
-            del pending[: end + 2]
-            searched = 0
-        if last is not None:
-            yield last
-        if len(pending) > MOST_BYTES:
-            raise CameraError(
-                f"no JPEG in {MOST_BYTES / 1e6:g} MB of the stream", remedy="write JPEGs one after another"
-            )

@@ -63,31 +63,22 @@ class Car:
 
     def __post_init__(self):
         steering, throttle = self.pwm.steering, self.pwm.throttle
-        ends, neutral = steering.ends_us, steering.neutral_us
+        neutral_us, forward_us = throttle.neutral_us, throttle.pulse_us(throttle.high)
+        periods, pulses = (PERIOD_MIN_US, PERIOD_MAX_US), (PULSE_MIN_US, PULSE_MAX_US)
+        neutrals = THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US
+        if throttle.period_us < PERIOD_MIN_US:  # a fast one, which goes forward only
+            periods = FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US
+            neutrals, pulses = (FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US), (neutral_us, FAST_PULSE_MAX_US)
+        throw_us = min(abs(end - steering.neutral_us) for end in steering.ends_us)
         limits: list[tuple[str, float, float, float]] = [
             ("steering's period_us", steering.period_us, PERIOD_MIN_US, PERIOD_MAX_US),
-            ("steering's neutral_us", neutral, STEERING_NEUTRAL_MIN_US, NEUTRAL_MAX_US),
-            *(("an end of steering", end, PULSE_MIN_US, PULSE_MAX_US) for end in ends),
-            ("from steering's neutral to its nearer end, us,", min(abs(end - neutral) for end in ends),
-             STEERING_THROW_US, PULSE_MAX_US),
-        ]  # fmt: skip
-        ends, neutral = throttle.ends_us, throttle.neutral_us
-        if throttle.period_us < PERIOD_MIN_US:
-            limits += [
-                ("a fast throttle's period_us", throttle.period_us, FAST_PERIOD_MIN_US, FAST_PERIOD_MAX_US),
-                ("a fast throttle's neutral_us", neutral, FAST_NEUTRAL_MIN_US, FAST_NEUTRAL_MAX_US),
-                ("a fast throttle's forward_us", ends[1], neutral, FAST_PULSE_MAX_US),
-                ("a fast throttle's lower end (it goes forward only)", ends[0], neutral, neutral),
-            ]
-        else:
-            limits += [
-                ("throttle's period_us", throttle.period_us, PERIOD_MIN_US, PERIOD_MAX_US),
-                ("throttle's neutral_us", neutral, THROTTLE_NEUTRAL_MIN_US, NEUTRAL_MAX_US),
-                *(("an end of throttle", end, PULSE_MIN_US, PULSE_MAX_US) for end in ends),
-            ]
-        forward_us = abs(throttle.pulse_us(throttle.high) - neutral)
-        limits += [
-            ("from throttle's neutral to forward, us,", forward_us, THROTTLE_THROW_US, PULSE_MAX_US),
+            ("steering's neutral_us", steering.neutral_us, STEERING_NEUTRAL_MIN_US, NEUTRAL_MAX_US),
+            *(("an end of steering", end, PULSE_MIN_US, PULSE_MAX_US) for end in steering.ends_us),
+            ("from steering's neutral to its nearer end, us,", throw_us, STEERING_THROW_US, PULSE_MAX_US),
+            ("throttle's period_us", throttle.period_us, *periods),
+            ("throttle's neutral_us", neutral_us, *neutrals),
+            *(("an end of throttle", end, *pulses) for end in throttle.ends_us),
+            ("from throttle's neutral to forward, us,", abs(forward_us - neutral_us), THROTTLE_THROW_US, PULSE_MAX_US),
             ("the throttle's cap, us from neutral,", self.cap_us, 1, CAP_MAX_US),
             ("the camera's field_of_view_deg", self.field_of_view_deg, 20, 160),
             ("wheelbase_m", self.wheelbase_m, 0.03, 3),
@@ -115,15 +106,11 @@ class Car:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers sent to the Arduino, in whole microseconds.
-
-        For each channel the period, the shortest pulse, neutral and the longest pulse; then the cap.
-        """
-        steering, throttle = (
-            (round(c.period_us), c.ends_us[0], c.neutral_us, c.ends_us[1])
-            for c in (self.pwm.steering, self.pwm.throttle)
-        )
-        return (*steering, *throttle, self.cap_us)
+        """The numbers sent to the Arduino: each channel's period, least, neutral and longest pulse, and the cap; us."""
+        numbers: list[int] = []
+        for c in (self.pwm.steering, self.pwm.throttle):
+            numbers += round(c.period_us), c.ends_us[0], c.neutral_us, c.ends_us[1]
+        return (*numbers, self.cap_us)
 
     @property
     def id(self) -> int:
@@ -147,13 +134,15 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether actions and pictures mean the same on both cars: all is equal but the name, the cap, the human, and
-        which side is called left.
+        """Whether actions and pictures mean the same on both cars.
+
+        All must be equal but the name, the cap, the human, and which side is called left.
         """
-        mine, others = ({**c.description(), "name": "", "human": "", "steering": c.steering_us} for c in (self, other))
-        for description in (mine, others):
-            description["throttle"] = {**description["throttle"], "cap_us": 0}
-        return mine == others
+        descriptions = []
+        for car in (self, other):
+            description = {**car.description(), "name": "", "human": "", "steering": car.steering_us}
+            descriptions.append({**description, "throttle": {**description["throttle"], "cap_us": 0}})
+        return descriptions[0] == descriptions[1]
 
     @property
     def steering_us(self) -> tuple[int, ...]:
@@ -234,13 +223,10 @@ TOP = (
 )
 SECTIONS = {
     "steering": (
-        dict.fromkeys(("period_us", "left_us", "neutral_us", "right_us"), _US),
+        {"period_us": _US, "left_us": _US, "neutral_us": _US, "right_us": _US},
         {"positive": one_of(("left", "right"))},
     ),
-    "throttle": (
-        dict.fromkeys(("period_us", "neutral_us", "forward_us"), _US),
-        dict.fromkeys(("reverse_us", "cap_us"), _US),
-    ),
+    "throttle": ({"period_us": _US, "neutral_us": _US, "forward_us": _US}, {"reverse_us": _US, "cap_us": _US}),
     "camera": ({}, {"field_of_view_deg": _NUMBER}),
 }
 
@@ -250,12 +236,10 @@ def _section(value: object, where: str, known: tuple[Mapping[str, Rule], Mapping
     needed, optional = known
     if not isinstance(value, Mapping):
         raise CarError(f"{where} must be a mapping", found=repr(value)[:80])
-    if missing := sorted(needed.keys() - value.keys()):
-        raise CarError(f"{where}: {', '.join(missing)} is missing", remedy="docs/build.md has a whole example")
     if unknown := sorted(map(str, value.keys() - needed.keys() - optional.keys())):
         remedy = f"known are {', '.join(sorted({*needed, *optional}))}"
         raise CarError(f"{where}: unknown {', '.join(unknown)}", remedy=remedy)
-    rules = {name: rule for name, rule in {**needed, **optional}.items() if name in value}
+    rules = {**needed, **{name: rule for name, rule in optional.items() if name in value}}
     if broken := broken_rule(value, rules):
         raise CarError(f"{where}: {broken[0]} must be {broken[1]}", found=broken[2])
     return value

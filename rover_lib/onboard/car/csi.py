@@ -13,6 +13,7 @@ import tempfile
 import threading
 from collections.abc import Generator
 
+from rover_lib.onboard.car.picture import MOST_BYTES
 from rover_lib.onboard.errors import CameraError
 
 PROGRAM = "rpicam-vid"
@@ -21,10 +22,9 @@ SETTINGS = ("shutter", "gain", "ev", "exposure", "awb", "rotation")  # options o
 # A short exposure first: a car that moves blurs a long one.
 DEFAULTS = {"exposure": "sport"}
 QUALITY = 90  # of the JPEGs, in percent; rpicam-vid's own default is 50
-START, END = b"\xff\xd8\xff", b"\xff\xd9"  # of a JPEG; its data contains neither
+START, END = b"\xff\xd8\xff", b"\xff\xd9"  # of a JPEG; its data contains neither: there 00 follows each FF
 STAMP = re.compile(rb"^SensorTimestamp=(\d+)$", re.M)
 END_S = 1.0
-MOST_BYTES = 8_000_000  # of a stream without a JPEG
 
 
 def is_csi(source: str) -> bool:
@@ -100,14 +100,25 @@ def _pairs(pictures: int, entries: int, closing: threading.Event) -> Generator[t
             if not (data := os.read(pictures, 1 << 20)):
                 return
             pending += data
-            while (end := pending.find(END)) >= 0:
-                begun += pending.count(START, 0, end)  # two, where the first was cut: both have an entry
-                if (start := pending.find(START, 0, end)) >= 0:
-                    waiting = {begun: bytes(pending[start : end + 2])}
-                del pending[: end + 2]
-            if len(pending) > MOST_BYTES:
-                raise CameraError(
-                    f"no JPEG in {MOST_BYTES / 1e6:g} MB of {PROGRAM}'s stream", remedy="update rpicam-apps"
-                )
+            jpeg, count = newest_jpeg(pending)
+            begun += count
+            if jpeg:
+                waiting = {begun: jpeg}
         for number in [n for n in waiting if n <= stamps]:
             yield waiting.pop(number), known.get(number)
+
+
+def newest_jpeg(pending: bytearray) -> tuple[bytes, int]:
+    """Cut the whole JPEGs from a stream's bytes. Return the last one, b"" if there is none, and how many had begun.
+
+    One that was cut counts too. Raises CameraError if there is no JPEG's end in many bytes.
+    """
+    jpeg, begun = b"", 0
+    while (end := pending.find(END)) >= 0:
+        begun += pending.count(START, 0, end)
+        if (start := pending.find(START, 0, end)) >= 0:
+            jpeg = bytes(pending[start : end + 2])
+        del pending[: end + 2]
+    if len(pending) > MOST_BYTES:
+        raise CameraError(f"no JPEG in {MOST_BYTES / 1e6:g} MB of the stream", remedy="write JPEGs one after another")
+    return jpeg, begun

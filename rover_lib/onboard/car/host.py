@@ -52,32 +52,24 @@ class Host:
 
     def throttled(self) -> str | None:
         """Return what `vcgencmd get_throttled` reports on a Raspberry Pi, such as "0x0"; None elsewhere."""
-        try:
-            found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
-        except (OSError, subprocess.SubprocessError):
-            return None
-        return self._value_in(found)
-
-    @staticmethod
-    def _value_in(found: "subprocess.CompletedProcess[str]") -> str | None:
-        name, _, value = found.stdout.strip().partition("=")
-        return value if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
+        return self._get_throttled()[0]
 
     def vcgencmd_trouble(self) -> str | None:
-        """Return why `vcgencmd get_throttled` gives no value although it is there; None if it is not there, or works.
+        """Return why `vcgencmd` gives no value although it is there, such as "VCHI initialization failed", or None."""
+        return self._get_throttled()[1]
 
-        Its own words, such as "VCHI initialization failed", are cut to one line.
-        """
+    def _get_throttled(self) -> tuple[str | None, str | None]:
         if shutil.which(self.vcgencmd) is None:
-            return None
+            return None, None
         try:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
         except (OSError, subprocess.SubprocessError) as error:
-            return f"{self.vcgencmd}: {type(error).__name__}"
-        if self._value_in(found):
-            return None
+            return None, f"{self.vcgencmd}: {type(error).__name__}"
+        name, _, value = found.stdout.strip().partition("=")
+        if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value):
+            return value, None
         said = ascii(" ".join((found.stderr + found.stdout).split()))[1:-1][:160]
-        return f"{self.vcgencmd} says {said!r}" if said else f"{self.vcgencmd} ended with {found.returncode}, silently"
+        return None, f"{self.vcgencmd} ended with {found.returncode}: {said or 'no word'}"
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""

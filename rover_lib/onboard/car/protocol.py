@@ -72,12 +72,12 @@ class Hello:
 class Telemetry:
     """One status of the Arduino. Pulses and periods are whole microseconds; None means "no pulse", and 0 never does.
 
-    host_s: time.monotonic() (or the link's clock) when the whole line had arrived here. uptime_ms: the Arduino's clock,
-    which wraps at 2^32. sequence: of the last command that it accepted as new. result: what became of the last command,
-    a key of RESULTS. missing: what is missing before the car can be armed, a key of MISSING. steering_us, throttle_us:
-    the pulses on its pins. cap_us: the pulse of the most throttle that the host gets; with reverse, the same distance
-    from neutral limits it there. receiver_*: the transmitter's pulses. The last four are counters, which stop at 65535:
-    lines that were no command; replayed or late commands, and those for another start; pulses out of range; bytes lost.
+    host_s: when the whole line had arrived here, by time.monotonic() (or the link's clock). uptime_ms: the Arduino's
+    clock, which wraps at 2^32. sequence: of the last command that it accepted as new. result: what became of the last
+    command, a key of RESULTS. missing: what arming lacks, a key of MISSING. steering_us, throttle_us: the pulses on its
+    pins. cap_us: the pulse of the most throttle that the host gets; with reverse, as far to the other side.
+    receiver_*: the transmitter's pulses. The last four are counters, which stop at 65535: lines that were no command;
+    replayed or late commands, and those for another start; pulses out of range; bytes lost.
     """
 
     host_s: float
@@ -143,7 +143,8 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
             return None
         # In another protocol only the first two fields are sure to mean the same.
         return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"], int(car or 0))
-    if not (found := _STATUS.fullmatch(text)):
+    found = _STATUS.fullmatch(text)
+    if not found:
         return None
     boot, uptime, sequence, result, state, reason, missing, *numbers = found.groups()
     values: list[Any] = [None if n is None else int(n) for n in numbers]  # the pattern says which may be None

@@ -5,9 +5,11 @@ Throttle 0 means *stopped*, 120 us; it is not the middle of the throttle's range
 car.yml (see car.py). Their spans may differ on the two sides of neutral, and they may be inverted.
 """
 
+import contextlib
 import math
 import numbers
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from rover_lib.onboard.errors import CarError
 
@@ -17,17 +19,10 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 
 def _finite(value: object, what: str) -> float:
     """Return `value` as a float. Raises CarError for None, strings, booleans, NaN and infinities."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        raise CarError(
-            f"{what} must be a number", found=f"{type(value).__name__} {value!r}", remedy="send neutral instead"
-        )
-    try:
-        found = float(value)
-    except OverflowError:
-        found = math.inf
-    if not math.isfinite(found):
-        raise CarError(f"{what} must be finite", found=found, remedy="send neutral and look at what computed it")
-    return found
+    with contextlib.suppress(OverflowError):
+        if isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(found := float(value)):
+            return found
+    raise CarError(f"{what} must be a finite number", found=f"{type(value).__name__} {value!r}"[:80])
 
 
 @dataclass(frozen=True)
@@ -52,9 +47,7 @@ class Channel:
     def __post_init__(self):
         for key in ("period_us", "neutral_pct", "span_pct", "low", "high"):
             _finite(getattr(self, key), f"{self.name} {key}")
-        if self.below_pct is not None:
-            _finite(self.below_pct, f"{self.name} below_pct")
-        below = self._span_pct(-1.0)
+        below = _finite(self._span_pct(-1.0), f"{self.name} below_pct")
         if self.period_us <= 0 or self.span_pct * below <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
             raise CarError(
                 f"{self.name}: period {self.period_us} us, span {self.span_pct} and {below} %, range "
@@ -64,7 +57,7 @@ class Channel:
         ends = sorted(self._duty_pct(action) for action in (self.low, self.high))
         if ends[0] <= 0 or ends[1] >= 100:
             raise CarError(
-                f"{self.name}: its ends must be inside a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} % of it"
+                f"{self.name}: its ends must be within a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} %"
             )
 
     def _span_pct(self, action: float) -> float:
@@ -93,33 +86,22 @@ class Channel:
         """Return the pulse for an action, in whole microseconds. Raises CarError for NaN and outside [low, high]."""
         action = _finite(action, self.name)
         if not self.low <= action <= self.high:
-            raise CarError(
-                f"{self.name} must be in [{self.low:g}, {self.high:g}]",
-                found=f"{action:g}",
-                remedy="clip the plan first",
-            )
+            raise CarError(f"{self.name} must be in [{self.low:g}, {self.high:g}]", found=f"{action:g}")
         return round(self._duty_pct(action) / 100 * self.period_us)
-
-    def measured(self, pulse_us: float, period_us: float) -> bool:
-        """Return whether the firmware measured a pulse.
-
-        If it did, the pulse is longer than 0 and shorter than its period, and the period is within 25 % of the nominal
-        one: neither 0 nor two periods taken for one. Raises CarError for what is not a finite number.
-        """
-        pulse_us, period_us = (_finite(pulse_us, f"{self.name} pulse"), _finite(period_us, f"{self.name} period"))
-        return 0 < pulse_us < period_us and 0.75 * self.period_us < period_us < 1.25 * self.period_us
 
     def action(self, pulse_us: float, period_us: float | None = None) -> float | None:
         """Return the action that a pulse stands for, in [low, high], or None (not 0) if no pulse was measured.
 
-        period_us: the measured period; None: the nominal one. An action beyond an end is clipped to it, as the
-        firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises CarError for a pulse that is None, and
-        for strings, NaN and infinities.
+        period_us: the measured period; None: the nominal one. A pulse was measured if it is shorter than its period,
+        and that within 25 % of the nominal one: neither 0 nor two periods taken for one. An action beyond an end is
+        clipped to it, as the firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises CarError for a
+        pulse that is None, and for strings, NaN and infinities.
         """
-        period_us = self.period_us if period_us is None else period_us
-        if not self.measured(pulse_us, period_us):
+        pulse_us = _finite(pulse_us, f"{self.name} pulse")
+        period_us = _finite(self.period_us if period_us is None else period_us, f"{self.name} period")
+        if not (0 < pulse_us < period_us and 0.75 * self.period_us < period_us < 1.25 * self.period_us):
             return None
-        duty_pct = float(pulse_us) / (self.period_us if self.by_pulse else float(period_us)) * 100
+        duty_pct = pulse_us / (self.period_us if self.by_pulse else period_us) * 100
         action = (duty_pct - self.neutral_pct) / self.span_pct
         if action < 0:
             action = (duty_pct - self.neutral_pct) / self._span_pct(action)
@@ -142,17 +124,11 @@ class Pulses:
     throttle_us: int
 
 
-@dataclass(frozen=True)
-class Actions:
+class Actions(NamedTuple):
     """The actions read from the transmitter; None for a channel without a measured pulse."""
 
     steering: float | None
     throttle: float | None
-
-    @property
-    def measured(self) -> bool:
-        """Whether both channels were measured."""
-        return self.steering is not None and self.throttle is not None
 
 
 @dataclass(frozen=True)
@@ -167,9 +143,7 @@ class PwmCalibration:
     def channel(self, action_name: str) -> Channel:
         """Return the channel of "steering" or "throttle". Raises CarError for other names."""
         if action_name not in ("steering", "throttle"):
-            raise CarError(
-                f"no servo channel for action {action_name!r}", remedy="this rover has steering and throttle"
-            )
+            raise CarError(f"an action must be steering or throttle, found {action_name!r}")
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:
@@ -192,13 +166,12 @@ class PwmCalibration:
     ) -> Actions:
         """Return the actions that two measured pulses stand for. A period that is None stands for the nominal one.
 
-        The action is None, not 0, for a channel without a measured pulse (see Channel.measured()).
-        Raises CarError for pulses that are None, and for strings, NaN and infinities.
+        Otherwise as Channel.action().
         """
         return Actions(
             self.steering.action(steering_us, steering_period_us), self.throttle.action(throttle_us, throttle_period_us)
         )
 
     def us_per_unit(self, action_name: str) -> float:
-        """Return the microseconds of pulse per unit of an action: they turn an action's error into the servo's."""
+        """Return the microseconds of pulse per unit of an action."""
         return self.channel(action_name).us_per_unit

@@ -1,8 +1,7 @@
 """The serial link to the rover's Arduino: commands out, telemetry in, by the protocol of firmware/README.md.
 
-The Arduino is what keeps the car safe: it stops the car 150 ms after the last valid command, rejects a command that
-waited in the link for longer than that, and hands over to the human at the first move of a stick. This module adds
-three things: it sends nothing out of range, it sends neutral when the link is left, and it notes when each status came.
+The Arduino keeps the car safe. This adds three things: it sends nothing out of range, it sends neutral when the link is
+left, and it notes when each status came.
 """
 
 import contextlib
@@ -17,6 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from numbers import Integral
+from typing import Any
 
 import serial
 
@@ -86,19 +86,16 @@ class ServoLink:
             while ...:
                 link.send_action(steering, throttle)  # at least every 150 ms
 
-    Any thread may call any method. Nothing is reconnected behind the caller's back: when the port fails, each call
-    raises LinkError, the Arduino stops by itself, and the caller decides whether to open a new link, whose Arduino is
-    then in manual and has to be armed again. With a car whose human has a gamepad, the thread that reads the statuses
-    answers them with its sticks. If the Arduino resets itself, the link goes on with the number of its new
+    Any thread may call any method. Nothing is reconnected: when the port fails, each call raises LinkError, the Arduino
+    stops by itself, and the caller may open a new link. With a car whose human has a gamepad, the thread that reads the
+    statuses answers them with its sticks. If the Arduino resets itself, the link goes on with the number of its new
     start, but the Arduino ignores drive commands until arm().
     """
 
     def __init__(
         self, port: str, *, car: Car | None = None, boot_s: float = BOOT_S, clock: Callable[[], float] = time.monotonic
     ):
-        """port: "" means the only Arduino's. car: None means this machine's. Raises CarError if its car.yml cannot be
-        read, and RoverError if it is not clear which port is meant.
-        """
+        """port: "" means the only Arduino's. car: None means this machine's. Raises RoverError if either is unclear."""
         self._gamepad: Gamepad | None = None
         self._relayed_s = 0.0
         self.port = port or find_port()
@@ -110,9 +107,8 @@ class ServoLink:
         self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._closing = threading.Event()
-        self._heard = threading.Condition()  # guards the seven below
+        self._heard = threading.Condition()  # guards the six below
         self._hello: Hello | None = None
-        self._hellos = 0
         self._telemetry: Telemetry | None = None
         self._turned: Telemetry | None = None
         self._requested: Telemetry | None = None  # the newest status when somebody asked to arm the car
@@ -122,7 +118,6 @@ class ServoLink:
         self._boot = 0
         self._sequence = 0
         self._asked = 0.0
-        self.resets = 0  # of the Arduino while the link was open
         self.garbled = 0  # lines of the Arduino that were dropped
 
     def __enter__(self) -> "ServoLink":
@@ -135,14 +130,10 @@ class ServoLink:
     def open(self) -> Hello:
         """Open the port for this program alone, wait for the hello and a first status, and tell the Arduino of the car.
 
-        The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it. It is
-        told of every car but the default one, and of that too if it now drives its pins for another.
-        Raises LinkError if the port cannot be opened or is in use, if nothing there says hello within `boot_s` seconds,
-        if the firmware is another one than this program knows, or if it refuses this car. Raises CarError as
-        open_gamepad() does.
+        The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it.
+        Raises LinkError if the port cannot be opened, if nothing there says hello within `boot_s` seconds, and for
+        another firmware, or one that refuses this car. Raises CarError as open_gamepad() does.
         """
-        if self._serial:
-            raise LinkError(f"{self.port}: the link is open already", remedy="close it first")
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
             _keep(self._serial)
@@ -151,17 +142,14 @@ class ServoLink:
             self._release()
             raise LinkError(
                 f"{self.port}: cannot be opened ({error})",
-                remedy="is the Arduino plugged in, is the user in group dialout, and does no other program have the "
-                "port?",
+                remedy="is it plugged in, is the user in group dialout, and does no other program have the port?",
             ) from error
         self._closing.clear()
         self._gamepad = None
         with self._heard:
             self._hello = self._telemetry = self._turned = self._requested = self._failure = None
             self._unanswered.clear()
-        self._reader = threading.Thread(
-            target=self._read, args=(self._serial,), name=f"servo link {self.port}", daemon=True
-        )
+        self._reader = threading.Thread(target=self._read, args=(self._serial,), name="servo link", daemon=True)
         self._reader.start()
         try:
             hello = self._wait_for_hello()
@@ -177,14 +165,10 @@ class ServoLink:
         opened = self._clock()
         self._asked = opened
         while True:
-            with self._heard:
-                self._heard.wait_for(lambda: self._hello or self._failure, timeout=REPEAT_S)
-                hello, failure, running = self._hello, self._failure, self._telemetry
-            if failure:
-                raise failure
+            hello = self._await(lambda: self._hello, REPEAT_S)
             if hello:
                 break
-            now = self._clock()
+            now, running = self._clock(), self._telemetry
             if now - opened > self.boot_s:
                 raise LinkError(
                     f"{self.port}: no hello from an Arduino within {self.boot_s:g} s",
@@ -199,16 +183,22 @@ class ServoLink:
         if self.car.human == "gamepad":
             build, make = f"{build}-gamepad", f"{make} HUMAN=gamepad"
         if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, build):
-            car = "" if self.car.is_default else f"; it cannot drive {self.car.name!r} of car.yml"
             raise LinkError(
-                f"{self.port}: the Arduino has firmware {hello.firmware} (protocol {hello.protocol}), this program "
-                f"knows {build} (protocol {PROTOCOL_VERSION}){car}",
+                f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})",
+                found=f"{hello.firmware} (protocol {hello.protocol})",
                 remedy=f"put the matching firmware on it: {make} PORT={self.port}",
             )
-        with self._heard:
-            if not self._heard.wait_for(lambda: self._telemetry or self._failure, timeout=STALE_S):
-                raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
+        if not self._await(lambda: self._telemetry, STALE_S):
+            raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
+
+    def _await(self, condition: Callable[[], Any], timeout_s: float) -> Any:
+        """Wait until a condition holds, and return its value. Raises LinkError if the port fails meanwhile."""
+        with self._heard:
+            self._heard.wait_for(lambda: condition() or self._failure, timeout=timeout_s)
+            if self._failure:
+                raise self._failure
+            return condition()
 
     def tell(self, car: Car) -> None:
         """Make the Arduino drive its pins for this car from now on. Raises LinkError if it refuses the car."""
@@ -225,16 +215,10 @@ class ServoLink:
             if telemetry.result == "k":
                 self._told_boot = telemetry.boot
                 return
-            if telemetry.result == "r":
-                raise LinkError(
-                    f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml, its firmware allows no such car",
-                    remedy="measure it with `rover calibrate`",
-                )
-            if telemetry.result == "t":
-                raise LinkError(
-                    f"{self.port}: a human drives, and the Arduino does not change its car", remedy=MISSING["t"]
-                )
-        raise LinkError(f"{self.port}: the Arduino was not told of the car; {self._last_words()}")
+            if telemetry.result in "rt":
+                remedy = MISSING["t"] if telemetry.result == "t" else "measure it with `rover calibrate`"
+                raise LinkError(f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml", remedy=remedy)
+        raise self._no_answer("being told of the car")
 
     def close(self) -> None:
         """Send neutral, then close the port. Raises nothing: an Arduino that cannot be reached stops by itself."""
@@ -266,18 +250,14 @@ class ServoLink:
             self._gamepad.close()
 
     def request(self, *, keep: bool = False) -> None:
-        """Note that somebody asks for the car now; the next arm() tells the Arduino, which counts the request's age.
-
-        keep: an earlier request that was not tried yet stays as old as it is.
-        """
+        """Note that somebody asks for the car now. keep: an earlier request, not tried yet, stays as old as it is."""
         with self._heard:
             self._requested = (keep and self._requested) or self._telemetry
 
     def arm(self) -> Telemetry:
         """Hand the car to the host, which must send commands from then on. Return the status that confirms it.
 
-        It is asked for now, or when request() was called. Raises LinkError if the Arduino refuses, with what is missing
-        as its remedy, or does not answer within 0.5 s.
+        The Arduino counts from request(), or from now. Raises LinkError if it refuses, or does not answer within 0.5 s.
         """
         hello = self.hello
         with self._heard:
@@ -291,20 +271,16 @@ class ServoLink:
                 return telemetry
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
                 continue  # it has just started, and cannot have seen the signals yet
-            if telemetry.result in "ce":
-                raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy="start again")
-            if telemetry.result in MISSING and telemetry.result != "-":
-                raise LinkError(
-                    f"{self.port}: arming was {RESULTS[telemetry.result]}",
-                    remedy=f"{self.remedy(telemetry.result)}, then try again",
-                )
-        raise LinkError(f"{self.port}: no answer to arming within {ANSWER_S:g} s; {self._last_words()}")
+            if telemetry.result in "cestw":
+                start = telemetry.result in "ce"
+                remedy = "start again" if start else f"{self.remedy(telemetry.result)}, then try again"
+                raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy=remedy)
+        raise self._no_answer("arming")
 
     def remedy(self, missing: str) -> str:
         """Return what this car's human does about what is missing, a key of MISSING.
 
-        Here a gamepad that was gone is opened again, if it is the same one; if it cannot be, that is what is missing.
-        Never waits.
+        A gamepad that was gone is opened again, if the same one is back. Never waits.
         """
         if missing != "s" or self.car.human != "gamepad":
             return MISSING[missing]
@@ -317,21 +293,20 @@ class ServoLink:
         return "hold L1 of the gamepad"
 
     def neutral(self) -> Telemetry:
-        """Stop the car until arm() if the host drives it; a human who drives goes on. Return the confirming status.
+        """Stop the car until arm() if the host drives it. Return the status that confirms it.
 
         Raises LinkError if the Arduino does not answer within 0.5 s; it stops by itself then.
         """
         for telemetry in self._ask(">N"):
             if telemetry.state is not State.AUTONOMOUS:
                 return telemetry
-        raise LinkError(f"{self.port}: no answer to neutral within {ANSWER_S:g} s; {self._last_words()}")
+        raise self._no_answer("neutral")
 
     def lower_cap(self, throttle_us: int) -> Telemetry:
         """Lower the host's throttle limit until the Arduino's next reset. Return the status that confirms it.
 
-        With reverse, the same distance from neutral limits it there.
-
-        Raises LinkError for a pulse out of range, while the car is armed, or without an answer within 0.5 s.
+        With reverse, the same distance from neutral limits it there. Raises LinkError for a pulse out of range, while
+        the car is armed, or without an answer within 0.5 s.
         """
         most_us = self._whole(self.calibration.throttle, throttle_us)
         neutral_us = self.calibration.throttle.neutral_us
@@ -340,7 +315,7 @@ class ServoLink:
                 return telemetry
             if telemetry.state is State.AUTONOMOUS:
                 raise LinkError(f"{self.port}: the throttle's cap is not changed while the car drives")
-        raise LinkError(f"{self.port}: no answer to the throttle's cap within {ANSWER_S:g} s; {self._last_words()}")
+        raise self._no_answer("the throttle's cap")
 
     def _ask(self, kind: str, *values: int) -> Iterator[Telemetry]:
         """Send a command every REPEAT_S until ANSWER_S is over; yield each status that the Arduino sends after it."""
@@ -352,11 +327,8 @@ class ServoLink:
             until = self._clock() + REPEAT_S
             seen = None
             while (left := until - self._clock()) > 0:
-                with self._heard:
-                    self._heard.wait_for(lambda: self._telemetry is not seen or self._failure, timeout=left)  # noqa: B023
-                    if self._failure:
-                        raise self._failure
-                    seen = self._telemetry
+                self._await(lambda: self._telemetry is not seen, left)  # noqa: B023
+                seen = self._telemetry
                 # An earlier status says nothing about the command.
                 if seen and _reached(seen, first) and seen.boot == self._boot:
                     yield seen
@@ -364,7 +336,7 @@ class ServoLink:
     def send(self, steering_us: int, throttle_us: int) -> int:
         """Send two pulses, whole microseconds, without waiting for an answer. Return the command's number.
 
-        Raises LinkError for pulses outside the calibration's range, which are not sent, and if the port failed.
+        Raises LinkError for pulses out of range, which are not sent, and if the port failed.
         """
         steering_us = self._whole(self.calibration.steering, steering_us)
         throttle_us = self._whole(self.calibration.throttle, throttle_us)
@@ -391,14 +363,10 @@ class ServoLink:
         return self.send(pulses.steering_us, pulses.throttle_us)
 
     def latest(self) -> Telemetry | None:
-        """Return the newest status, None before the first.
-
-        Raises LinkError if the port failed, or if the newest status is more than 0.5 s old.
-        """
-        with self._heard:
-            if self._failure:
-                raise self._failure
-            telemetry = self._telemetry
+        """Return the newest status, None before the first. Raises LinkError if it is older than 0.5 s."""
+        if self._failure:
+            raise self._failure
+        telemetry = self._telemetry
         if telemetry and (age := self._clock() - telemetry.host_s) > STALE_S:
             raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s", remedy="is it still plugged in?")
         return telemetry
@@ -406,48 +374,37 @@ class ServoLink:
     @property
     def turned(self) -> Telemetry | None:
         """The status with which the present state or start of the Arduino began; None before the first status."""
-        with self._heard:
-            return self._turned
+        return self._turned
 
     def unacknowledged_s(self, now_s: float) -> float:
         """Return the age in seconds of the oldest command that the Arduino has not acknowledged; 0 if there is none.
 
-        An acknowledged command acknowledges all before it. now_s: by the link's clock. Stop the car if the age is
-        above LATE_S, because it then obeys commands from the past.
+        now_s: by the link's clock. Above LATE_S, stop the car: it obeys commands from the past.
         """
         with self._heard:
             return now_s - self._unanswered[0][1] if self._unanswered else 0.0
 
     def round_trip_s(self) -> float:
         """Ask for a hello, and return the seconds until it came. Raises LinkError if none comes within 0.5 s."""
-        with self._heard:
-            before = self._hellos
-        start = self._clock()
+        before, start = self.hello, self._clock()
         self._write(frame(">Q"))
-        with self._heard:
-            self._heard.wait_for(lambda: self._hellos > before or self._failure, timeout=ANSWER_S)
-            if self._failure:
-                raise self._failure
-            if self._hellos == before:
-                raise LinkError(f"{self.port}: no answer within {ANSWER_S:g} s", remedy="is it still plugged in?")
-            return self._clock() - start
+        if not self._await(lambda: self._hello is not before, ANSWER_S):
+            raise self._no_answer("a question")
+        return self._clock() - start
 
     @property
     def hello(self) -> Hello | None:
-        """The newest hello: firmware, number of the start, reason of the reset."""
-        with self._heard:
-            return self._hello
+        """The newest hello."""
+        return self._hello
 
-    def _last_words(self) -> str:
-        with self._heard:
-            telemetry = self._telemetry
-        return f"its last status was {telemetry.why}" if telemetry else "it sent no status"
+    def _no_answer(self, what: str) -> LinkError:
+        last = self._telemetry.why if self._telemetry else "none"
+        return LinkError(f"{self.port}: no answer to {what} within {ANSWER_S:g} s", found=f"as last status {last}")
 
     def _send(self, kind: str, *values: int) -> int:
-        with self._heard:
-            if self._failure:
-                raise self._failure
-            heard = self._telemetry
+        if self._failure:
+            raise self._failure
+        heard = self._telemetry
         if kind in DATED:
             if not heard:
                 raise LinkError(f"{self.port}: the Arduino has sent no status yet")
@@ -465,8 +422,8 @@ class ServoLink:
             raise LinkError(f"{self.port}: the link is closed")
         try:
             with self._sending:
-                # Not pyserial's write: without a timeout it may wait for ever, and with one it may report a line as
-                # failed that went out whole while this process waited for the processor. The port is non-blocking.
+                # Not pyserial's write, which may wait for ever, or with a timeout report a line as failed that went
+                # out whole while this process waited for the processor. The port is non-blocking.
                 try:
                     taken = os.write(port.fileno(), line)
                 except BlockingIOError:
@@ -532,8 +489,6 @@ class ServoLink:
             return
         if isinstance(message, Hello):
             with self._sending:
-                if self._hello and message.boot != self._boot:
-                    self.resets += 1
                 if not self._hello or message.boot != self._boot:
                     self._boot, self._sequence = message.boot, message.sequence
         elif self._hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
@@ -544,7 +499,7 @@ class ServoLink:
             if isinstance(message, Hello):
                 if self._hello and message.boot != self._hello.boot:
                     self._unanswered.clear()
-                self._hello, self._hellos = message, self._hellos + 1
+                self._hello = message
             else:
                 before, self._telemetry = self._telemetry, message
                 if not before or (before.boot, before.state) != (message.boot, message.state):

@@ -38,9 +38,9 @@ class DriveOptions:
     much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
     throttle_limit, blend_ticks, ensemble: replace the values of params.yml. threads: of the policy; None: all cores but
     one. log_file: None: the user's. service: run as a systemd service, disarmed until a human arms it. film: the camera
-    may be recorded pictures (a folder, a FIFO, an .mjpeg), which do not show where the car is. latency_ms: make each
-    plan take at least this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car
-    was asked for, by boottime().
+    may be recorded pictures (a folder or a FIFO), which do not show where the car is. latency_ms: make each
+    plan take at least this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when
+    the car was asked for, by boottime().
     """
 
     artifact: Path

@@ -73,7 +73,7 @@ def boost_priority(log: FlightLog) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_on_signals(stop: SignalEvent, log: FlightLog) -> Iterator[None]:
+def stop_on_signals(stop: SignalEvent | threading.Event, log: FlightLog) -> Iterator[None]:
     """Inside the context, each of SIGNALS sets `stop`; the second time, the same signal does what it did before.
 
     Only the main thread may use this.

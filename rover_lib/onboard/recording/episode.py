@@ -50,7 +50,6 @@ DATA = "episode_data.json"
 PART = ".part"  # how the name of the hidden folder ends
 ABOUT = "about.json"  # in the hidden folder: what finish_killed() needs
 KINDS = {"control": "system_timestamp", "frame": "timestamp"}  # of rows, and the name of their time
-CUT_OFF = "the recording was cut off"
 SYNC_S = 0.4  # and two syncs of 0.3 s: a power cut costs the last second
 DATA_BYTES = 200_000_000  # largest data file that is read: three hours of driving
 LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers stay finite
@@ -116,7 +115,8 @@ class EpisodeWriter:
         self._part: Path | None = None  # the hidden folder, while it is open
         self._lock: int | None = None
         self._rows: dict[str, FileIO] = {}
-        self._damaged: set[str] = set()  # pictures that a kill or a power cut has left without their end
+        self._damaged: set[Any] = set()  # pictures that a kill or a power cut has left without their end
+        self._left_out = 0  # damaged rows and pictures
         self._closing, self._syncing = threading.Event(), threading.Thread(target=self._keep_synced, daemon=True)
         self._unsynced: OSError | None = None
 
@@ -231,7 +231,8 @@ class EpisodeWriter:
                     self._write(part)
                     sync_disk(part)
                 for name in (*(f"{kind}.rows" for kind in KINDS), ABOUT):
-                    (part / name).unlink(missing_ok=True)
+                    if not self._left_out:  # else the damaged rows stay too: nothing that was recorded is removed
+                        (part / name).unlink(missing_ok=True)
                 self._refuse_existing()  # rename would replace an empty folder without a word
                 move_durably(part, self.folder)
             self._part = None
@@ -255,24 +256,25 @@ class EpisodeWriter:
     def _take(self, part: Path, lock: int) -> None:
         """Go on with what an ended process has left in a hidden folder."""
         self._part, self._lock = part, lock
-        known, left_out = {*CONTROL_FIELDS, *FLAG_FIELDS}, 0
+        known = {*CONTROL_FIELDS, *FLAG_FIELDS}
         for kind, time in KINDS.items():
             for line in _lines(part, kind):
                 row = _whole_row(line, kind)
-                if row and kind == "frame" and not _is_whole_picture(part / row["image_path"]):
-                    self._damaged.add(row["image_path"])
+                if row and kind == "frame" and not _is_whole_picture(part / str(row.get("image_path"))):
+                    self._damaged.add(row.get("image_path"))
                     row = None
                 if row is None:
-                    left_out += 1
+                    self._left_out += 1
                     continue
                 self.controls += kind == "control"
                 self.frames += kind == "frame"
                 self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in known)
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
-                if kind == "frame" and self.frames == 1:
+                if kind == "frame" and self.resolution is None:
                     picture = cv2.imread(str(part / row["image_path"]))
-                    self.resolution = None if picture is None else picture.shape[1::-1]
-        self.metadata["fault"] = CUT_OFF + (f"; {left_out} damaged rows and pictures are left out" if left_out else "")
+                    self.resolution = None if picture is None else (picture.shape[1], picture.shape[0])
+        damaged = f"; {self._left_out} damaged rows and pictures are left out" if self._left_out else ""
+        self.metadata["fault"] = f"the recording was cut off{damaged}"
 
     def _rows_of(self, part: Path, kind: str) -> Iterator[dict[str, Any]]:
         for line in _lines(part, kind):

@@ -81,9 +81,8 @@ class Recorder:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if error and not self.controls and not self._queue:
-            self.discard()  # the drive had not begun, say because the car was not armed
-        self.close(sentence_of(error) if error else None)
+        begun = error is None or self.controls or self._queue  # else the car was not armed, say
+        self.close(sentence_of(error) if error else None, unwanted=not begun)
 
     def control(self, host_s: float, *reading: int | None, **extra: Any) -> None:
         """Hand over one control, at time `host_s` of the clock. Never blocks, never raises.
@@ -102,25 +101,20 @@ class Recorder:
         if self.failure is None and not self._closing.is_set():
             self._writer.metadata |= metadata
 
-    def close(self, fault: str | None = None) -> Path | None:
+    def close(self, fault: str | None = None, unwanted: bool = False) -> Path | None:
         """End the episode and return its folder; None if there is no usable episode, and `failure` says why.
 
         fault: the fault that ended it, if there was one. An episode that a fault ended is kept as far as it goes; the
-        fault is noted in its metadata and in `failure`.
+        fault is noted in its metadata and in `failure`. unwanted: remove all of it.
         """
-        if fault and not self._closing.is_set():
+        self._unwanted = unwanted
+        if fault and not unwanted and not self._closing.is_set():
             self._fail(fault)
         self._closing.set()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
             self._fail(f"{self.folder}: the disk has not taken the episode for {CLOSE_S:g} s: check it")
         return self.path
-
-    def discard(self) -> None:
-        """End the episode and remove all of it."""
-        self._unwanted = True
-        self._closing.set()
-        self._thread.join(CLOSE_S)
 
     @property
     def controls(self) -> int:

@@ -9,7 +9,7 @@ import random
 import needs
 import pytest
 from recorded import real_episode
-from uno import CUT, LINE_IN, RESET, Uno, line, pulses, widths
+from uno import CUT, EDGE_US, LINE_IN, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
@@ -17,9 +17,6 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 pytestmark = [pytest.mark.emulated, needs.simavr]
 NEUTRAL_US = 1456, 120
 TIMEOUT_MS, WATCHDOG_MS, TAKEOVER_MS = 150, 60, 50
-EDGE_US = 0.3  # an instruction of simavr takes up to four cycles of 0.0625 us
-STEP_US = ARDUINO_STEP_US + EDGE_US
-ANSWER_MS = 25  # a command takes up to 4 ms on the wire, a status 7, and may wait for one that is under way
 REST = (1460, 124)  # sticks that were let go, a little off, as transmitters are
 RUBBISH = b"<>ADNQ 0123456789*ABCDEF\n\xff"
 
@@ -37,21 +34,6 @@ def armed(board):
     board.run_ms(120)
     arm(board)
     return board
-
-
-def arm(board):
-    board.wiggle()
-    board.command("A")
-    board.run_ms(ANSWER_MS)
-    assert (board.status.state, board.status.reason, board.status.result) == ("A", "a", "k"), board.lines[-3:]
-
-
-def on_pins(events, steering_us, throttle_us, after_us=0, within_us=EDGE_US):
-    """Whether there are pulses of both pins, and all are these."""
-    for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
-        measured = widths(events, pin, after_us)
-        assert measured, f"no {pin} pulses"
-        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"
 
 
 def last_throttle_us(events):
@@ -74,30 +56,29 @@ def test_recorded_pulses_come_out_as_they_went_in(board):
     """What a transmitter sent, through the receiver's pins, and as actions through the host, within a timer step."""
     pwm = PwmCalibration()
     controls = json.loads((real_episode() / "episode_data.json").read_text())["control_samples"][60:260:8]
+    moving = []
     board.transmitter(*REST)
     board.run_ms(100)
     for control in controls:
         steering_us, throttle_us = control["steering_raw_us"], control["throttle_raw_us"]
-        if pwm.actions_from_pulses(steering_us, throttle_us).measured and throttle_us >= 40:
-            board.transmitter(steering_us, throttle_us)
-            board.run_ms(50)
-            on_pins(board.run_ms(25), steering_us, throttle_us, within_us=STEP_US)
-            assert abs(board.status.receiver_steering_us - steering_us) <= ARDUINO_STEP_US
+        periods_us = control["steering_period_us"], control["throttle_period_us"]
+        actions = pwm.actions_from_pulses(steering_us, throttle_us, *periods_us)
+        if None in actions:
+            continue
+        board.transmitter(steering_us, throttle_us)
+        board.run_ms(50)
+        on_pins(board.run_ms(25), steering_us, throttle_us, within_us=STEP_US)
+        assert abs(board.status.receiver_steering_us - steering_us) <= ARDUINO_STEP_US
+        if actions.throttle > 0:
+            moving.append((steering_us, throttle_us, pwm.pulses(*actions)))
     board.transmitter(*REST)
     board.run_ms(60)
     arm(board)
-    checked = 0
-    for control in controls:
-        actions = pwm.actions_from_pulses(
-            *(control[f"{name}_{what}_us"] for what in ("raw", "period") for name in ("steering", "throttle"))
-        )
-        if actions.measured and actions.throttle > 0:
-            sent = pwm.pulses(actions.steering, actions.throttle)
-            board.drive(sent.steering_us, sent.throttle_us, 60)
-            events = board.drive(sent.steering_us, sent.throttle_us, 25)
-            on_pins(events, control["steering_raw_us"], control["throttle_raw_us"], within_us=2 * ARDUINO_STEP_US)
-            checked += 1
-    assert checked >= 5
+    for steering_us, throttle_us, sent in moving:
+        board.drive(sent.steering_us, sent.throttle_us, 60)
+        events = board.drive(sent.steering_us, sent.throttle_us, 25)
+        on_pins(events, steering_us, throttle_us, within_us=2 * ARDUINO_STEP_US)
+    assert len(moving) >= 5
 
 
 def test_no_command_for_150_ms_stops(armed):
@@ -206,26 +187,19 @@ def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
         assert abs(board.status.receiver_steering_us - steering_us) <= STEP_US + 0.5
 
 
-@pytest.mark.parametrize("let_go", [False, True])
-def test_a_held_throttle_of_a_gamepad_stops(let_go):
+@pytest.mark.parametrize(("let_go", "most_ms"), [(False, 155), (True, 30)])
+def test_a_held_throttle_of_a_gamepad_stops(let_go, most_ms):
     """Of the firmware that is built with HUMAN=gamepad, whose human's sticks are a host's lines."""
     board = Uno(human="gamepad")
     board.run_ms(120)
-
-    def hold(steering_us, throttle_us, ms):
-        events = []
-        for _ in range(0, ms, 20):
-            board.send(line(f">S {board.boot} {board.status.uptime_ms} {steering_us} {throttle_us}"))
-            events += board.run_ms(20)
-        return events
-
-    hold(1456, 120, 400)
-    assert any(abs(us - 200) <= 1 for us in widths(hold(1600, 200, 300), "throttle"))
-    at_us = board.now_us
-    if let_go:
-        hold(0, 0, 20)
+    held = [(1456, 120)] * 20 + [(1600, 200)] * 15
+    for steering_us, throttle_us in held + [(0, 0)] * let_go:
+        at_us = board.now_us
+        board.send(line(f">S {board.boot} {board.status.uptime_ms} {steering_us} {throttle_us}"))
+        board.run_ms(20)
+    assert any(abs(us - 200) <= 1 for us in widths(board.events, "throttle"))
     board.run_ms(400)
-    off_ms = (last_throttle_us(board.events) - at_us) / 1000
+    off_ms = (last_throttle_us(board.events) - at_us) / 1000  # after the last line began
     print(f"throttle off after {off_ms:.1f} ms")
-    assert off_ms <= (30 if let_go else 155)
+    assert off_ms <= most_ms
     board.close()

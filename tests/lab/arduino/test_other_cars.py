@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import needs
 import pytest
-from uno import EEPROM_BYTES, REPOSITORY, RESET, Uno, pulses, widths
+from uno import ANSWER_MS, EDGE_US, EEPROM_BYTES, REPOSITORY, RESET, STEP_US, Uno, arm, on_pins, pulses, widths
 
 from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -16,10 +16,7 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
 pytestmark = [pytest.mark.emulated, needs.simavr]
 CRAWLER, INVERTED = (read_car(REPOSITORY / "lab" / "cars" / f"{name}.yml") for name in ("crawler", "inverted"))
-ALL_CARS = [Car(), CRAWLER, INVERTED]
-EDGE_US = 0.3
-STEP_US = ARDUINO_STEP_US + EDGE_US
-ANSWER_MS = 25
+HALF_STEP_US = ARDUINO_STEP_US / 2 + EDGE_US
 
 
 def told(board, car):
@@ -33,21 +30,7 @@ def sticks_rest(board, car):
     """Near neutral; receiver and Arduino have each a clock of their own."""
     periods = {"steering_period_us": car.numbers[0] + 30, "throttle_period_us": car.numbers[4] + 30 * car.reverses}
     board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, **periods)
-
-
-def arm(board):
     board.run_ms(300)
-    board.wiggle()
-    board.command("A")
-    board.run_ms(ANSWER_MS)
-    assert (board.status.state, board.status.result) == ("A", "k"), board.lines[-3:]
-
-
-def on_pins(events, steering_us, throttle_us, within_us=ARDUINO_STEP_US / 2 + EDGE_US):
-    for pin, wanted in (("steering", steering_us), ("throttle", throttle_us)):
-        measured = widths(events, pin)
-        assert measured, f"no {pin} pulses"
-        assert all(abs(us - wanted) <= within_us for us in measured), f"{pin}: {sorted(measured)} us, wanted {wanted}"
 
 
 def has_periods(events, car):
@@ -73,7 +56,7 @@ def test_the_pins_are_car_ymls_over_the_whole_range(crawler):
         wanted = CRAWLER.pwm.pulses(action, CRAWLER.cap * action)
         crawler.drive(wanted.steering_us, wanted.throttle_us, 330)
         events = crawler.drive(wanted.steering_us, wanted.throttle_us, 90)
-        on_pins(events, wanted.steering_us, wanted.throttle_us)
+        on_pins(events, wanted.steering_us, wanted.throttle_us, within_us=HALF_STEP_US)
         has_periods(events, CRAWLER)
     assert crawler.status.state == "A"
 
@@ -101,10 +84,9 @@ def test_after_a_reset_the_pins_have_its_neutral_and_nobody_arms_it(crawler, how
     crawler.run_ms(400)
     reset_us = max(e.at_us for e in crawler.events if e.kind == RESET)
     later = [e for e in crawler.events if e.at_us > reset_us]
-    on_pins(later, 1500, 1500)
+    on_pins(later, 1500, 1500, within_us=HALF_STEP_US)
     has_periods(later, CRAWLER)
     sticks_rest(crawler, CRAWLER)
-    crawler.run_ms(400)
     crawler.wiggle()
     crawler.command("A")
     crawler.run_ms(ANSWER_MS)
@@ -138,7 +120,7 @@ def test_told_of_another_car_no_pulse_is_cut():
 # ---- the car that it keeps
 
 
-@pytest.mark.parametrize("car", ALL_CARS, ids=lambda car: car.name)
+@pytest.mark.parametrize("car", [Car(), CRAWLER, INVERTED], ids=lambda car: car.name)
 def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car):
     """Before, they had 120 us at 984 Hz until a host opened the port, whatever the car was."""
     board = Uno(eeprom=b"")
@@ -151,7 +133,7 @@ def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car):
     board.run_ms(300)
     events = [e for e in board.events if e.at_us >= start_us]
     assert all(pulses(events, pin)[0].at_us - start_us < 1500 for pin in ("steering", "throttle"))
-    on_pins(events, car.numbers[2], car.numbers[6])
+    on_pins(events, car.numbers[2], car.numbers[6], within_us=HALF_STEP_US)
     has_periods(events, car)
     assert any(line.endswith(f" p {car.id}") for line in board.lines)
     board.close()

@@ -55,7 +55,7 @@ STEERED = Story((Happening(2300, "the human steers", 300, 2000),))
         ("asked_for", "vehicle->throttle_free ? ", "true ? ", "presets after a loss"),
         ("capped", ")command->throttle_us, vehicle->cap_us);", ")2000, 2000);", "a host that asks for full throttle"),
         ("human_wins", "FAST_MOVED_PULSES : 1)", "8 : 1)", "every third pulse misread"),
-        ("human_keeps", "vehicle->steering_us = vehicle->received[STEERING].pulse_us", "(void)0", STEERED),
+        ("human_keeps", "if (vehicle->state == MANUAL && has_signal(vehicle)) {", "if (false) {", STEERED),
         ("armed_by_people", ".seen && let_go ? NOTHING", ".seen | let_go ? NOTHING", "held since before the start"),
     ],
 )

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rover_lib.onboard.car import car as module
-from rover_lib.onboard.car.car import Car, read_car, this_car, yaml_of
+from rover_lib.onboard.car.car import Car, this_car, yaml_of
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import CarError
 
@@ -26,13 +26,10 @@ def changed(where, value):
     """Return CRAWLER with one value changed, or without it if `value` is None."""
     content = copy.deepcopy(CRAWLER)
     *sections, key = where.split(".")
-    section = content
-    for name in sections:
-        section = section[name]
+    section = content[sections[0]] if sections else content
+    section[key] = value
     if value is None:
         del section[key]
-    else:
-        section[key] = value
     return content
 
 
@@ -52,21 +49,16 @@ def test_without_a_file_it_is_the_recordings_car(no_file):
     np.testing.assert_array_equal(car.limits, [[-1, 0], [1, 1]])
 
 
-def test_the_default_written_down_is_the_same_to_the_bit(no_file):
+def test_the_default_written_down_is_the_same_to_the_bit_and_a_named_file_counts_first(no_file, monkeypatch, tmp_path):
     no_file.write_text(yaml_of(Car()))
     assert this_car() == Car()
     assert this_car().pwm.steering.neutral_pct == 6.83
-
-
-def test_a_file_that_is_named_counts_before_all_places(no_file, monkeypatch, tmp_path):
-    no_file.write_text(yaml_of(Car()))
     other = tmp_path / "other.yml"
-    other.write_text(yaml.safe_dump(CRAWLER))
     monkeypatch.setenv(module.FILE_VARIABLE, str(other))
-    assert this_car().name == "crawler"
-    monkeypatch.setenv(module.FILE_VARIABLE, str(tmp_path / "gone.yml"))
-    with pytest.raises(CarError, match=r"gone\.yml: not found; .*calibrate"):
+    with pytest.raises(CarError, match=r"other\.yml: not found; .*calibrate"):
         this_car()
+    other.write_text(yaml.safe_dump(CRAWLER))
+    assert this_car().name == "crawler"
 
 
 def test_each_side_of_neutral_has_its_own_span():
@@ -79,14 +71,6 @@ def test_each_side_of_neutral_has_its_own_span():
     assert car.focal_px == pytest.approx(268.5, abs=0.05)
 
 
-def test_an_inverted_steering():
-    content = changed("steering.left_us", 1000)
-    content["steering"]["right_us"] = 1900
-    car = Car.of(content)
-    assert [car.pwm.steering.pulse_us(a) for a in (-1, 0, 1)] == [1900, 1500, 1000]
-    assert car.numbers[1:4] == (1000, 1500, 1900)
-
-
 @given(st.floats(-1, 1), st.floats(-1, 1), st.booleans())
 def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
     content = copy.deepcopy(CRAWLER)
@@ -96,6 +80,7 @@ def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
     pulses = pwm.pulses(steering, throttle)
     # A receiver's period may be a little longer or shorter; only the pulse counts for a servo.
     actions = pwm.actions_from_pulses(pulses.steering_us, pulses.throttle_us, 19000, 22000)
+    assert pwm.pulses(-1, 0).steering_us == (2000 if inverted else 1100)
     assert actions.steering == pytest.approx(steering, abs=0.6 / 400)
     assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)
 
@@ -109,7 +94,7 @@ def test_what_moves_a_car():
 @pytest.mark.parametrize(
     ("where", "value", "sentence"),
     [
-        ("steering.left_us", None, "left_us is missing"),
+        ("steering.left_us", None, "left_us must be a whole number"),
         ("colour", "red", "unknown colour"),
         ("steering.left_us", True, "left_us"),
         ("steering.left_us", 1500, "between its two ends"),
@@ -117,7 +102,7 @@ def test_what_moves_a_car():
         ("steering.right_us", 1300, "must be from 250"),
         ("steering.left_us", 2400, "must be from 800 to 2200"),
         ("steering.period_us", 1900, "longer than its pulses"),
-        ("throttle.period_us", 2500, "fast throttle"),
+        ("throttle.period_us", 2500, "throttle's period_us must be from 1000"),
         ("throttle.reverse_us", 700, "an end of throttle"),
         ("throttle.forward_us", 1550, "must be from 100"),
         ("throttle.cap_us", 119, "from 1 to 118"),
@@ -126,21 +111,12 @@ def test_what_moves_a_car():
         ("human", "nobody", "human"),
     ],
 )
-def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, tmp_path):
-    path = tmp_path / "car.yml"
-    path.write_text(yaml.safe_dump(changed(where, value)))
-    with pytest.raises(CarError) as error:
-        read_car(path)
-    assert sentence in str(error.value)
-    assert str(error.value).startswith(f"{path}: ")
-
-
-@pytest.mark.parametrize("text", ["", "- a list", "a: [", "a: 1\na: 2", "wheelbase_m: 2026-13-45"])
-def test_a_file_that_is_no_mapping(tmp_path, text):
-    path = tmp_path / "car.yml"
-    path.write_text(text)
-    with pytest.raises(CarError, match=r"car\.yml"):
-        read_car(path)
+def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, no_file):
+    for text, words in ((yaml.safe_dump(changed(where, value)), sentence), ("- a list", ""), ("a: [", ""), ("", "")):
+        no_file.write_text(text)
+        with pytest.raises(CarError) as error:
+            this_car()
+        assert str(error.value).startswith(str(no_file)) and words in str(error.value)
 
 
 def test_which_side_is_positive_is_said_and_changes_no_pulse():

@@ -162,20 +162,6 @@ def test_the_arduino_gets_each_stick_as_far_as_it_judges(cap_us):
     assert sent == [frame(f">S 7 1000 {steering} {throttle}") for steering, throttle in wanted]
 
 
-def kernel(root, *nodes):
-    """Make a folder like /sys/class/input. nodes: (name, which gamepad, kind)."""
-    for i, (name, whole, kind) in enumerate(nodes):
-        device = root / f"event{i}" / "device"
-        (device / "capabilities").mkdir(parents=True)
-        (root / whole).mkdir(exist_ok=True)
-        (device / "device").symlink_to(root / whole)
-        (device / "name").write_text(name + "\n")
-        (device / "properties").write_text("40\n" if kind == "motion" else "0\n")
-        (device / "capabilities" / "abs").write_text({"pad": "3003f\n", "motion": "3f\n"}.get(kind, "0\n"))
-        (device / "capabilities" / "key").write_text("7fdb000000000000 0 0 0 0\n" if kind == "pad" else "0\n")
-    return lambda: gamepads.list_gamepads(root, root)
-
-
 @pytest.mark.parametrize(
     ("nodes", "sentence"),
     [
@@ -184,20 +170,26 @@ def kernel(root, *nodes):
         ([("A", "a", "pad"), ("B", "b", "pad"), ("", "a", "motion"), ("", "b", "motion")], "A (event0), B (event1)"),
         ([("DualSense", "a", "pad"), ("motion", "a", "motion")], "DualSense (event0) cannot be read"),
     ],
-)  # fmt: skip
+)
 def test_one_sentence_says_what_is_there(tmp_path, nodes, sentence):
+    """In a folder like /sys/class/input. nodes: (name, which gamepad, kind)."""
+    for i, (name, whole, kind) in enumerate(nodes):
+        device = tmp_path / f"event{i}" / "device"
+        (device / "capabilities").mkdir(parents=True)
+        (tmp_path / whole).mkdir(exist_ok=True)
+        (device / "device").symlink_to(tmp_path / whole)
+        (device / "name").write_text(name + "\n")
+        (device / "properties").write_text("40\n" if kind == "motion" else "0\n")
+        (device / "capabilities" / "abs").write_text({"pad": "3003f\n", "motion": "3f\n"}.get(kind, "0\n"))
+        (device / "capabilities" / "key").write_text("7fdb000000000000 0 0 0 0\n" if kind == "pad" else "0\n")
     with pytest.raises(CarError) as error:
-        gamepads.open_gamepad(kernel(tmp_path, *nodes))
+        gamepads.open_gamepad(lambda: gamepads.list_gamepads(tmp_path, tmp_path))
     assert sentence in str(error.value) and error.value.remedy
 
 
 def test_car_yml_names_the_human(tmp_path):
     path = tmp_path / "car.yml"
-    assert "human" not in yaml_of(Car())
     path.write_text(yaml_of(Car(human="gamepad")))
-    assert read_car(path) == Car(human="gamepad")
-    assert read_car(path).drives_like(Car()) and read_car(path).id == Car().id
-    assert [ServoLink("none", car=car).remedy("s") for car in (Car(), read_car(path))] == [
-        MISSING["s"],
-        "hold L1 of the gamepad",
-    ]
+    car = read_car(path)
+    assert car == Car(human="gamepad") and car.drives_like(Car()) and car.id == Car().id
+    assert "human" not in yaml_of(Car()) and ServoLink("none", car=Car()).remedy("s") == MISSING["s"]

@@ -62,7 +62,7 @@ def test_filler_before_markers_is_no_damage():
         assert (decode_jpeg(filled) == decode_jpeg(hostile.RESTARTS if filled.count(b"\xff\xd0") else WHOLE)).all()
 
 
-@given(st.integers(100, len(hostile.RESTARTS) - hostile.SCAN), st.integers(1, 3000))
+@given(st.integers(100, 26_000), st.integers(1, 3000))
 def test_what_is_torn_after_filler_is_torn(from_end, missing):
     """libjpeg's first warning is about the filler, and simplejpeg has no other: half a picture was missing."""
     whole, filled = (

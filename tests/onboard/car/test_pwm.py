@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recorded import real_episode
 
-from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, NEUTRAL, Channel, Pulses, PwmCalibration
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, NEUTRAL, Pulses, PwmCalibration
 from rover_lib.onboard.errors import CarError
 
 PWM = PwmCalibration()
@@ -17,17 +18,12 @@ PWM = PwmCalibration()
 
 @pytest.fixture
 def pwm():
-    return PwmCalibration()
+    return PWM
 
 
 def test_zero_throttle_is_a_stopped_car(pwm):
     assert pwm.pulses(steering=0.0, throttle=0.0).throttle_us == 120
-
-
-def test_neutral_is_straight_and_stopped(pwm):
-    assert NEUTRAL == (0.0, 0.0)
-    assert pwm.neutral() == Pulses(steering_us=1456, throttle_us=120)
-    assert (pwm.steering.neutral_us, pwm.throttle.neutral_us) == (1456, 120)
+    assert NEUTRAL == (0.0, 0.0) and pwm.neutral() == Pulses(steering_us=1456, throttle_us=120)
 
 
 def test_recorded_pulses_come_back_within_a_timer_step(pwm):
@@ -71,10 +67,7 @@ def test_no_pulse_is_no_action(pwm, name, pulse_us, period_us):
     assert pwm.channel(name).action(pulse_us, period_us) is None
 
 
-BAD = [math.nan, -math.inf, None, "0.1", True, 10**400, np.array(0.1)]
-
-
-@pytest.mark.parametrize("bad", BAD, ids=lambda b: f"{type(b).__name__} {b!r}"[:24])
+@pytest.mark.parametrize("bad", [math.nan, -math.inf, None, "0.1", True, 10**400, np.array(0.1)])
 def test_what_is_no_number_never_becomes_a_pulse(pwm, bad):
     with pytest.raises(CarError):
         pwm.pulses(bad, 0.0)
@@ -89,14 +82,12 @@ def test_what_is_no_number_never_becomes_a_pulse(pwm, bad):
 
 @given(st.floats(), st.floats())
 def test_a_pulse_is_within_the_servos_range_or_refused(steering, throttle):
-    try:
+    if -1 <= steering <= 1 and 0 <= throttle <= 1:
         pulses = PWM.pulses(steering, throttle)
-    except CarError:
-        assert not (-1 <= steering <= 1 and 0 <= throttle <= 1)
-    else:
-        assert 900 <= pulses.steering_us <= 2012
-        assert 120 <= pulses.throttle_us <= 711
-        assert isinstance(pulses.steering_us, int)
+        assert 900 <= pulses.steering_us <= 2012 and 120 <= pulses.throttle_us <= 711
+        return
+    with pytest.raises(CarError):
+        PWM.pulses(steering, throttle)
 
 
 @given(st.floats(-1, 1, width=32), st.floats(0, 1, width=32))
@@ -111,8 +102,6 @@ def test_action_to_pulse_and_back(steering, throttle):
 def test_microseconds_per_unit(pwm):
     assert pwm.us_per_unit("steering") == pytest.approx(555.7, abs=0.1)
     assert pwm.us_per_unit("throttle") == pytest.approx(591.2, abs=0.1)
-    span_us = pwm.pulses(1, 1).steering_us - pwm.pulses(-1, 1).steering_us
-    assert 2 * pwm.us_per_unit("steering") == pytest.approx(span_us, abs=1)
     with pytest.raises(CarError, match="gripper"):
         pwm.us_per_unit("gripper")
 
@@ -130,9 +119,5 @@ def test_microseconds_per_unit(pwm):
     ],
 )
 def test_a_calibration_that_exists_is_valid(bad):
-    good = {
-        "name": "steering", "period_us": 21316, "neutral_pct": 6.83, "span_pct": 2.607, "low": -1, "high": 1,
-    }  # fmt: skip
-    Channel(**good)
     with pytest.raises(CarError):
-        Channel(**{**good, **bad})
+        replace(PWM.steering, **bad)

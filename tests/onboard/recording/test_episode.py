@@ -88,7 +88,7 @@ def test_a_recording_that_was_cut_off_is_not_lost(tmp_path, caplog):
     about = content_of(tmp_path / NAME)
     assert (len(about["control_samples"]), len(about["frame_samples"]), about["action_label"]) == (5, 1, "hit")
     assert about["metadata"]["fault"].endswith("3 damaged rows and pictures are left out")
-    assert about["metadata"]["camera_resolution"] == [64, 36]
+    assert about["metadata"]["camera_resolution"] == [64, 36] and (tmp_path / NAME / "control.rows").exists()
     assert "nothing to finish" in finish(tmp_path).output
 
 
