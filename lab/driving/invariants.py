@@ -364,7 +364,7 @@ NAMED = re.compile(
     "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
     "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
     "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
-    "|pictures in a row|no new frame|no frame|ended after|too old"
+    "|pictures in a row|no (new )?frame|ended after|too old"
     "|picture changed|no frames|squeezed|no such camera|has ended|not found|damaged|copy the file|firmware flash"
     "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
 )

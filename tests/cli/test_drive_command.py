@@ -129,7 +129,7 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
     """A camera of some seconds, which torch may take to load, the car being another world's."""
     folder = fresh(tmp_path)
     for i, picture in enumerate(pictures(0) * 14):
-        (folder / f"{i:03}.jpg").write_bytes(picture)
+        (folder / f"{i:05}.jpg").write_bytes(picture)
     with VirtualCar() as car:
         options = ["--film", "--camera", folder, "--port", car.port]
         options += ["--log", folder / "l", "--json", folder / "j"]
@@ -144,7 +144,7 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
 
 def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
     for i, picture in enumerate(pictures(0) * 50):
-        (tmp_path / f"{i:03}.jpg").write_bytes(picture)
+        (tmp_path / f"{i:05}.jpg").write_bytes(picture)
     options = ["--camera", tmp_path, "--dry-run", "--ticks", 30, "--log", tmp_path / "l", "--json", "-"]
     done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

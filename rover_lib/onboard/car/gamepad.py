@@ -166,8 +166,7 @@ class Found:
             for path in (self.pad, self.motion or self.pad):
                 fds.append(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
                 fcntl.ioctl(fds[-1], EVIOCSCLOCKID, struct.pack("i", time.CLOCK_MONOTONIC))
-            pad, motion = fds
-            return Gamepad(self.name, pad, motion, identity=self.identity)
+            return Gamepad(self.name, fds[0], fds[1], self.identity)
         except OSError as error:
             for fd in fds:
                 os.close(fd)
