@@ -46,21 +46,26 @@ class Rows:
 class Recorded(Process):
     """A drive that is recorded, through the human's takeover too."""
 
-    def __init__(self, world):
-        super().__init__(world, service=False)
+    def __init__(self, world, service=False):
+        super().__init__(world, service)
         self.written = Rows(world)
         self.session.options = replace(self.session.options, record="nowhere")
         self.session.make_recorder = lambda folder, room: self.written
 
 
-def mixed(*happenings):
+def mixed(*happenings, service=False):
     """A drive in which a human does things: (milliseconds, what is done to the hand). The world, and the process."""
     world = World()
-    process = Recorded(world)
+    process = Recorded(world, service)
     gesture = [(-400, sticks(300, 0)), (-300, sticks(-300, 0)), (-200, sticks(0, 0))]
     for at_ms, change in (*gesture, *happenings):
         world.at(at_ms + 1800, lambda change=change: (change(world.hand), world.handle()))
     world.sleep(2.8)
+    if service:
+        world.at(3600, process.ask)
+        world.at(6000, process.ask)  # while the human drives
+        world.at(12_500, process.ask)
+        world.at(14_000, process.stopped.set)
     process.run()
     world.close()
     return world, process
@@ -124,3 +129,15 @@ def test_every_frame_of_a_mixed_drive_says_who_drove():
                 farthest_ms = max(farthest_ms, min(abs(frame_ms - ms) for ms in changes))
     print(f"{judged} moments judged; who drove is wrong for at most {farthest_ms:.1f} ms beside a change")
     assert judged > 10_000 and farthest_ms <= FRAME_MS
+
+
+@needs.gcc
+def test_after_a_takeover_the_service_waits_for_another_request():
+    """With the port open: opened again, it might reset the Arduino, and the human would lose the car."""
+    gesture = (9000, sticks(300, 0)), (9100, sticks(-300, 0)), (9200, sticks(0, 0))
+    world, process = mixed((2600, sticks(200, 0)), (5000, sticks(0, 0)), *gesture, service=True)
+    assert [words for _, _, words in world.seen.drives] == ["the human took over with the transmitter", "told to stop"]
+    assert sum(line.startswith(b">C") or line.startswith(b">A") for line in world.written) > 0
+    assert process.session.planner.newest() and len(world.seen.starts) == 1
+    assert any("rest" in text for _, text in world.seen.log)
+    assert process._operators._rounds > 4 * 30  # the watchdog is fed while the human is recorded
