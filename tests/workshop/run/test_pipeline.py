@@ -1,17 +1,25 @@
 """The pipeline once: what the command line makes is what a run makes."""
 
+import shutil
 from types import SimpleNamespace
 
 import pytest
 from policies import memory_samples
 
 from rover_lib.onboard.artifact.manifest import content_hash
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.params import params
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.run import pipeline
-from rover_lib.workshop.run.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
+from rover_lib.workshop.run.pipeline import (
+    Recipe,
+    export_onnx,
+    export_policies,
+    make_artifact,
+    requantize,
+    write_quantize,
+)
 from rover_lib.workshop.run.session import Opened
 
 
@@ -53,3 +61,13 @@ def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(loaded, cal
     with pytest.raises(RoverError):
         export_onnx(tmp_path)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_another_calibration_is_not_taken_for_the_artifacts(tiny, artifacts, calibration, tmp_path):
+    calibration.save(tmp_path / "calibration.pt")
+    shutil.copy(artifacts["static"], tmp_path / "policy_static.pt")
+    made = {"content_hash": content_hash(tmp_path / "policy_static.pt")}
+    write_quantize(tmp_path, tiny, {"modes": {"static": made}})
+    (tmp_path / "calibration.pt").write_bytes(b"another")
+    with pytest.raises(ArtifactError, match="not those of quantize"):
+        requantize(tmp_path, tiny)
