@@ -34,7 +34,7 @@ def fetch(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequenc
     """
     # Imported here, because it takes a second, and a local path does not need it.
     from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RevisionNotFoundError
+    from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError
 
     found = ID.fullmatch(str(hub_id))
     assert found, hub_id
@@ -53,11 +53,9 @@ def fetch(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequenc
             f"{hub_id}: a gated repository",
             remedy="request access on its page, and log in with 'huggingface-cli login'",
         ) from None
-    except RevisionNotFoundError:
-        raise error(f"{hub_id}: has no revision '{revision}'", remedy="give a branch, a tag or a commit") from None
     except Exception as e:  # requests, the Hub's client and the disk each raise their own types
         reason = (str(e).strip().splitlines() or [""])[0][:160]
         raise error(
             f"{hub_id}: cannot be fetched as a {kind} ({type(e).__name__}{': ' if reason else ''}{reason})",
-            remedy="is its name right, and is it public?",
+            remedy="are its name and revision right, and is it public?",
         ) from None

@@ -110,14 +110,3 @@ def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypat
         )
         assert "python_full_version" not in listed and "setuptools==" in listed and "torch==2.8.0" in listed
         assert listed.count("--hash=sha256:") == w.REQUIREMENTS["torch"].read_text().count("--hash=sha256:")
-
-
-@pytest.mark.usefixtures("no_build")
-def test_no_internet_ends_in_a_sentence(tmp_path, monkeypatch):
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/")
-    monkeypatch.setenv("PIP_RETRIES", "0")
-    for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
-    with pytest.raises(w.RoverError, match=r"is there internet here\? pip fetches the wheels of requirements_pi"):
-        w.make(tmp_path, pythons=("3.13",))

@@ -4,7 +4,6 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
@@ -18,7 +17,6 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
-from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
@@ -29,7 +27,7 @@ from rover_lib.workshop.checkpoint.contents import (
     name_weights,
 )
 from rover_lib.workshop.recordings.samples import camera_names
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
 
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
-PRETRAINED, ADAPTER = "pretrained_model", "adapter_config.json"
+PRETRAINED = "pretrained_model"
 ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
 # Each processor's file, its step that normalises, and how its statistics were named among the weights before 0.4.
 INNER = "policy_preprocessor.json", "normalizer_processor", "normalize_inputs.buffer_"
@@ -53,7 +51,7 @@ def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
     folder that has several checkpoints, but no link to the last.
     """
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
-        if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
+        if (path / inner / "config.json").exists():
             return path / inner, []
     for steps in (path / "checkpoints", path):
         if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
@@ -69,7 +67,6 @@ def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
 
 def read_lerobot(folder: Path) -> Contents:
     """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
-    _refuse_pieces(folder)
     said, notes = _act_config(folder)
     state, buffers = _read_safetensors(folder / "model.safetensors"), {}
     for name in list(state):  # also inside of what torch.compile puts around a policy, see name_weights
@@ -278,23 +275,6 @@ def _own_rate_hz(folder: Path) -> float:
     return float(rate_hz)
 
 
-def _refuse_pieces(folder: Path) -> None:
-    """Raise CheckpointError for an adapter, and for weights in pieces: torch's DCP, or an index of safetensors."""
-    if (folder / ADAPTER).exists():
-        raise CheckpointError(
-            f"{folder}: a PEFT adapter, which holds changes to another policy's weights and no policy",
-            remedy="merge it into its policy (PEFT's merge_and_unload) and save that",
-        )
-    around = folder.parent if folder.name == PRETRAINED else folder
-    pieces = [*folder.glob("*.index.json"), *around.glob("*.distcp"), *around.glob("*/*.distcp")]
-    if pieces and not (folder / "model.safetensors").exists():
-        raise CheckpointError(
-            f"{folder}: a sharded checkpoint, and no model.safetensors",
-            found=pieces[0].name,
-            remedy="merge them where it was trained, and save the policy by its save_pretrained",
-        )
-
-
 @contextmanager
 def _as_checkpoint_error(path: Path) -> Iterator[None]:
     """Turn whatever LeRobot, or a reader below it, raises for a file into a CheckpointError of one sentence."""
@@ -310,8 +290,8 @@ def _as_checkpoint_error(path: Path) -> Iterator[None]:
 def _read_json(path: Path) -> dict[str, Any]:
     refuse_pointer(path, CheckpointError)
     try:
-        content = json.loads(read_plain(path, JSON_BYTES))
-    except (ValueError, OSError, RecursionError) as e:  # RecursionError comes from brackets nested too deep
+        content = read_json(path, JSON_BYTES)
+    except (ValueError, OSError) as e:
         reason = e.strerror if isinstance(e, OSError) else f"not JSON: {e}"
         raise CheckpointError(f"{path}: cannot be read ({reason})", remedy=COPY_AGAIN) from None
     if not isinstance(content, dict):
@@ -324,7 +304,8 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         what = "not a file" if path.exists() else "not found"
         raise CheckpointError(
-            f"{printable(str(path))}: {what}", remedy="a LeRobot folder has config.json and model.safetensors"
+            f"{printable(str(path))}: {what}",
+            remedy="save the whole policy by its save_pretrained",
         )
     with _as_checkpoint_error(path):
         return load_file(path)

@@ -6,7 +6,6 @@ The copy is a run like any other: `rover report runs/try1` judges it again, and 
 """
 
 import os
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -35,8 +34,6 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     with build_folder(folder) as new:
         for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
             (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
-        for path in new.glob("*.ipynb"):  # earlier versions wrote the run's own folder into them
-            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', r"run_dir = \".\"", path.read_text()))
     return folder
 
 

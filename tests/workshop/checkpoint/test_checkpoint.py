@@ -263,11 +263,6 @@ def test_refuses_damaged_and_divided_folders(copied):
     os.mkfifo(weights)
     refused(copied)
     weights.unlink()
-    (copied / "model.safetensors.index.json").write_text("{}")
-    assert "sharded" in refused(copied)
-    (copied / "adapter_config.json").write_text("{}")
-    assert "PEFT" in refused(copied)
-    (copied / "adapter_config.json").unlink()
     for text in ("{", "[]", "[" * 100_000, " " * 2_000_000):
         (copied / "config.json").write_text(text)
         refused(copied)

@@ -65,7 +65,9 @@ def test_a_policy_of_older_actions_is_converted_once(tiny, old_recordings):
 
 def test_a_policy_of_todays_actions_stays_as_it_is(tiny, old_recordings, tmp_path):
     today = speaks(tiny, neutral=0.05, gain=1e-3)
-    assert in_todays_units(today, old_recordings, old_recordings.samples) is today
+    doubtful = speaks(tiny, neutral=0.15, gain=1e-3)  # converted, it would be nearer by a quarter only
+    for policy in (today, doubtful):
+        assert in_todays_units(policy, old_recordings, old_recordings.samples) is policy
     never = load_recordings(record_drives(tmp_path / "today"))
     assert in_todays_units(today, never, never.samples) is today
 
