@@ -39,7 +39,7 @@ from rover_lib.onboard.car.protocol import (
 from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.errors import CarError, RoverError
 
-FIRMWARE_VERSION = "4.1.1"  # open() accepts no other; firmware/rover/protocol.h has the same
+FIRMWARE_VERSION = "4.2.0"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
 BOOT_S = 4.0  # a boot loader starts the sketch after 1 to 2 s
 SILENT_S = 0.3  # nothing may be sent before: while an Arduino resets, its boot loader listens
