@@ -101,8 +101,7 @@ def test_an_arduino_that_is_not_reset_is_asked():
         board.hello = f"<H 4 4.2.0 7 40 p {DEFAULT}"
         threading.Thread(target=needs.keep_sending, args=(lambda: board.say(STATUS), 1.2), daemon=True).start()
         with ServoLink(board.port) as link:
-            assert link.hello.sequence == 40
-        assert board.heard[0] == ">Q"
+            assert link.hello.sequence == 40 and board.heard[0] == ">Q"
 
 
 def test_arming_refused():
@@ -152,27 +151,13 @@ def test_what_waited_in_the_port_is_dropped_and_nobody_else_gets_it():
             assert int.from_bytes(excluded, "little") == 1
 
 
-def test_a_reset_meanwhile_needs_arming_again():
-    with board_of(answer=obedient) as board, ServoLink(board.port) as link:
-        link.arm()
-        link.send(1500, 200)
-        board.hello = f"<H 4 4.2.0 8 0 w {DEFAULT}"
-        board.say(board.hello)
-        until(lambda: link.hello.boot == 8)
-        link.send(1500, 200)
-        until(lambda: board.heard[-1] == ">D 8 1 999 1500 200")
-        assert link.hello.reset == "watchdog"
-
-
 def test_an_unplugged_arduino():
     board = Board(answer=obedient)
     with ServoLink(board.port) as link:
         link.arm()
         board.close()
         with pytest.raises(LinkError, match="still plugged in"):
-            for _ in range(100):
-                link.send(1500, 200)
-                time.sleep(0.01)
+            needs.keep_sending(lambda: link.send(1500, 200), 1.0)
         with pytest.raises(LinkError, match="still plugged in"):
             link.latest()
 
@@ -181,12 +166,10 @@ def test_a_stuck_port_does_not_stop_the_loop():
     with board_of(answer=obedient) as board, ServoLink(board.port) as link:
         link.arm()
         board.reading = False
-        start = time.monotonic()
-        with pytest.raises(LinkError, match="took no data"):
+        with pytest.raises(LinkError, match="took no data"):  # a write that waits would wait for ever
             for _ in range(20000):
                 link.send(1500, 200)
         board.reading = True
-        assert time.monotonic() - start < 10  # a write that waits would wait for ever
 
 
 def test_silence_is_an_error_and_garbled_lines_are_dropped():
@@ -217,18 +200,9 @@ def test_the_age_of_what_is_not_acknowledged():
         board.hello = f"<H 4 4.2.0 8 0 w {DEFAULT}"  # another start will never answer
         board.say(board.hello)
         until(lambda: link.unacknowledged_s(link._clock()) == 0)
-
-
-def test_an_answer_that_comes_before_the_write_returns_is_one():
-    """The reader's thread may have the answer while the thread that sent still waits for its turn."""
-    with board_of(answer=obedient) as board, ServoLink(board.port) as link:
-        link.arm()
-        write = link._write
-        link._write = lambda line: (write(line), time.sleep(0.1))
-        number = link.send(1500, 200)
-        until(lambda: link.latest().sequence == number)
-        link._write = write
-        assert link.unacknowledged_s(link._clock()) == 0
+        link.send(1500, 200)
+        until(lambda: board.heard[-1] == ">D 8 1 999 1500 200")  # which the Arduino ignores until it is armed again
+        assert link.hello.reset == "watchdog"
 
 
 def test_the_cap_is_lowered():
@@ -241,6 +215,3 @@ def test_the_cap_is_lowered():
         assert link.lower_cap(300).cap_us == 238
         with pytest.raises(LinkError, match="throttle pulse"):
             link.lower_cap(119)
-        board.answer = lambda board, body: board.status("A", "a", "i")
-        with pytest.raises(LinkError, match="while the car drives"):
-            link.lower_cap(180)
