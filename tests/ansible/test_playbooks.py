@@ -269,7 +269,7 @@ def test_the_service_may_open_what_its_camera_and_its_human_need_and_no_more():
         assert ("DeviceAllow=char-input r" in lines) == gamepad == ("SupplementaryGroups=video dialout input" in lines)
 
 
-@pytest.mark.parametrize(("firmware", "flashes"), [("4.1.1-gamepad", False), ("4.1.1", True)])
+@pytest.mark.parametrize(("firmware", "flashes"), [("4.2.0-gamepad", False), ("4.2.0", True)])
 def test_a_board_is_not_flashed_again_for_want_of_a_gamepad(tmp_path, firmware, flashes):
     tasks = yaml.safe_load((ROLE / "tasks" / "firmware.yml").read_text())
     (asks,) = [task["ansible.builtin.command"]["argv"] for task in tasks if "Ask the Arduino" in task["name"]]

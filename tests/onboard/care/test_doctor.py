@@ -142,7 +142,7 @@ def test_an_arduino(monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
         checks = {c.name: c for c in doctor.arduino(board.port, boot_s=2)}
-    assert checks["Arduino"].found == f"{board.port}: firmware 4.1.1, protocol 4"
+    assert checks["Arduino"].found == f"{board.port}: firmware 4.2.0, protocol 4"
     assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     if verdict == "fail":  # an ordinary car's pulses are none of the recorded car's
@@ -160,7 +160,7 @@ def test_a_gamepad(proc, monkeypatch, held):
         monkeypatch.setattr(f"rover_lib.onboard.{module}.open_gamepad", lambda: pad)
     monkeypatch.setattr(doctor, "list_gamepads", lambda: ("A (event0)", "B (event1)"))
     receiver = "1460 21316 124 1016" if held else "- - - -"
-    with board_of(answer=talking(receiver), hello=f"<H 4 4.1.1-gamepad 7 0 e {gamepad_car.id}") as board:
+    with board_of(answer=talking(receiver), hello=f"<H 4 4.2.0-gamepad 7 0 e {gamepad_car.id}") as board:
         found = examine(camera=str(proc / "none"), port=board.port, host=Host(proc_root=proc), boot_s=2)
         checks = {c.name: c for c in found}
     assert checks["transmitter"].verdict == ("ok" if held else "warning")

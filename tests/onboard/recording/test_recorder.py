@@ -311,7 +311,7 @@ def arduino():
             if done.wait(0.02):
                 break
             if n % 25 == 15:
-                os.write(master, frame(f"<H 4 4.1.1 7 0 e {Car().id}"))
+                os.write(master, frame(f"<H 4 4.2.0 7 0 e {Car().id}"))
             os.write(master, status(n))
         os.close(master)
 
