@@ -112,8 +112,8 @@ def usual_rate_hz(recordings: Recordings) -> int:
     usual_hz = float(np.median(list(rates.values())))
     if odd := {name: found for name, found in rates.items() if is_another_rate(found, usual_hz)}:
         what = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
-        name, rate_hz = next(iter(odd.items()))
-        raise EpisodeError(what, found=f"{rate_hz:.1f} in {name}", remedy="export those of each rate by themselves")
+        name, odd_hz = next(iter(odd.items()))
+        raise EpisodeError(what, found=f"{odd_hz:.1f} in {name}", remedy="export those of each rate by themselves")
     return max(round(usual_hz), 1)
 
 

@@ -48,13 +48,13 @@ def mounted(image):
 
 
 @pytest.fixture
-def disk(tmp_path):
-    """The folder of a file system of 2 GB."""
+def disk(tmp_path, request):
+    """The folder of a file system: small for a recording, which is copied often, and 2 GB for checkpoints."""
     if os.geteuid() or not (shutil.which("mkfs.ext4") and shutil.which("mount")):
         pytest.skip("needs root and the Debian packages e2fsprogs and mount")
     image = tmp_path / "disk"
     with image.open("wb") as file:
-        file.truncate(2_000_000_000)
+        file.truncate(2_000_000_000 if "work" in request.fixturenames else 100_000_000)
     subprocess.run(["mkfs.ext4", "-q", "-F", image], check=True)
     with mounted(image) as folder:
         yield folder

@@ -4,15 +4,12 @@ import zipfile
 from types import SimpleNamespace
 
 import pytest
-from click.testing import CliRunner
 from test_drives import Foresees, Seen
 
 from balloon_world import drives, latency
 from balloon_world.latency import gates, table
-from rover_lib.cli import main
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop.run import run as runs
 
 
 def write_policy(folder, acts, serial="1"):
@@ -74,15 +71,3 @@ def test_the_gate_is_of_compensated_drives_that_nobody_pushes(hits_at, lost, pas
         rows += [calm, calm | {"compensate": False, "hits": 0}, calm | {"pushes": 4, "hits": 0}]
     (row,) = gates(rows, 2)
     assert (row["found"], row["passed"], row["limit"]) == (lost, passed, 2)
-
-
-@pytest.mark.slow
-def test_the_command_executes_the_notebook_and_prints_a_table(run_dir, monkeypatch):
-    def execute(name, folder, worlds):
-        assert name == "07_drive"
-        latency.measure_latencies(folder, **HOW | {"worlds": worlds})
-
-    monkeypatch.setattr(runs, "execute", execute)
-    result = CliRunner().invoke(main, ["world", "latency", str(run_dir.path), "--worlds", "1"])
-    assert result.exit_code == 0, result.output
-    assert result.output.rstrip("\n") == str(table(read_stage(run_dir.path / "drive.json", "drive")))

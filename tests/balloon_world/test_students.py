@@ -5,18 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from balloon_world import drives, students
 from balloon_world.drives import SEED
 from balloon_world.students import gates_of, judge_students, recommendation, sentences, table
 from rover_learn import plots
-from rover_lib.cli import main
 from rover_lib.onboard.care.pi5 import Work, predict_ms
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop.run import run as runs
 
 
 class Policy:
@@ -152,16 +149,6 @@ def test_what_does_not_belong_together_is_refused(made, breaks, says):
     with pytest.raises(TrainingError, match=says):
         judge_students(made.teacher, [student], worlds=1)
     assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
-
-
-def test_the_command_drives_and_executes_the_notebook(made, monkeypatch):
-    executed = []
-    monkeypatch.setattr(runs, "execute", lambda name, folder, **given: executed.append((name, folder, given)))
-    result = CliRunner().invoke(main, ["world", "students", str(made.teacher), str(made.student), "--worlds", "2"])
-    assert result.exit_code == 0 and "stay with the teacher" in result.output
-    assert executed == [("08_distill", made.teacher, {"students": [str(made.student)], "worlds": 2, "episodes": ""})]
-    result = CliRunner().invoke(main, ["world", "students", str(made.teacher), str(made.teacher)])
-    assert result.exit_code == 1 and "Traceback" not in result.output
 
 
 # --- the rule ---

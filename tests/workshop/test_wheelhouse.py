@@ -100,14 +100,3 @@ def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypat
         assert {"--require-hashes", "--only-binary", "manylinux_2_28_aarch64"} <= set(arguments)
         assert "python_full_version" not in listed and "setuptools==" in listed and "torch==2.8.0" in listed
         assert listed.count("--hash=sha256:") == w.REQUIREMENTS["torch"].read_text().count("--hash=sha256:")
-
-
-def test_no_internet_ends_in_a_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr(w, "_build", lambda folder: (folder / "own.whl", "1"))
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/")
-    monkeypatch.setenv("PIP_RETRIES", "0")
-    for name in ("PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
-    with pytest.raises(w.RoverError, match=r"is there internet here\? pip fetches the wheels of requirements_pi"):
-        w.make(tmp_path, pythons=("3.13",))

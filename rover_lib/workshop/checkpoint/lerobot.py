@@ -4,7 +4,6 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -17,7 +16,6 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
-from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import (
     MIGRATE,
@@ -28,7 +26,7 @@ from rover_lib.workshop.checkpoint.contents import (
     name_weights,
 )
 from rover_lib.workshop.recordings.samples import camera_names
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -214,7 +212,7 @@ class Normaliser:
 def _read_json(path: Path) -> dict[str, Any]:
     refuse_pointer(path, CheckpointError)
     with as_checkpoint_error(path):
-        return dict(json.loads(read_plain(path, JSON_BYTES)))
+        return dict(read_json(path, JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:

@@ -4,32 +4,20 @@
     parts = split(recordings)
     samples, note = choose_calibration(parts.calibration, 200, seed=0)
 
-How a recording becomes samples:
-- A control measures a channel only if the firmware saw a pulse there (`pwm.Channel.measured`). If it saw none, the file
-  has a flag and no value, or the old recorder's 0 (onboard/recording/episode.py): here that is missing, never 0.
-  A frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
-  reading between two good ones costs nothing (controls come every 33 ms), and a longer hole leaves its frames without
-  an action.
-- Controls that waited in the serial buffer arrive in one burst, so their system times say nothing. They get the times
-  of the Arduino's clock, counted back from the first control after them that arrived live (backwards and from close by,
-  because that clock drifts). Those that the clock cannot place are dropped.
-- If the system's clock was set back in the middle of a drive, which shows because the frames' numbers and the Arduino's
-  clock go on, everything after that is left out. Its times belong to other moments of the same drive, and it would be
-  given their actions.
+How a recording becomes samples (docs/data.md has the table of faults):
+- A frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. What the
+  firmware did not measure is missing, never 0; a hole leaves its frames without an action.
+- Controls of a serial burst get the times of the Arduino's clock, counted back from the first live control after them,
+  because that clock drifts. What follows on a clock that was set back is left out: its times are of other moments.
 - A frame's action is its control. Its state is the previous frame's action. Its chunk is its own action and those of
   the following frames (LeRobot's delta indices range(chunk)), padded at the end with the last one and masked.
-- A picture that is missing or damaged costs only its own sample: that frame's time and action are known, so its
-  neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks before it, and
-  the frame after it is no sample, because its state would be invented. Only an episode's first frame starts neutral.
-- If nobody drove, the pulses are those of a human whose car did something else, because it was held. Such frames are
-  samples with that driver, but no chunk and no state reaches from them to frames at which somebody drove, or back.
-- Actions that follow another formula of the pulses than this car's, as older firmware wrote them, are recomputed from
-  the pulses (see `formula`). If they follow none, the recording is left out.
-- A drive that failed is as good a recording as any other: its outcome is noted, and nothing is left out because of it.
+- A picture that is missing or damaged costs only its own sample. A frame without an action, or a hole in time, ends the
+  chunks before it, and the frame after it is no sample, because its state would be invented.
+- Where nobody drove, the car was held: no chunk and no state reaches from there to where somebody drove, or back.
+- Actions of older firmware's formula are recomputed from the pulses (see `formula`); those of any other are left out.
 """
 
 import csv
-import json
 import math
 import os
 import stat
@@ -62,7 +50,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import JSON_BYTES, parse_json, quote, quote_all
 
 DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
@@ -245,10 +233,10 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], 
     return (label if isinstance(label, str) else "", outcome), tables
 
 
-def _read_bytes(path: Path, faults: Faults) -> bytes:
+def _read_bytes(path: Path, faults: Faults, most: int = DATA_BYTES) -> bytes:
     """Return a data file's bytes; none, with a fault, if it is absent, empty, unreadable or too large."""
     try:
-        if data := read_plain(path, DATA_BYTES).strip():
+        if data := read_plain(path, most).strip():
             return data
         faults.add(path, "empty", "nothing in it")
     except FileNotFoundError:
@@ -259,13 +247,13 @@ def _read_bytes(path: Path, faults: Faults) -> bytes:
 
 
 def _read_json(path: Path, faults: Faults) -> dict[str, Any]:
-    if not (data := _read_bytes(path, faults)):
+    if not (data := _read_bytes(path, faults, JSON_BYTES)):
         return {}
     try:
-        if isinstance(content := json.loads(data), dict):
+        if isinstance(content := parse_json(data), dict):
             return content
         faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
-    except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
+    except ValueError as e:
         faults.add(path, "broken_json", quote(str(e)))
     return {}
 

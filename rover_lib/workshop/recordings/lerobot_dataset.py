@@ -6,7 +6,6 @@ The meaning of its numbers is read from the names of its features, or given by t
 never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
 """
 
-import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,10 +22,10 @@ from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
-from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import hub
 from rover_lib.workshop.lerobot_moved import conversion
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.limits import check_encoded, check_inside, check_table, check_video, limited_memory
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -37,13 +36,14 @@ from rover_lib.workshop.recordings.samples import (
     Source,
     camera_names,
 )
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
+MOST_FEATURES = 200  # an arm with six cameras has 20
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -70,10 +70,12 @@ def is_dataset(root: Path) -> bool:
 class LerobotSample(Sample):
     """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera).
 
-    dataset: opened once for all samples. cameras: by the policy's name of each, the dataset's, and (height, width).
+    dataset: opened once for all samples. encoded: the same rows' pictures as they lie in the table. cameras: by the
+    policy's name of each, the dataset's, and (height, width).
     """
 
     dataset: "LeRobotDataset" = field(kw_only=True)
+    encoded: Any = field(kw_only=True)
     cameras: Mapping[str, tuple[str, tuple[int, int]]] = field(kw_only=True)
 
     @property
@@ -86,18 +88,17 @@ class LerobotSample(Sample):
         Raises EpisodeError if it cannot be decoded, or has another size than the others.
         """
         frames = {}
-        with _as_episode_error(self.frame_path, f"its frame {self.row} cannot be decoded"), warnings.catch_warnings():
+        where = f"{self.frame_path}: its frame {self.row}"
+        with _as_episode_error(f"{where} cannot be decoded"), limited_memory(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            for key, encoded in self.encoded[self.row].items():  # LeRobot decodes all, also those of no policy
+                check_encoded(f"{where} of '{key}'", encoded, _size_of(self.dataset.meta.features[key]))
             item = self.dataset[self.row]
             for name, (key, size) in self.cameras.items():
                 # (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
                 rgb = (item[key] * 255).round().byte().permute(1, 2, 0).numpy()
                 if rgb.shape != (*size, 3):
-                    raise EpisodeError(
-                        f"{self.frame_path}: its frame {self.row} of '{key}' has another shape than {size} in {INFO}",
-                        found=rgb.shape,
-                        remedy="record pictures of one size, in colour, in one dataset",
-                    )
+                    raise _broken(f"{where} of '{key}' has another shape than {size} in {INFO}", rgb.shape)
                 frames[name] = np.ascontiguousarray(rgb[..., ::-1])
         return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
 
@@ -114,19 +115,24 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
-    keys = [key for key, _ in cameras.values()]
-    _check_files(root, info["features"], keys)
-    dataset = _open_local(root)
-    columns = _columns(root, dataset, layout)
-    starts = _check_frames(root, dataset, columns)
-    for key in (key for key in keys if key in dataset.meta.video_keys):
-        _check_video_times(root, dataset.meta, key)
+    import lerobot.datasets.lerobot_dataset  # noqa: F401, takes seconds, and memory beside what is limited below
+
+    with limited_memory():
+        _check_files(root, info["features"], [key for key, _ in cameras.values()])
+    tables = sum(path.stat().st_size for path in root.rglob("*.parquet"))
+    with _as_episode_error(f"{root}: LeRobot cannot read it"), limited_memory(3 * tables):
+        dataset = _open_local(root)
+        columns = _columns(root, dataset, layout)
+        starts = _check_frames(root, dataset, columns)
+        for key in dataset.meta.video_keys:
+            _check_videos(root, dataset.meta, key)
+        encoded = _encoded(dataset)
     exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
     _check_numbers(root, columns, layout, exported.car)
     episodes = []
     parts = np.split(np.arange(len(columns["index"])), starts[1:])
     for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
-        episodes.append(_episode(dataset, cameras, columns, rows, chunk, exported, i))
+        episodes.append(_episode(dataset, encoded, cameras, columns, rows, chunk, exported, i))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
@@ -157,7 +163,7 @@ def _read_export(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tu
     if not path.is_file():
         return default, ()
     try:
-        report = json.loads(read_plain(path, INFO_BYTES))
+        report = read_json(path, INFO_BYTES)
         if CAR in report:  # right also if somebody has removed episodes since, with LeRobot's tools
             default = replace(default, car=Car.of(report[CAR], "the exported car"))
         if DRIVEN_BY not in report:  # of before there were takeovers
@@ -167,7 +173,7 @@ def _read_export(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tu
             raise ValueError(f"it is of {len(driven_by)} episodes, here are {episodes}")
         if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
             raise ValueError("it names who drove, or what it came to, by unknown words")
-    except (OSError, ValueError, RecursionError, TypeError, KeyError, CarError) as e:
+    except (OSError, ValueError, TypeError, KeyError, CarError) as e:
         return default, (Fault(REPORT, "another_export", 1, f"not used: {quote(str(e))}"),)
     return replace(default, drivers=driven_by, outcomes=outcomes), ()
 
@@ -187,8 +193,8 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     path = root / INFO
     refuse_pointer(path, EpisodeError)
     try:
-        info = json.loads(read_plain(path, INFO_BYTES))
-    except (OSError, ValueError, RecursionError) as e:
+        info = read_json(path, INFO_BYTES)
+    except (OSError, ValueError) as e:
         raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if str(version).startswith("v2.1"):
@@ -204,11 +210,14 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
         )
     features, fps = info.get("features"), info.get("fps")
     try:
-        right = all(is_whole(n, 1, 10_000) for feature in features.values() for n in [1, *feature["shape"]])
+        right = len(features) <= MOST_FEATURES and not any("/" in name for name in features)
+        right = right and all(is_whole(n, 1, 10_000) for feature in features.values() for n in feature["shape"])
+        paths = [Path(str(info.get(name))) for name in ("data_path", "video_path")]
+        right = right and not any(path.is_absolute() or ".." in path.parts for path in paths)
     except (AttributeError, TypeError, KeyError):
         right = False
     if not right or not is_number(fps, 0, 1000) or not fps:
-        raise _broken(f"{path}: lacks frames per second, or features with a dtype and a shape", quote(fps))
+        raise _broken(f"{path}: lacks frames per second, or plain features with a dtype and a shape", quote(fps))
     return info
 
 
@@ -295,8 +304,14 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     if isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map")):
         shape = [*shape[:2], "distances"]
     elif len(shape) == 3 and 3 in (shape[0], shape[2]):
-        return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
+        return _size_of(feature)
     raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
+
+
+def _size_of(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Height and width of a camera, whose shape has its colours last or first."""
+    first, second, last = feature["shape"]
+    return (second, last) if first <= 4 < last else (first, second)
 
 
 def _check_files(root: Path, features: Mapping[str, Any], cameras: list[str]) -> None:
@@ -305,27 +320,37 @@ def _check_files(root: Path, features: Mapping[str, Any], cameras: list[str]) ->
     LeRobot would look for missing tables on the Hub, and fill such a column with nothing, so that, for example, an
     intervention would lose its mark.
     """
-    from pyarrow import parquet  # imported here, so that our own recordings do not wait for it
-
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
             raise _broken(f"{root}: has no {pattern}")
-    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*.*")):
+    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+        check_inside(root, path)
         refuse_pointer(path, EpisodeError)
+    for path in root.rglob("*.parquet"):
+        with _as_episode_error(f"{path}: LeRobot cannot read it"):
+            check_table(path)
     read = {*NUMBERS, INTERVENTION, SUCCESS, *cameras}
     wanted = [name for name, feature in features.items() if name in read and feature.get("dtype") != "video"]
     for path in sorted(root.glob("data/*/*.parquet")):
-        with _as_episode_error(path, "LeRobot cannot read it"):
-            columns = parquet.read_schema(path).names
+        with _as_episode_error(f"{path}: LeRobot cannot read it"):
+            columns = check_table(path)
         if missing := [name for name in wanted if name not in columns]:
             raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
         if unknown := [name for name in columns if name not in features]:
             raise _broken(f"{path}: has columns that {INFO} does not know: {quote_all(unknown)}")
 
 
+def _encoded(dataset: "LeRobotDataset") -> Any:
+    """The rows' pictures as they lie in the table, of all cameras that are no video."""
+    keys = [key for key, feature in dataset.meta.features.items() if feature["dtype"] == "image"]
+    rows = dataset.hf_dataset.with_format(None).select_columns(keys or ["index"])
+    for key in keys:
+        rows = rows.cast_column(key, replace(rows.features[key], decode=False))
+    return rows if keys else [{}] * len(rows)
+
+
 def _open_local(root: Path) -> "LeRobotDataset":
     """Open a local folder by LeRobot's own loader, which would fetch missing files; here they are an error."""
-    # Imported here, because it takes seconds, and our own recordings do not need it.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     class Local(LeRobotDataset):
@@ -334,19 +359,24 @@ def _open_local(root: Path) -> "LeRobotDataset":
 
         _download = download  # as LeRobot 0.6 calls it
 
-    with _as_episode_error(root, "LeRobot cannot read it"):
+    with _as_episode_error(f"{root}: LeRobot cannot read it"):
         return Local(f"local/{root.resolve().name}", root, revision="local", video_backend=BACKEND)
 
 
-def _check_video_times(root: Path, meta: Any, key: str) -> None:
-    """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode.
+def _check_videos(root: Path, meta: Any, key: str) -> None:
+    """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode, and each video
+    the camera's size.
 
     The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
     """
     names = ("length", *(f"videos/{key}/{name}" for name in ("from_timestamp", "to_timestamp")))
-    with _as_episode_error(root, "where its pictures lie cannot be read"):
+    with _as_episode_error(f"{root}: where its pictures lie cannot be read"):
         lengths, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
         files = [meta.get_video_file_path(number, key) for number in range(len(lengths))]
+    for file in sorted(set(files)):
+        check_inside(root, root / file)
+        with _as_episode_error(f"{root / file}: cannot be decoded"):
+            check_video(root / file, _size_of(meta.features[key]))
     wrong = {int(n): "is not as long as it" for n in np.flatnonzero(abs((last_s - first_s) * meta.fps - lengths) >= 1)}
     order = sorted(range(len(lengths)), key=lambda number: (files[number], first_s[number]))
     for number, after in pairwise(order):
@@ -362,7 +392,7 @@ def _check_video_times(root: Path, meta: Any, key: str) -> None:
 
 
 @contextmanager
-def _as_episode_error(path: Path, what: str) -> Iterator[None]:
+def _as_episode_error(what: str) -> Iterator[None]:
     """Turn any error of a loader inside the block into an EpisodeError of one sentence. what: what went wrong."""
     try:
         yield
@@ -372,13 +402,13 @@ def _as_episode_error(path: Path, what: str) -> Iterator[None]:
         cause = e.__cause__ or e  # datasets wraps pyarrow's error
         reason = " ".join(str(cause).split())[:160]
         text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
-        raise _broken(f"{path}: {what} ({text})") from None
+        raise _broken(f"{what} ({text})") from None
 
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
     marks = [key for key in (INTERVENTION, SUCCESS) if key in dataset.meta.features]
-    with _as_episode_error(root, "its numbers cannot be read"):
+    with _as_episode_error(f"{root}: its numbers cannot be read"):
         columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
         for key in marks:
             columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
@@ -419,7 +449,7 @@ def _check_frames(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, n
     number, times_s = columns["episode_index"], columns["timestamp"].astype(np.float64)
     starts, rows = np.flatnonzero(np.diff(number, prepend=-1)), np.arange(len(number))
     lengths = np.diff([*starts, len(number)])
-    with _as_episode_error(root, "its table of episodes cannot be read"):
+    with _as_episode_error(f"{root}: its table of episodes cannot be read"):
         names = ("episode_index", "dataset_from_index", "dataset_to_index")
         table = np.stack([np.asarray(dataset.meta.episodes[name]) for name in names], 1)
     episodes = np.stack([np.arange(len(starts)), starts, starts + lengths], 1)
@@ -447,6 +477,7 @@ def _check_frames(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, n
 
 def _episode(
     dataset: "LeRobotDataset",
+    encoded: Any,
     cameras: Mapping[str, Any],
     columns: Mapping[str, np.ndarray],
     rows: np.ndarray,
@@ -458,7 +489,7 @@ def _episode(
     root, meta, first, n = dataset.root, dataset.meta, int(rows[0]), len(rows)
     driver, outcome = exported.drivers[number], exported.outcomes[number]
     name, keys = f"episode_{number:06d}", [key for key, _ in cameras.values()]
-    with _as_episode_error(root, f"where the files of episode {number} lie cannot be read"):
+    with _as_episode_error(f"{root}: where the files of episode {number} lie cannot be read"):
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         if not data.is_file():
@@ -479,6 +510,7 @@ def _episode(
             chunk=chunks[k].copy(),
             is_pad=pads[k].copy(),
             dataset=dataset,
+            encoded=encoded,
             cameras=cameras,
             row=int(row),
             driver=HUMAN if taken_over[k] else driver,

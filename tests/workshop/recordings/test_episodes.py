@@ -137,11 +137,6 @@ def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
     assert recordings.summary()["driven_by_pct"].keys() == {"human", "nobody"}
 
 
-def test_an_unknown_outcome_is_counted(tmp_path):
-    recordings = load(edit(record(tmp_path), lambda c: c["metadata"].update(outcome=["hit"])).parent)
-    assert kinds(recordings) == {"unknown_outcome": 1} and recordings.episodes[0].outcome is None
-
-
 def test_summary_range_and_hashes(tmp_path):
     record(tmp_path)
     recordings = load(tmp_path)
@@ -155,13 +150,7 @@ def test_summary_range_and_hashes(tmp_path):
     hashes = recordings.hashes()
     assert len(hashes) == 43
     assert "episode_20260101_120000/frames/frame_000001.jpg" in hashes
-    assert hashes == load(tmp_path).hashes()
-
-
-def test_one_episode_folder_may_be_given_itself(tmp_path):
-    folder = record(tmp_path)
-    assert [s.chunk.tolist() for s in load(folder).samples] == [s.chunk.tolist() for s in load(tmp_path).samples]
-    assert load(folder).hashes() == load(tmp_path).hashes()
+    assert hashes == load(tmp_path).hashes() == load(tmp_path / "episode_20260101_120000").hashes()
 
 
 def test_pictures(tmp_path):
@@ -233,17 +222,6 @@ def test_a_channel_that_is_flagged_is_missing(tmp_path):
         assert len(recordings.samples) == 31
         assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
         (flagged.folder / "episode_data.json").write_text("{}")  # the second turn reads the CSVs
-
-
-def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
-    lost = dict.fromkeys(("throttle_normalized", "throttle_raw_us", "throttle_period_us"))
-
-    def change(content):
-        for control, more in zip(content["control_samples"][20:], ({}, {"throttle_measured": False}), strict=False):
-            control.update(lost | more)
-
-    edit(record(tmp_path), change)
-    assert kinds(load(tmp_path))["throttle_no_pulse"] == 2
 
 
 def test_single_lost_readings_cost_no_frame(tmp_path):
@@ -319,15 +297,14 @@ def test_real_recording(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "kind"), [(None, "absent"), ("", "empty"), ("{", "broken_json"), ("[]", "wrong_type")]
+    ("text", "kind"),
+    [("", "empty"), ("{", "broken_json"), ("[]", "wrong_type"), ("[" + "[]," * 3_000_000 + "1]", "broken_json")],
+    ids=["empty", "cut", "a list", "lists that would take 200 MB"],
 )
 def test_without_json_the_csvs_serve(tmp_path, text, kind):
     folder = record(tmp_path)
     whole = load(tmp_path).samples
-    if text is None:
-        (folder / "episode_data.json").unlink()
-    else:
-        (folder / "episode_data.json").write_text(text)
+    (folder / "episode_data.json").write_text(text)
     recordings = load(tmp_path)
     assert kinds(recordings) == {kind: 1}
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
@@ -372,6 +349,8 @@ def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
         controls[26]["throttle_raw_us"] = None
         controls[29]["throttle_normalized"] = 7.0
         controls.append("control")
+        controls[5], controls[12] = controls[12], controls[5]
+        content["metadata"]["outcome"] = ["hit"]
         frames[10]["timestamp"] = math.nan
         frames[15]["image_path"] = 15
         frames[20]["frame_id"] = "x"
@@ -380,7 +359,8 @@ def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6, "throttle_out_of_range": 1}
+    odd = {"unknown_outcome": 1, "unsorted_control_times": 2}
+    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6, "throttle_out_of_range": 1} | odd
     assert len(recordings.samples) == 36
     assert all(np.isfinite(s.chunk).all() and np.isfinite(s.state).all() for s in recordings.samples)
 
@@ -496,20 +476,6 @@ def test_the_real_recordings_have_the_actions_of_their_pulses():
     assert sum(s.chunk[0, 1] > 0.1 for s in recordings.samples) == 0
 
 
-def test_unsorted_times(tmp_path):
-    folder = record(tmp_path)
-    whole = load(tmp_path).samples
-
-    def change(content):
-        for rows in (content["control_samples"], content["frame_samples"]):
-            rows[5], rows[12] = rows[12], rows[5]
-
-    edit(folder, change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"unsorted_control_times": 2, "unsorted_frame_times": 2}
-    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
-
-
 @pytest.mark.parametrize("back_s", [0.2, 30])
 def test_what_follows_on_a_clock_that_was_set_back_is_left_out(tmp_path, back_s):
     """Otherwise frames of two moments would have the same time, and get each other's actions."""
@@ -599,16 +565,10 @@ def test_paths_that_leave_the_folder(tmp_path):
 @pytest.mark.parametrize("make", [lambda root: None, lambda root: root.write_text("x"), lambda root: root.mkdir()])
 def test_no_recordings_is_one_sentence(tmp_path, make):
     make(tmp_path / "episodes")
-    with pytest.raises(EpisodeError, match="episodes") as e:
-        load(tmp_path / "episodes")
-    assert "\n" not in str(e.value)
-
-
-def test_options_that_make_no_sense(tmp_path):
-    record(tmp_path)
-    for options in ({"chunk": 0}, {"sync_s": math.nan}):
-        with pytest.raises(EpisodeError, match="sync_s"):
-            load(tmp_path, **options)
+    for options in ({}, {"chunk": 0}, {"sync_s": math.nan}):
+        with pytest.raises(EpisodeError) as e:
+            load(tmp_path / "episodes", **options)
+        assert "\n" not in str(e.value)
 
 
 # ---- wild input ------------------------------------------------------------------------------------------
@@ -738,20 +698,6 @@ def test_too_short_to_split(tmp_path):
     record(tmp_path, frames=2 * CHUNK)
     with pytest.raises(EpisodeError, match="too short to be parted"):
         split(load(tmp_path))
-
-
-def test_a_split_share_that_makes_no_sense(many):
-    with pytest.raises(EpisodeError, match="held_out_share"):
-        split(many, math.nan)
-
-
-@given(share=st.floats(0.01, 0.99), seed=st.integers(0, 10**6))
-@settings(deadline=None, suppress_health_check=list(HealthCheck))
-def test_split_never_shares_an_episode(many, share, seed):
-    parts = split(many, share, seed)
-    ids = [i for part in parts.episodes.values() for i in part]
-    assert len(ids) == len(set(ids)) == 16
-    assert all(parts.episodes.values())
 
 
 def test_calibration_covers_the_recorded_actions(many):
