@@ -39,7 +39,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, pick_evenly
-from rover_lib.workshop.run.session import check_sizes, training_device
+from rover_lib.workshop.run.session import training_device
 
 SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
@@ -136,7 +136,6 @@ def _open(
         raise TrainingError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
     parent = load_checkpoint(checkpoint)
     refuse_no_car(parent)
-    check_sizes(parent)
     places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
