@@ -141,7 +141,7 @@ class Simulation:
         head: dict[str, Any] = {
             "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
-            "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
+            "missed": 0, "tick": row and row._asdict(),
             "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
             "captured_s": time.monotonic(), "size": [frame.shape[1], frame.shape[0]],
         }  # fmt: skip

@@ -1,6 +1,5 @@
 """The rover as a robot of LeRobot: its camera, and its Arduino with all limits of `rover drive`."""
 
-import logging
 import threading
 import time
 from contextlib import ExitStack
@@ -26,7 +25,6 @@ from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.opening import check_no_film
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
-from rover_lib.onboard.drive.watch import find_unfinished_drive
 from rover_lib.onboard.errors import CameraError, PolicyError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -174,8 +172,6 @@ class Rover(CarPart, Robot):
 
     def _flight_log(self) -> FlightLog:
         (max_bytes, keep), path, car = log_limits(), self.config.log or default_log(), this_car()
-        if unfinished := find_unfinished_drive(path):
-            logging.getLogger("rover").warning(unfinished)
         header = {"artifact": "LeRobot", "hz": RATE_HZ, **vars(self.settings), "car": car.description()}
         return FlightLog(path, header=header, max_bytes=max_bytes, keep=keep)
 

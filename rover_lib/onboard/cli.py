@@ -68,10 +68,6 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--max-seconds", type=POSITIVE, help="Longest duration of the drive."),
     click.option("--ticks", type=FROM_1, help="End after this number of commands."),
     click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
-    click.option(
-        "--blend-ticks", type=FROM_0, help="Commands over which a plan replaces another [default: params.yml]."
-    ),
-    click.option("--ensemble", type=float, help="LeRobot's temporal ensembling with this coefficient, such as 0.01."),
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option(
         "--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in the user's state folder]."
