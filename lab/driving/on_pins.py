@@ -153,7 +153,7 @@ class PinBench:
             if first_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
             if not drive.running or time.monotonic() > deadline:
-                raise RoverError("rover drive did not drive", found=drive.last_words(), remedy="drive it by hand")
+                raise RoverError("rover drive did not drive", found=drive.errors()[-3:], remedy="drive it by hand")
         self.arduino.ready(False)  # from here on the human only does what a fault says
 
     def clear_faults(self) -> None:
