@@ -18,8 +18,7 @@ from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
 
 Weights = dict[str, Tensor]
-# Settings of the user's trainer, which its checkpoints name:
-DROPOUT = 0.1  # LeRobot's default
+DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too
 KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)

@@ -95,7 +95,7 @@ def read_lerobot(folder: Path) -> Contents:
 def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
     """Return the config as LeRobot reads it, and notes on what it asks for beyond the network.
 
-    Raises CheckpointError for one that LeRobot refuses, and for features that a car with cameras does not have.
+    Raises CheckpointError.
     """
     path = folder / "config.json"
     raw = _read_json(path)
@@ -178,8 +178,8 @@ class Normaliser:
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.
 
-        key: the feature's name. kind: its type, for which the step has a mode. shape: of one value of it. inverse: undo
-        the normalisation, as for an output. Raises CheckpointError for missing or wrong statistics.
+        key, kind, shape: the feature's. inverse: undo the normalisation, as for an output. Raises CheckpointError for
+        missing or wrong statistics.
         """
         step, own = self.step, self.step.features.get(key)
         if own and not inverse:

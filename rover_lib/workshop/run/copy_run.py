@@ -37,10 +37,7 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
 
 
 def main() -> None:
-    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named.
-
-    It opens the first notebook, as JupyterLab's launcher shows neither the folder's question nor its figures.
-    """
+    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named."""
     name, copy = (*sys.argv[1:], "", "")[:2]
     try:
         folder = copy_run(name, copy) if name else NOTEBOOKS

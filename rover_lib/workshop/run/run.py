@@ -189,10 +189,7 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
 
 def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
-    """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml.
-
-    A parameter that is turned there acts, in whichever folder the notebook lies: its run is where it is executed.
-    """
+    """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml."""
     values, p = {"run_dir": ".", **given}, params()
     notebook, cell = _parameters_cell(source)
     lines = []

@@ -56,9 +56,9 @@ def load(
 
 
 def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
-    """Load again what notebook 01 loaded. Raises RoverError if it did not run, or if the files have changed since.
+    """Load again what notebook 01 loaded; for a policy of less than SMALL_GMAC, on one thread.
 
-    For a policy of less than SMALL_GMAC, this sets torch to one thread; a benchmark sets its own number.
+    Raises RoverError if it did not run, or if the files have changed since.
     """
     stage = read_stage(Path(run_dir) / "load.json", "load")
     given, loaded = stage["params"], stage["metrics"]["checkpoint"]
