@@ -82,7 +82,7 @@ def _drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progr
 def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
     """Return a row of drive.json, less how far the car was beside its path."""
     latency_ms, pushes, settings = how
-    row = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
+    row: dict[str, Any] = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
     row |= {"compensate": settings.compensate, "ensemble": settings.ensemble}
     outcomes = [d.outcome for d in driven]
     row |= count_hits(dict(enumerate(outcomes)), "hits_wilson")

@@ -33,7 +33,8 @@ class Trajectory:
     def of(cls, world: World) -> "Trajectory":
         """Return everything that was driven in a world so far."""
         track = np.array([(s.x_m, s.y_m, s.steering_command, s.throttle_command) for s in world.trajectory])
-        return cls(*track.T, (world.balloon.x_m, world.balloon.y_m))
+        x_m, y_m, steering, throttle = track.T
+        return cls(x_m, y_m, steering, throttle, (world.balloon.x_m, world.balloon.y_m))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,5 @@
 """The balloon world in a view: a slow machine slows its time and changes nothing else; a page's requests."""
 
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -74,17 +71,3 @@ def test_what_a_page_asks_for(simulation):
     drive(simulation, 3, each)  # stopped; the same world, skipped; the next one
     assert ("ended", "stopped here; nobody drives") in said
     assert (simulation._worlds, simulation._seed) == (1, 10_002)  # what was stopped counts for nobody
-
-
-@pytest.mark.slow
-def test_no_thread_waits_for_another_by_spinning(demo_run):
-    """Neither XNNPACK's nor OpenCV's: beside busy processes they take the time that a plan needs."""
-    program = f"""
-import os
-from balloon_world.show import Simulation
-Simulation({str(demo_run / "policy_static.pt")!r}).run(lambda head, picture: None, 1)
-print(os.listdir("/proc/self/task") == [str(os.getpid())])
-"""
-    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}  # numpy's, which sleep when nobody multiplies
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=alone)
-    assert done.stdout == "True\n", done.stderr

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,8 +14,7 @@ import numpy as np
 import pytest
 from needs import ended, until
 
-from balloon_world import car as car_module
-from balloon_world.car import HOLD_S, STAND_IN, CameraFeed, VirtualCar, _Car
+from balloon_world.car import HOLD_S, STAND_IN, VirtualCar, _Car
 from balloon_world.simulated_arduino import PinEvent
 from balloon_world.world import World
 from lab.arduino.emulator import BOARD
@@ -100,12 +98,6 @@ def test_the_whole_chain_hits_a_balloon(board):
         eye.close()
 
 
-def test_it_needs_no_torch():
-    program = "import sys, balloon_world.car; print([m for m in ('torch', 'lerobot') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_when_its_process_dies():
     with VirtualCar() as car:
         eye = Eye(car.camera)
@@ -137,18 +129,6 @@ def test_it_ends_with_its_parent():
         with suppress(ProcessLookupError):
             os.killpg(parent.pid, signal.SIGKILL)
         parent.stdout.close()
-
-
-def test_when_its_process_hangs(monkeypatch):
-    with VirtualCar() as car:
-        os.kill(car.pid, signal.SIGINT)  # a terminal's interrupt is not for it
-        assert os.getsid(car.pid) != os.getsid(0)
-        assert car.report().held
-        monkeypatch.setattr(car_module, "ANSWER_S", 0.2)
-        os.kill(car.pid, signal.SIGSTOP)
-        with pytest.raises(TrainingError, match="did not answer"):
-            car.report()
-        os.kill(car.pid, signal.SIGCONT)
 
 
 # ---- the worlds, without a process: what the pins ask for, and what is kept
@@ -191,15 +171,3 @@ def test_the_newest_pulses_drive_world_after_world_and_a_reset_ends_them():
         car.tick()
     car.tick()
     assert car.world.state.time_s > 0 and car.world.seed == 8
-
-
-def test_a_slow_reader_misses_no_picture(tmp_path):
-    """Of two in turn, who takes every second frame would else see one of them alone, and call the camera frozen."""
-    path, seen = tmp_path / "camera", []
-    pictures = b"\xff\xd8 red \xff\xd9", b"\xff\xd8 blue \xff\xd9"
-    with CameraFeed(path, *pictures, rate_hz=100) as feed, path.open("rb", buffering=0) as pipe:
-        for count in range(1, 9):
-            until(lambda count=count: feed.written == count)
-            time.sleep(0.03)  # three more frames are due, and refused
-            seen.append(pipe.read(1 << 20))
-    assert seen == [*pictures] * 4

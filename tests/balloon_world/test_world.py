@@ -29,11 +29,9 @@ def test_the_same_seed_gives_the_same_drive_and_frames():
     assert frame_hash(worlds[0]) == frame_hash(worlds[1])
 
 
-@pytest.mark.slow
 def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
-    for seed in range(30):
+    for seed in range(5):
         plain, with_decoys = World(seed, 2), World(seed, 2, decoys=2)
-        assert frame_hash(plain) == frame_hash(World(seed, 2, decoys=0)) if seed < 3 else True
         assert (plain.balloon, plain._shoves) == (with_decoys.balloon, with_decoys._shoves)
         *others, first, second = with_decoys.distractors
         assert tuple(others) == plain.distractors and first != second
