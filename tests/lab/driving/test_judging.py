@@ -8,9 +8,10 @@ import pytest
 from balloon_world.simulated_arduino import PinEvent
 from lab.driving import on_pins
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge, periods_of
+from lab.driving.rows import FaultRow
 from rover_lib.onboard.car.car import Car
 
-GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30)
+GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50)
 AT, START, END = 100.0, 99.5, 102.0
 DRIVEN = (1567, 209)
 
@@ -56,11 +57,11 @@ def test_a_judgement(expected, what, sentence):
 
 
 def test_a_row_that_this_machine_spoilt_is_known():
-    fault, steady = on_pins.PinRow("a fault", "link", CONTINUES, "", "", lambda bench: None), seen(then())
+    fault, steady = FaultRow("a fault", "link", CONTINUES, ""), seen(then())
     assert not on_pins._spoilt(fault, steady, GATES)
     paused = replace(steady, commands=[c for c in steady.commands if not 0.5 < c.at_s - AT < 0.65])
     assert on_pins._spoilt(fault, paused, GATES)  # rover drive did not get its turn
-    assert not on_pins._spoilt(replace(fault, starves=True), paused, GATES)
+    assert not on_pins._spoilt(replace(fault, name=on_pins.STARVES), paused, GATES)
     for kind in ("stall", "lost"):
         stalled = replace(steady, events=[*steady.events, PinEvent(AT + 1, kind, "", 30_000.0, 0.0)])
         assert on_pins._spoilt(fault, stalled, GATES)
