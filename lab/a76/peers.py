@@ -45,7 +45,7 @@ FRAMES = 20  # how many judge a peer; its error only has to show that it compute
 
 @dataclass(frozen=True)
 class Engine:
-    """Another engine: the packages that it needs before ours, here and in the emulated Pi, and its files' suffix.
+    """Another engine: its files' suffix, and the packages that it needs before ours; in the emulated Pi only the first.
 
     FOLDER/make_<name>.py runs its tools. Dependencies such as numpy are not listed, as our own packages have them.
     """
@@ -53,28 +53,20 @@ class Engine:
     name: str
     suffix: str
     packages: tuple[str, ...]
-    guest_packages: tuple[str, ...]
 
 
-ONNXRUNTIME = Engine(
-    "onnxruntime",
-    ".onnx",
-    ("onnxruntime==1.31.1", "onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19"),
-    ("onnxruntime==1.31.1",),
+ONNX_PACKAGES = ("onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19")
+ONNXRUNTIME = Engine("onnxruntime", ".onnx", ("onnxruntime==1.31.1", *ONNX_PACKAGES))
+# This torch is the newest that runs on the CUDA libraries of our torch 2.8, but for one.
+EXECUTORCH_PACKAGES = ("torchao==0.18.0", "torch==2.10.0", "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'")
+BESIDE = (
+    "flatbuffers==25.12.19",
+    "ruamel.yaml==0.19.1",
+    "tabulate==0.10.0",
+    "expecttest==0.3.0",
+    "parameterized==0.9.0",
 )
-EXECUTORCH = Engine(
-    "executorch",
-    ".pte",
-    (
-        "executorch==1.5.1",
-        "torchao==0.18.0",
-        "torch==2.10.0",  # the newest that runs on the CUDA libraries of our torch 2.8, but for one
-        "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
-        *("flatbuffers==25.12.19", "ruamel.yaml==0.19.1", "tabulate==0.10.0"),
-        *("expecttest==0.3.0", "parameterized==0.9.0"),
-    ),
-    ("executorch==1.5.1",),  # only its C++ runtime is used: see executorch.cpp
-)
+EXECUTORCH = Engine("executorch", ".pte", ("executorch==1.5.1", *EXECUTORCH_PACKAGES, *BESIDE))
 ENGINES = (ONNXRUNTIME, EXECUTORCH)
 
 
@@ -90,11 +82,11 @@ def packages_here(engine: Engine) -> Path:
 
 def packages_there(engine: Engine) -> Path:
     """Return the same for the emulated Pi; for ExecuTorch, it includes our compiled caller of its C++ runtime."""
-    made = {"packages": engine.guest_packages, "for": FOR_GUEST}
+    made = {"packages": engine.packages[0], "for": FOR_GUEST}
     compiled = [SHIM] if engine is EXECUTORCH else []
 
     def make(folder: Path) -> None:
-        fetch_wheels(folder, *FOR_GUEST, *engine.guest_packages)
+        fetch_wheels(folder, *FOR_GUEST, engine.packages[0])
         if compiled:
             _compile(folder)
 

@@ -97,4 +97,4 @@ def test_the_engines_run_the_policy_in_int8(users_cache, tiny, tiny_run, monkeyp
         assert row["sdot_g"] == pytest.approx(ours.sdot / 1e9, rel=0.1), "the same layers are INT8"
         assert any("loops with SDOT" in kernel for kernel in row["instructions_by_kernel"])
         assert 0 < row["steering_mae_pct"] < 5 * our_error["steering_mae_pct"], engine.name
-        assert row["versions"][engine.name] in engine.guest_packages[0]
+        assert row["versions"][engine.name] in engine.packages[0]
