@@ -107,10 +107,9 @@ def load_recordings(
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
-        found, remedy = (
-            (f"{len(killed)} killed ones", finish) if killed else (None, "give the folder that holds episode_*")
-        )
-        raise EpisodeError(f"{root}: no episode folders in it", found=found, remedy=remedy)
+        remedy = finish if killed else "give the folder that holds episode_*"
+        many = f"{len(killed)} killed ones" if killed else None
+        raise EpisodeError(f"{root}: no episode folders in it", found=many, remedy=remedy)
     faults = Faults(root)
     for part in killed:
         faults.add(part, "killed_recording", finish)

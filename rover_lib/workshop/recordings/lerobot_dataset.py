@@ -257,8 +257,9 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
-    shape, kind = list(feature["shape"]), feature.get("info") or {}
-    if len(shape) != 3 or 3 not in (shape[0], shape[2]) or kind.get("is_depth_map") or kind.get("video.is_depth_map"):
+    shape, kind = list(feature["shape"]), feature.get("info")
+    depth = isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map"))
+    if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
         remedy = "choose another: --camera NAME"
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
     return _size_of(feature)

@@ -229,11 +229,6 @@ class Recordings:
             counted[fault.handled][fault.kind] += fault.count
         return {handled: dict(kinds.most_common()) for handled, kinds in counted.items() if kinds}
 
-    def driven_by_pct(self) -> dict[str, float]:
-        """The percentage of samples at which each of `episode.DRIVERS` drove, without those who never did."""
-        counted = _counted(s.driver for s in self.samples)
-        return {who: round(100 * n / len(self.samples), 1) for who, n in counted.items()}
-
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
         files = dict.fromkeys(path for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples)))
@@ -244,6 +239,7 @@ class Recordings:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
+        drivers = _counted(s.driver for s in self.samples)
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -253,7 +249,7 @@ class Recordings:
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
             "outcomes": _counted(e.outcome or "not labelled" for e in self.episodes),
-            "driven_by_pct": self.driven_by_pct(),
+            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
