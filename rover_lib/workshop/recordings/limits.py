@@ -57,9 +57,8 @@ def check_encoded(where: str, encoded: Any, size: tuple[int, int]) -> None:
     except (OSError, TypeError, ValueError, Image.DecompressionBombError):
         raise EpisodeError(f"{where} cannot be decoded: neither PNG nor JPEG", remedy="record it again") from None
     if found != size:
-        raise EpisodeError(
-            f"{where} has another shape than {size}", found=found, remedy="record pictures of one size in one dataset"
-        )
+        remedy = "record pictures of one size in one dataset"
+        raise EpisodeError(f"{where} has another shape than {size}", found=found, remedy=remedy)
 
 
 def check_video(path: Path, size: tuple[int, int]) -> None:
@@ -74,9 +73,8 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
         stream = container.streams.video[0]
         found = stream.codec_context.name, stream.height, stream.width
     if found[0] not in CODECS or found[1:] != size:
-        raise EpisodeError(
-            f"{path}: has another shape or codec than {size} in h264, hevc or av1", found=found, remedy="encode it anew"
-        )
+        what = f"{path}: has another shape or codec than {size} in h264, hevc or av1"
+        raise EpisodeError(what, found=found, remedy="encode it anew")
 
 
 def check_table(path: Path) -> list[str]:
@@ -85,7 +83,6 @@ def check_table(path: Path) -> list[str]:
 
     table = parquet.read_metadata(path)
     if (size := path.stat().st_size) < ROW_BYTES * table.num_rows:
-        raise EpisodeError(
-            f"{path}: its footer says {table.num_rows} rows", found=f"{size} bytes", remedy="copy the dataset again"
-        )
+        what = f"{path}: its footer says {table.num_rows} rows"
+        raise EpisodeError(what, found=f"{size} bytes", remedy="copy the dataset again")
     return table.schema.to_arrow_schema().names
