@@ -15,13 +15,13 @@ from rover_lib.workshop.plots.style import (
     OTHERS,
     RED,
     SKY,
+    SLATE,
     action_colour,
     bar_values,
     judged_keys,
     legend,
     legend_below,
     new_figure,
-    simd_bars,
 )
 
 NEAR = 2  # rows with less than this many times the fewest instructions are shown again, enlarged
@@ -34,7 +34,9 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     fig, axes = new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
     (left, right), y = axes[0], np.arange(len(rows))
     total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
-    simd_bars(left, y, total, simd)
+    left.barh(y, simd, color=SLATE, label="SIMD (vector) instructions")
+    left.barh(y, total - simd, left=simd, color=MIST, label="all others")
+    bar_values(left, y, total, "{:.3g}")
     floor_g = next(m["floor_g"] for m in rows.values())
     left.axvline(floor_g, color=RED, ls="--", lw=1.2, label=f"floor: dot products alone, {floor_g:.2g}")
     left.set_yticks(y, [NAMES.get(n, n) for n in rows])

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, expected_shapes
+from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig
+from rover_lib.workshop.act_config import expected_shapes
 from rover_lib.workshop.untrusted import quote, quote_all
 
 # Config, weights by LeRobot's names without the leading `model.`, and more for the report.

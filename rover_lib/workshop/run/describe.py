@@ -77,7 +77,7 @@ def _calibration(path: Path) -> dict[str, Any]:
         "samples": found.samples,
         "smooth": found.smooth,
         "checkpoint_sha256": found.checkpoint,
-        "ranges": len(found.ranges),
+        "tensors": len(found.frames),
     }
 
 

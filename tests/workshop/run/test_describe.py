@@ -57,4 +57,4 @@ def test_a_flight_log(tmp_path):
 def test_a_calibration(calibration, tmp_path):
     calibration.save(tmp_path / "calibration.pt")
     described = describe(Source(tmp_path / "calibration.pt"))["calibration"]
-    assert described["samples"] == calibration.samples and described["ranges"] == len(calibration.ranges)
+    assert described["samples"] == calibration.samples and described["tensors"] == len(calibration.frames)
