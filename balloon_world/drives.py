@@ -47,7 +47,7 @@ class NoLog:
     def tick(self, row: Any) -> None:
         self.row = row
 
-    def event(self, text: str, **fields: Any) -> None: ...
+    def event(self, text: str, *, level: int = 0) -> None: ...
 
 
 class TimedCar:

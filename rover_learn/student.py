@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rover_learn.refit import grams_of, refit_layer
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, expected_shapes, multiply_accumulates
+from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
+from rover_lib.workshop.act_config import expected_shapes
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote_all

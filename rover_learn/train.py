@@ -33,7 +33,8 @@ from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop import act_config
-from rover_lib.workshop.act import ActConfig, lerobot_act
+from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
 from rover_lib.workshop.progress import Progress, silent

@@ -25,7 +25,6 @@ FULL = {"cameras": {"observation.images.cam_front": (360, 640)}, "n_decoder_laye
 
 
 def smooth_frame(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return a picture of smooth random patches, (height, width, 3) uint8."""
     coarse = rng.random((5, 9, 3)).astype(np.float32)
     return (cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 1) * 255).astype(np.uint8)
 

@@ -75,7 +75,7 @@ def start_of(checkpoint, dataset, folder):
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
-    from rover_lib.workshop.act import lerobot_act
+    from rover_lib.workshop.act_config import lerobot_act
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     demo = load_checkpoint(checkpoint)

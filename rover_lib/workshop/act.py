@@ -1,9 +1,8 @@
 """ACT for inference only: LeRobot's Action Chunking Transformer without what only training needs.
 
-It computes the same function as `lerobot.policies.act` in eval mode. Everything that does not depend on the observation
-is computed once: batch norm is folded into the convolutions; the VAE encoder is left out (its latent is zero when
-driving, so its projection is a bias); positions are constants, as are the first decoder layer's self-attention, which
-acts on zeros, and the query that follows from it.
+It computes the same function as `lerobot.policies.act` in eval mode. What depends on no observation is computed once:
+batch norm is folded into convolutions, the latent's projection is a bias, positions are constants, as are the first
+decoder layer's self-attention and the query that follows from it.
 
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
@@ -21,11 +20,6 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
-from rover_lib.workshop.act_config import EMBEDDINGS as EMBEDDINGS
-from rover_lib.workshop.act_config import backbone_blocks as backbone_blocks  # the same names from here too
-from rover_lib.workshop.act_config import expected_shapes as expected_shapes
-from rover_lib.workshop.act_config import imagenet as imagenet
-from rover_lib.workshop.act_config import lerobot_act as lerobot_act
 from rover_lib.workshop.recordings.episodes import Sample
 
 Projection = nn.Linear | nn.Conv2d
@@ -38,8 +32,7 @@ def positions_2d(dim: int, h: int, w: int) -> Tensor:
     half = dim // 2
     frequency = 10000 ** (2 * (torch.arange(half, dtype=torch.float32) // 2) / half)
 
-    def axis(n: int) -> Tensor:  # (n, half)
-        # The operations are in LeRobot's order, so that the constants are the same to the last bit.
+    def axis(n: int) -> Tensor:  # (n, half), in LeRobot's order of operations, to the last bit
         p = torch.arange(1, n + 1, dtype=torch.float32)
         p = (p / (p[-1:] + 1e-6) * (2 * math.pi))[:, None] / frequency
         return torch.stack((p[:, 0::2].sin(), p[:, 1::2].cos()), -1).flatten(1)
@@ -80,9 +73,9 @@ def layer_norm(w: Weights) -> nn.LayerNorm:
 
 
 def conv(weight: Tensor, bias: Tensor, stride: Any, padding: int, dilation: int = 1) -> nn.Conv2d:
-    out_channels, in_channels, height, width = weight.shape
+    outputs, inputs, height, width = weight.shape
     size = height, width
-    return _load(nn.Conv2d(in_channels, out_channels, size, stride, padding, dilation, device="meta"), weight, bias)
+    return _load(nn.Conv2d(inputs, outputs, size, stride, padding, dilation, device="meta"), weight, bias)
 
 
 def norm_gain(bn: Weights) -> Tensor:
@@ -97,10 +90,7 @@ def fold(w: Weights, bn: Weights) -> Pair:
 
 
 def fold_block(w: Weights, kind: str) -> list[Pair]:
-    """Return the weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero.
-
-    All weights of such a channel are zero and its bias is not positive. The module `channels` makes such channels.
-    """
+    """Return weight and bias of a ResNet block's convolutions, without the channels inside it that are always zero."""
     pairs = [fold(w.at(f"conv{i}"), w.at(f"bn{i}")) for i in range(1, (2 if kind == "basic" else 3) + 1)]
     for i, (weight, bias) in enumerate(pairs[:-1]):
         alive = (weight != 0).flatten(1).any(1) | (bias > 0)
@@ -116,7 +106,6 @@ class Pixels(nn.Module):
 
     def __init__(self, norm: Affine):
         super().__init__()
-        # Pixels are 0..255 here, so the division by 255 is part of the scale.
         self.norm = Normalise(Affine(tuple(s / 255 for s in norm.scale), norm.shift), (1, 3, 1, 1))
 
     def forward(self, frame: Tensor) -> Tensor:
@@ -128,8 +117,7 @@ class Columns(nn.Module):
 
     The result has, for each second pixel, the 8 pixels around it in its row: (1, 24, rows, width / 2), padded with the
     colour that normalises to zero. The stem's 7x7 convolution over 3 channels becomes a 7x1 convolution over these 24
-    (`of_columns`), with half the instructions, because XNNPACK's kernels are made for at least 8 channels.
-    Normalisation is in that convolution's weights, so a pixel is its own quantized value.
+    (`of_columns`), with half the instructions. Normalisation is in its weights, so a pixel is its own quantized value.
     """
 
     WINDOW = 8  # pixels: the kernel's 7, and one with weight 0 that fills the kernel's lanes
@@ -168,10 +156,7 @@ def zero_colour(norm: Affine) -> tuple[float, ...]:
 
 
 def column_scale(norm: Affine) -> tuple[float, int]:
-    """Return (scale, zero pixel) of columns, the same for all channels: the mean of the channels' normalisation.
-
-    `of_columns` puts the difference to each channel's own normalisation into the weights.
-    """
+    """Return (scale, zero pixel) of columns: the mean of the channels' normalisation. The rest is in `of_columns`."""
     return sum(norm.scale) / len(norm.scale) / 255, round(sum(zero_colour(norm)) / len(norm.scale))
 
 
@@ -238,8 +223,7 @@ class Backbone(nn.Module):
 class Pointwise(nn.Module):
     """A module with token projections, which are linears over (1, T, D) or 1x1 convolutions over (1, D, 1, T).
 
-    In channels-last both have the same memory and XNNPACK runs the same GEMM, but only a convolution may have one
-    weight scale per output channel with qint8 activations (a per-channel linear raises an error there).
+    XNNPACK runs the same GEMM, but only a convolution may have a weight scale per channel with qint8 activations.
     """
 
     def __init__(self, as_conv: bool):
@@ -247,9 +231,7 @@ class Pointwise(nn.Module):
         self.as_conv = as_conv
 
     def project(self, weight: Tensor, bias: Tensor) -> Projection:
-        if not self.as_conv:
-            return linear(weight, bias)
-        return conv(weight[:, :, None, None], bias, 1, 0)
+        return conv(weight[:, :, None, None], bias, 1, 0) if self.as_conv else linear(weight, bias)
 
     def enter(self, x: Tensor) -> Tensor:
         return x.transpose(1, 2).unsqueeze(2) if self.as_conv else x
@@ -261,20 +243,16 @@ class Pointwise(nn.Module):
 class Attention(Pointwise):
     """Multi-head attention added to the residual stream.
 
-    Channel scales (buffers, None until they are set) give the channels of the INT8 tensors inside similar ranges, and
-    cancel exactly: q_in, k_in and v_in multiply the inputs, q_out, v_out and o_out the outputs. The scale of the keys'
-    output is merged into q_out, and that of the output projection's input into v_out. In cross-attention `Memory` has
-    applied k_in and v_in already, once for all layers.
+    Channel scales (buffers, None until they are set) cancel exactly: q_in, k_in and v_in multiply the inputs, q_out,
+    v_out and o_out the outputs. The scale of the keys' output is merged into q_out, and that of the output projection's
+    input into v_out. In cross-attention `Memory` has applied k_in and v_in already, once for all layers.
     """
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, *, cross: bool = False):
         super().__init__(as_conv)
         self.heads, self.cross = config.heads, cross
-        wq, wk, wv = w["in_proj_weight"].split(config.dim)
-        bq, bk, bv = w["in_proj_bias"].split(config.dim)
-        self.q = self.project(wq, bq)
-        self.k = self.project(wk, bk)
-        self.v = self.project(wv, bv)
+        inputs = zip(w["in_proj_weight"].split(config.dim), w["in_proj_bias"].split(config.dim), strict=True)
+        self.q, self.k, self.v = (self.project(weight, bias) for weight, bias in inputs)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
         for name in ("constant_q", "q_in", "k_in", "v_in", "q_out", "v_out", "o_out"):
             self.register_buffer(name, None)
@@ -360,10 +338,7 @@ class EncoderLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention, cross-attention and feed-forward.
-
-    The first layer's input is zeros, so its self-attention and the query that follows are computed once, in __init__.
-    """
+    """Self-attention, cross-attention and feed-forward. The first layer's self-attention, on zeros, is a constant."""
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, q_pos: Tensor, first: bool):
         super().__init__()
@@ -412,11 +387,9 @@ class Normalise(nn.Module):
 class ACT(nn.Module):
     """The policy, for one observation at a time.
 
-    weights: by LeRobot's names without the leading `model.`. config: checked against them (see `checkpoint`).
-    for_int8: as static INT8 needs it, with token projections as 1x1 convolutions instead of linears, and frames as
-    columns of pixels (see Columns) if their normalisation allows it, padded with a colour of whole numbers.
-    forward(state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> (1, C, A) float32: it takes a
-    raw state and returns raw actions, with all normalisation inside.
+    weights: by LeRobot's names without the leading `model.`. for_int8: as static INT8 needs it, with token projections
+    as 1x1 convolutions, and frames as Columns if their normalisation allows it.
+    forward(raw state (1, S) float32, *frames (height, width, 3) uint8 RGB, one per camera) -> raw actions (1, C, A).
     """
 
     def __init__(self, config: ActConfig, weights: dict[str, Tensor], *, for_int8: bool = False):
@@ -437,7 +410,6 @@ class ACT(nn.Module):
         if config.sees_state:
             state = w.at("encoder_robot_state_input_proj")
             self.state_project = linear(state["weight"], state["bias"])
-        # The latent is zero when driving, so its projection gives the bias alone.
         self.latent = nn.Buffer(w["encoder_latent_input_proj.bias"][None, None])
         pos = [w["encoder_1d_feature_pos_embed.weight"]]
         pos += [positions_2d(config.dim, *config.grid(*size)) for size in config.image_sizes]
@@ -467,10 +439,7 @@ class ACT(nn.Module):
 
 
 def transform(parts: Any, x: Tensor) -> Tensor:
-    """Run the transformer: tokens (1, T, D) -> actions (1, C, A), still normalised.
-
-    parts: an object with the attributes encoder, encoder_norm, memory, decoder, norm, head, pos and q_pos of ACT.
-    """
+    """Run the transformer of an ACT, or of what has its parts: tokens (1, T, D) -> actions (1, C, A), normalised."""
     for layer in parts.encoder:
         x = layer(x, parts.pos)
     key, value = parts.memory(parts.encoder_norm(x), parts.pos)

@@ -19,10 +19,6 @@ BACKBONES = {
     "resnet50": ("bottleneck", (3, 4, 6, 3), 2048),
 }
 ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
-EMBEDDINGS = {
-    "encoder_1d_feature_pos_embed": "one constant with the image's sinusoidal positions; never looked up by index",
-    "decoder_pos_embed": "a constant; with the first decoder layer's self-attention and query computed from it once",
-}
 
 
 def backbone_blocks(backbone: str) -> list[str]:
@@ -41,9 +37,8 @@ class Affine:
 
 def imagenet() -> Affine:
     """Return the normalisation of pixels in [0, 1] that torchvision's weights were trained with."""
-    return Affine(
-        tuple(1 / s for s in IMAGENET_STD), tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
-    )
+    shift = tuple(-m / s for m, s in zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
+    return Affine(tuple(1 / s for s in IMAGENET_STD), shift)
 
 
 @dataclass(frozen=True)
@@ -81,10 +76,10 @@ class ActConfig:
 def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "ACTPolicy":
     """Make LeRobot's own ACTPolicy of this shape, without normalisation. It downloads nothing.
 
-    weights: all of them, by LeRobot's names without the leading `model.`; copied, as float32. None: random ones, which
-    take most of the time. Empty: none, on torch's meta device.
+    weights: by LeRobot's names without the leading `model.`; copied, as float32. None: random ones. Empty: none, on
+    torch's meta device.
     """
-    # Imported here, because it takes seconds, and code that only quantizes or exports does not need it.
+    # Imported here, because it takes seconds.
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy

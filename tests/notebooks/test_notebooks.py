@@ -51,8 +51,7 @@ def test_committed_outputs_are_clean(path):
 def test_rovers_are_drawn(tmp_path):
     """The cells that draw, without those that measure here: the demo executes these."""
     policy = {"latency_p50_ms": 60.0, "latency_p95_ms": 61.0, "latency_p99_ms": 62.0, "n": 16, "mode": "static"}
-    series = [{"t_s": t_s, "artifacts": {"policy": policy}} for t_s in (1.0, 2.0)]
-    metrics = {"artifacts": {"policy": policy}, "main": "policy", "series": series}
+    metrics = {"artifacts": {"policy": policy}, "main": "policy"}
     run_dir, fetched = tmp_path / "demo", tmp_path / "rovers"
     for folder in (run_dir, fetched):
         folder.mkdir()
@@ -60,11 +59,11 @@ def test_rovers_are_drawn(tmp_path):
     (fetched / "benchmark-rover2.json").write_text("{")
     names = {"run_dir": run_dir, "fetched": fetched}
     cells = {c.id: c.source for c in nbformat.read(PATHS[4], as_version=4).cells}
-    for cell in ("imports", "latency", "rovers", "soak"):
+    for cell in ("imports", "latency", "rovers"):
         exec(cells[cell], names)
     text = str(names["benchmarks"].table())
     assert re.search(r"rover1 +static, another +60.0 ", text) and "benchmark-rover2.json: " in text
-    assert {p.stem for p in (run_dir / "figures").glob("*.png")} == {"05_latency", "05_soak"}
+    assert {p.stem for p in (run_dir / "figures").glob("*.png")} == {"05_latency"}
 
 
 # --- executing ---

@@ -8,7 +8,8 @@ from policies import memory_samples
 
 from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, TrainingError
-from rover_lib.workshop.act import ACT, expected_shapes, inputs_of, predictions
+from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.act_config import expected_shapes
 
 
 @pytest.fixture(scope="module")

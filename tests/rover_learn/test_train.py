@@ -10,7 +10,7 @@ from rover_learn import train as train_module
 from rover_learn import training as training_module
 from rover_learn.train import SIZES, train
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.act import lerobot_act
+from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.slow

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import FULL, TINY, check_is, lerobot_config, lerobot_policy, saved, saved_processors, smooth_frame
+from policies import FULL, TINY, lerobot_config, lerobot_policy, saved_processors, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise
@@ -20,11 +20,10 @@ from rover_lib.workshop.act import (
     conv,
     example_inputs,
     fits_columns,
-    imagenet,
-    lerobot_act,
     multiply_accumulates,
     of_columns,
 )
+from rover_lib.workshop.act_config import imagenet
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 SHAPES = {
@@ -56,18 +55,6 @@ def image_stats(policy, mean=IMAGENET_MEAN):
     return {k: stats for k in policy.config.image_features}
 
 
-@pytest.mark.slow
-def test_lerobots_policy_is_filled_as_if_it_had_been_made_first(tiny):
-    """Nothing of it is left without a value, and training finds the same to train."""
-    filled, made = lerobot_act(tiny.config, tiny.weights), lerobot_act(tiny.config)
-    made.model.load_state_dict(tiny.weights)
-    for part in ("named_parameters", "named_buffers"):
-        ours, theirs = (dict(getattr(policy, part)()) for policy in (filled, made))
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[n], x) and ours[n].requires_grad == x.requires_grad for n, x in theirs.items())
-    assert all(w.data_ptr() != tiny.weights[n].data_ptr() for n, w in filled.model.state_dict().items()), "copied"
-
-
 # LeRobot pads with normalised zeros. With this mean, zero is a whole pixel, so columns can be exact at the border too.
 WHOLE_MEAN = (124 / 255, 116 / 255, 104 / 255)
 
@@ -94,20 +81,6 @@ def test_equals_lerobot(name, tmp_path):
         assert expected.std() > 1e-3  # a constant answer would prove nothing
         assert (ours - expected).abs().max() < 1e-5
         del model  # a policy of the user's size has 270 MB of it
-
-
-@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY"])
-def test_lerobots_processors_end_up_inside(mode, tmp_path):
-    from lerobot.configs.types import NormalizationMode
-
-    norm = {k: NormalizationMode(mode) for k in ("STATE", "ACTION")} | {"VISUAL": NormalizationMode.MEAN_STD}
-    policy = lerobot_policy(**TINY, normalization_mapping=norm)
-    low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
-    numbers = {"mean": (low + high) / 2, "std": high - low}
-    numbers |= {"min": low, "max": high, "q01": low, "q99": high, "q10": low, "q90": high}
-    stats = image_stats(policy) | {"observation.state": numbers, "action": numbers}
-    inner, outer = saved(policy, tmp_path, stats)
-    check_is(load_checkpoint(tmp_path), policy, inner, outer)
 
 
 @pytest.mark.parametrize(
@@ -146,8 +119,7 @@ def test_quantized_columns_are_the_float_ones_exactly(dtype):
     expected = columns(frame)
     columns.dtype = dtype
     ours = columns(frame)
-    assert ours.dtype == dtype
-    assert ours.is_contiguous(memory_format=torch.channels_last)
+    assert ours.dtype == dtype and ours.is_contiguous(memory_format=torch.channels_last)
     assert (ours.dequantize() - expected).abs().max() < 1e-6
 
 
@@ -166,8 +138,6 @@ def test_counts_the_full_policys_arithmetic():
     theirs = counter.get_total_flops() / 2
     assert theirs / 1e9 == pytest.approx(15.02, abs=0.15)
     assert 0.97 * theirs < sum(counts.values()) <= theirs
-    backbone = sum(n for b, n in counts.items() if b.startswith("backbone"))
-    assert backbone / 1e9 == pytest.approx(8.5, abs=0.1)
 
 
 def test_every_module_belongs_to_a_block(tiny):

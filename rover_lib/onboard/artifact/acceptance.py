@@ -61,10 +61,9 @@ THIS_CAR = Expected()
 
 
 def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Iterable[str] = ()) -> Artifact:
-    """Check that an artifact may be deployed, without running it; return it, closed.
+    """Check that an artifact may be deployed, without running it; return it, closed. Raises ArtifactError.
 
-    allow: kinds of refusal to ignore, of those in MAY_DIFFER. Raises ArtifactError for a damaged file, a manifest that
-    does not fit the code beside it, and an artifact that this rover does not accept.
+    allow: kinds of refusal to ignore, of those in MAY_DIFFER.
     """
     allow = set(allow)
     if unknown := allow - set(MAY_DIFFER):

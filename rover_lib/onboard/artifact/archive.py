@@ -1,11 +1,7 @@
 """The zip file around an artifact: a limited number of records, each with a known name and a bounded size.
 
-    with open_archive("policy_static.pt") as z:
-        manifest = read_record(z, MANIFEST)
-
-It holds a program for torch (TorchScript's own records), for ONNX Runtime (one record, an ordinary .onnx with its
-weights inside), or for a Hailo chip (a compiled network, and an .onnx for the part that runs on the processor after
-it). The manifest and the parity vectors lie beside the program.
+It holds a program for torch (TorchScript's own records), for ONNX Runtime (an ordinary .onnx), or for a Hailo chip (a
+compiled network, and an .onnx for the part that runs on the processor after it).
 """
 
 import os
@@ -47,10 +43,7 @@ def refused(path: Path | str, what: str, found: object = None) -> ArtifactError:
 
 
 def open_archive(path: Path | str) -> zipfile.ZipFile:
-    """Open an artifact, after checking in its headers that the number, names and sizes of its records are allowed.
-
-    No record is unpacked. Raises ArtifactError.
-    """
+    """Open an artifact, after checking number, names and sizes of its records in its headers. Raises ArtifactError."""
     try:
         with open_plain(path, ArtifactError(f"{path}: not a file", remedy="give a policy_*.pt")) as file:
             _check_directory(file, path)

@@ -1,14 +1,10 @@
 """The engines that run artifacts, by the name in an artifact's manifest. Only `load` imports one.
 
-An engine is a module with
-
-    load(artifact, threads) -> Engine
-
-that raises ArtifactError if it cannot run the open Artifact here. threads: None lets the engine choose.
+An engine's module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact
+here. threads: None lets the engine choose.
 """
 
 import importlib
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -32,10 +28,7 @@ class Engine(Protocol):
         """(S,) float32 and one (height, width, 3) uint8 per camera in, (1, chunk, A) out. Raises RuntimeError."""
 
     def give_back(self) -> bool:
-        """Free the memory that only loading needed. Call it after a first run.
-
-        Returns whether the predictions must be checked again afterwards.
-        """
+        """Free the memory that only loading needed, after a first run; return whether to check predictions again."""
 
     @property
     def threads(self) -> int:
@@ -45,25 +38,21 @@ class Engine(Protocol):
         """Compute with that many threads from now on. XNNPACK's pool keeps the number of its first plan."""
 
 
-class SessionEngine(ABC):
+class SessionEngine:
     """Base of the engines that compute in a session of ONNX Runtime. They have no memory to give back."""
 
-    _threads: int
+    threads = 0
 
-    @abstractmethod
     def _make_session(self, threads: int) -> None:
         """Make the session with that many threads. Raises ArtifactError, and then keeps the present session."""
+        raise NotImplementedError
 
     def give_back(self) -> bool:
         return False
 
-    @property
-    def threads(self) -> int:
-        return self._threads
-
     def set_threads(self, threads: int) -> None:
         self._make_session(threads)
-        self._threads = threads
+        self.threads = threads
 
 
 def module_of(name: str) -> Any:

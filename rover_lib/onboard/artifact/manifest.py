@@ -1,8 +1,7 @@
 """The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors.
 
-Beside the records of the policy itself, TorchScript's, model.onnx or network.hef, it contains `extra/manifest.json`
-(what the artifact is, see RULES) and `extra/parity.npz` (inputs, and the chunks that they must give). It
-contains no pickled Python objects, and reading it needs no lerobot.
+Beside the policy's own records it contains `extra/manifest.json` (see RULES) and `extra/parity.npz` (inputs, and the
+chunks that they must give), and no pickled Python objects.
 """
 
 import hashlib
@@ -40,8 +39,8 @@ SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
 WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
 MOST_NAMES, NAME_LENGTH = 64, 64
 MOST_VECTORS = 16
-# How far a car's actions may differ from the parity vectors. FP32 policies differ by the order of sums, INT8 ones by
-# flipped roundings: by at most 0.13 with random weights and 0.03 with trained ones, as far as we have seen.
+# How far a car's actions may differ from the parity vectors: FP32 by the order of sums, INT8 by flipped roundings, so
+# far by at most 0.13 with random weights and 0.03 with trained ones.
 LARGEST_TOLERANCE = {"fp32": 1e-3, "int8": 0.3}
 CAR_ACTIONS = ("steering", "throttle")
 
@@ -88,10 +87,9 @@ RULES = {
 
 
 def save_artifact(path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: Vectors) -> str:
-    """Write an artifact for torch atomically, and return its content hash.
+    """Write an artifact for torch atomically, and return its content hash. Raises ArtifactError like check_manifest().
 
     parity: `state` (n, S) float32, `frame_<camera>` (n, height, width, 3) uint8 RGB, `chunk` (n, C, A) float32.
-    Raises ArtifactError like check_manifest().
     """
     import torch
 
@@ -120,29 +118,21 @@ def _extra(path: Path | str, manifest: dict[str, Any], parity: Vectors) -> dict[
 
 
 def car_of(manifest: dict[str, Any]) -> Car:
-    """Return the car whose recordings an artifact was calibrated with, from its manifest; Car() if that names none.
-
-    Raises ArtifactError if the manifest's description is not one of a car.
-    """
-    if "car" not in manifest:
-        return Car()
+    """Return the manifest's car, Car() if it names none. Raises ArtifactError for a description that is none."""
     try:
-        return Car.of(manifest["car"], "the artifact's car")
+        return Car.of(manifest["car"], "the artifact's car") if "car" in manifest else Car()
     except CarError as error:
         raise ArtifactError(str(error), remedy="export it again") from None
 
 
 class Artifact:
-    """An artifact that is opened once, and carries on what was read of it and checked.
+    """An artifact that is opened once, and carries on what was read of it and checked. All raise ArtifactError.
 
-        with Artifact("policy_static.pt") as artifact:
-            artifact.prove()
-
-    path: of the file. All its methods raise ArtifactError.
+    with Artifact("policy_static.pt") as artifact:
+        artifact.prove()
     """
 
     def __init__(self, path: Path | str):
-        """Open the file and check its directory, as open_archive() does."""
         self.path = Path(path)
         self._z = open_archive(path)
 
@@ -162,17 +152,14 @@ class Artifact:
             raise refused(self.path, f"its manifest is not readable ({e})") from None
         kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
         if kind != self.kind:
-            raise refused(
-                self.path, "its manifest names another engine than its policy is for", manifest["engine"][:60]
-            )
+            raise refused(self.path, "its manifest names another engine than its policy's", manifest["engine"][:60])
         return manifest
 
     @cached_property
     def content_hash(self) -> str:
-        """The hex SHA-256 of everything in the artifact that has an effect: the same inputs give the same hash.
+        """The hex SHA-256 of everything that has an effect; reading each record also checks its checksum.
 
-        TorchScript also writes debug tables (source positions), a serial number, and in the class's name a counter of
-        all classes that the process ever made. Reading each record also checks its checksum.
+        Left out are TorchScript's debug tables, its serial number, and the counter in its class's name.
         """
         digest = hashlib.sha256()
         code = (r for r in self._z.infolist() if r.filename.startswith("archive/code/") and r.filename.endswith(".py"))
@@ -206,8 +193,7 @@ class Artifact:
         for name, (dtype, shape) in wanted.items():
             found = vectors[name]
             if found.dtype != dtype or found.shape != (len(vectors["state"]), *shape) or not len(found):
-                what = "its parity vectors have another shape than its manifest says"
-                raise refused(self.path, what, f"{name} of {found.dtype} {found.shape}")
+                raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
             if not np.isfinite(found).all():
                 raise refused(self.path, "its parity vectors are not finite", name)
         return vectors
@@ -232,15 +218,12 @@ class Artifact:
             raise ArtifactError(f"{self.path}: damaged, {what}", remedy="copy the file again") from None
 
     def prove(self) -> None:
-        """Prove that no byte changed since the artifact was written. Nothing in it is run.
-
-        Whether its program means harm, nobody can tell: so it is loaded in a confined process (see confine.py).
-        """
+        """Prove that no byte changed since the artifact was written. Nothing in it is run."""
         _ = self.content_hash  # which reads every byte, once
 
 
 def content_hash(path: Path | str) -> str:
-    """Return Artifact.content_hash of a file. Raises ArtifactError."""
+    """Return Artifact.content_hash of a file."""
     with Artifact(path) as artifact:
         return artifact.content_hash
 

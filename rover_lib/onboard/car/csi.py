@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Generator
+from typing import Any
 
 from rover_lib.onboard.car.picture import MOST_BYTES
 from rover_lib.onboard.errors import CameraError
@@ -55,13 +56,14 @@ def read_csi(
         leaving.callback(os.close, reading)
         leaving.callback(os.close, writing)
         line = command(source, size, rate_hz, f"/proc/self/fd/{writing}")
-        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": errors}
+        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": errors}
         try:
             process = leaving.enter_context(subprocess.Popen(line, pass_fds=[writing], **pipes))
         except OSError as error:
             remedy = "sudo apt-get install rpicam-apps-lite, on Raspberry Pi OS; is the cable in?"
             raise CameraError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy=remedy) from None
         leaving.callback(process.kill)
+        assert process.stdout
         yield from _pairs(process.stdout.fileno(), reading, closing)
         if not closing.is_set():
             code = process.wait(END_S)

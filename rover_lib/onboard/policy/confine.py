@@ -4,7 +4,7 @@
 
 Nobody can tell what an artifact's program does. So before a process runs it, it gives up every right that a policy does
 not need: it can no longer open a file for writing, the serial port or a socket, start a program, or touch another
-process, and its memory has a limit. systemd's sandbox is for the service as a whole, which needs the serial port.
+process, and its memory has a limit.
 """
 
 import ctypes

@@ -1,9 +1,7 @@
 """Load artifacts only in a process that has confined itself: whoever made them, they cannot do harm there.
 
-    metrics = run_confined(time_artifacts, paths={"static": "policy_static.pt"}, ...)     # in a process of its own
-    policies = load_confined(paths, threads=3)                                            # in time_artifacts
-
-`rover drive` has a process with a protocol of its own, for speed (see drive/inference.py), which loads so too.
+metrics = run_confined(time_artifacts, paths={"static": "policy_static.pt"}, ...)     # in a process of its own
+policies = load_confined(paths, threads=3)                                            # in time_artifacts
 """
 
 import importlib
@@ -30,9 +28,8 @@ _log = logging.getLogger("rover")
 def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None, **arguments: Any) -> Any:
     """Call a function of a module in a new process, and return what it returned there.
 
-    function: calls load_confined(), and so confines its process. Arguments and result are of JSON's types, because a
-    pickle of a process that is not trusted could run anything here. Raises the function's RoverError as a PolicyError,
-    and PolicyError if the process ends otherwise or takes longer than timeout_s.
+    function: calls load_confined(). Arguments and result are of JSON's types: a pickle could run anything here. Raises
+    the function's RoverError as a PolicyError, and PolicyError if the process ends otherwise or after timeout_s.
     """
     command = [sys.executable, "-m", __name__, function.__module__, function.__qualname__, json.dumps(plain(arguments))]
     what = f"the process of {function.__qualname__}"
@@ -42,12 +39,11 @@ def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None
         raise PolicyError(f"{what} took longer than {timeout_s:g} s") from None
     try:
         result, error = json.loads(done.stdout)
-        if error:
-            error = {"what": str(error["what"]), "found": error["found"], "remedy": str(error["remedy"])}
+        refused = error and PolicyError(str(error["what"]), found=error["found"], remedy=str(error["remedy"]))
     except (ValueError, LookupError, TypeError):
         raise PolicyError(f"{what} ended ({done.returncode})", remedy="is there enough memory?") from None
-    if error:
-        raise PolicyError(**error)
+    if refused:
+        raise refused
     return result
 
 
@@ -60,8 +56,7 @@ def load_confined(
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 
-    threads: of the engines. spare_mb: memory that the process needs besides. notify: told why, if the process is not
-    confined. Raises ArtifactError as load_policy() does.
+    spare_mb: memory that the process needs besides. notify: told why, if the process is not confined.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
     with ExitStack() as unless_all_are_loaded:

@@ -1,7 +1,6 @@
 """Run artifacts on a Hailo chip: it runs a compiled network (HEF), and ONNX Runtime runs the rest on the processor.
 
-HailoRT's Python package `hailo_platform` drives the chip. Nobody here could run this: it was written by HailoRT's
-documentation, and the parity vectors of every artifact are checked on the device itself.
+Nobody here could run this: it was written by HailoRT's documentation, and parity vectors are checked on the device.
 """
 
 import math

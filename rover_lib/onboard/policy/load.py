@@ -17,10 +17,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 
 
 def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
-    """Return (2, A) float32: the least and the greatest action that the car's pulses can express.
-
-    The limits of actions other than steering and throttle are infinite.
-    """
+    """Return (2, A) float32: the least and the greatest action of the car's pulses; infinite for other actions."""
     known = dict(zip(("steering", "throttle"), car.limits.T.tolist(), strict=True))
     return np.array([known.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
 
@@ -52,10 +49,9 @@ class Policy:
         return np.clip(self.predict_unclipped(frame_bgr, state), self._low, self._high)
 
     def predict_unclipped(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
-        """Predict like predict_chunk(), but without clipping, to show how far a prediction was beyond a limit.
+        """Predict like predict_chunk(), but without clipping.
 
-        Raises PolicyError for a frame that is not a picture, frames of other cameras, a state that is not finite or has
-        another shape, and a prediction that is not finite.
+        Raises PolicyError for frames and states that are none of this policy's, and a prediction that is not finite.
         """
         cameras = self.manifest["cameras"]
         frames = frame_bgr if isinstance(frame_bgr, Mapping) else {self.cameras[0]: frame_bgr}
@@ -72,10 +68,7 @@ class Policy:
         return chunk
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
-        """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped.
-
-        Raises PolicyError if the answer has another shape or type than the manifest says.
-        """
+        """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped."""
         y = self._engine.run(state, frames_rgb)
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
             what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
@@ -93,10 +86,7 @@ class Policy:
 
 
 def import_engine(artifact: Artifact) -> str:
-    """Import the engine that an artifact needs, which takes seconds and memory, and return the engine's name.
-
-    Raises ArtifactError if the engine is unknown or not installed.
-    """
+    """Import the engine that an artifact needs, and return its name. Raises ArtifactError if it is not installed."""
     path, name = artifact.path, artifact.manifest["engine"]
     try:
         module_of(name)
@@ -126,8 +116,7 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     chunks = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
     if engine.give_back() and not np.array_equal(_predict(policy, vectors), chunks):
-        what = f"{path}: predicts something else once the memory of its original weights was given back"
-        raise ArtifactError(what, remedy="do not drive with it; report this, with the version of torch")
+        raise ArtifactError(f"{path}: predicts differently without its original weights", remedy="do not drive")
     give_back_freed()
     return policy
 
@@ -151,4 +140,4 @@ def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str,
     for name, d in zip(policy.action_names, difference.tolist(), strict=True):
         if not d <= tolerance[name]:  # so that NaN fails too
             what = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
-            raise ArtifactError(f"{what}, at most {tolerance[name]:.3g} is rounding", remedy="do not drive with it")
+            raise ArtifactError(what, remedy="do not drive with it")

@@ -1,8 +1,7 @@
 """Give memory back to the kernel: weights that torch holds twice, and what malloc keeps after loading.
 
-XNNPACK packs the weights of an INT8 convolution when it runs for the first time. torch keeps the original, 66 MB of the
-full-size policy, so that it can be saved, and has no way to drop it: `setReleaseWeightsWhenPrepacking` has no effect on
-XNNPACK's path.
+XNNPACK packs the weights of an INT8 convolution when it first runs. torch keeps the original, 66 MB of the full-size
+policy, and has no way to drop it.
 """
 
 import ctypes
@@ -21,13 +20,9 @@ def give_back_packed_weights(module: "torch.jit.ScriptModule") -> int:
     """Give the pages of the convolutions' original weights back to the kernel; return the number of bytes freed.
 
     module: frozen, and has run once, so that its weights are packed. It cannot be saved afterwards, and the caller must
-    check that it still predicts the same. Linear layers keep their weights, because dynamic INT8 has new scales for
-    each frame. Returns 0 where the system has no madvise.
+    check that it still predicts the same.
     """
-    libc = ctypes.CDLL(None, use_errno=True)
-    if not hasattr(libc, "madvise"):
-        return 0
-    given = 0
+    libc, given = ctypes.CDLL(None), 0
     for weight in _originals(module.graph):
         start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
         first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, because others may share the rest

@@ -22,8 +22,7 @@ def session_of(model: bytes, threads: int, path: Path | str = "the model") -> on
     options.log_severity_level = ERRORS_ONLY
     # A thread that waits for work by spinning takes the control loop's turn, and warms the processor for nothing.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Else kernels for x86 without VNNI clip sums of two products to 16 bits, and the error is twice as large. ARM has
-    # no such kernels.
+    # Else kernels for x86 without VNNI clip sums of two products to 16 bits.
     options.add_session_config_entry("session.x64quantprecision", "1")
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
@@ -41,7 +40,7 @@ class OnnxEngine(SessionEngine):
     def __init__(self, path: Path, model: bytes, threads: int):
         self._path = path
         self._start(model, threads)
-        self._threads = threads
+        self.threads = threads
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         inputs = dict(zip(self._names, (state[None], *frames_rgb), strict=True))

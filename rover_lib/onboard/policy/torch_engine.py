@@ -35,21 +35,13 @@ class TorchEngine:
 
 
 def load(artifact: Artifact, threads: int | None) -> TorchEngine:
-    """Load an artifact.
-
-    Raises ArtifactError if it was made with another torch, needs a quantization engine that this torch lacks, or cannot
-    be loaded.
-    """
+    """Load an artifact. Raises ArtifactError if it was made with another torch, or cannot be loaded."""
     path, manifest = artifact.path, artifact.manifest
     made_with, here = str(manifest["versions"].get("torch", "?")), torch.__version__
     if made_with.split(".")[:2] != here.split(".")[:2]:
         remedy = "make it again where this torch is: rover run CHECKPOINT EPISODES"
         raise ArtifactError(f"{path}: made with torch {made_with}", found=here, remedy=remedy)
-    engine, known = manifest["engine"], list(torch.backends.quantized.supported_engines)
-    if engine not in known:
-        what = f"{path}: needs the quantization engine '{engine}'"
-        raise ArtifactError(what, found=known, remedy="install PyPI's build of torch")
-    torch.backends.quantized.engine = engine
+    torch.backends.quantized.engine = manifest["engine"]
     if threads:
         torch.set_num_threads(threads)
     try:

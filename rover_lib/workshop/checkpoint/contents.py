@@ -11,7 +11,8 @@ from torch import Tensor
 from rover_lib.onboard.artifact.manifest import RULES
 from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, lerobot_act
+from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig
+from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.untrusted import quote, quote_all
 
 # Config, weights by LeRobot's names without the leading `model.`, and more for the report.

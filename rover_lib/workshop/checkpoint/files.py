@@ -14,7 +14,8 @@ from torch import Tensor
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import atomic_path, sha256_of
-from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
+from rover_lib.workshop.act import ActConfig, Affine
+from rover_lib.workshop.act_config import imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
 
 Weights = dict[str, Tensor]

@@ -15,7 +15,8 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import plain
-from rover_lib.workshop.act import ActConfig, imagenet
+from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.act_config import imagenet
 from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
     CORRECT_IT,

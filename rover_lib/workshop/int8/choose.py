@@ -1,18 +1,15 @@
 """Which observer, and which blocks stay in float: chosen by measuring, on frames that calibration has not seen.
 
-    odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range(), odd)
+    chooser = Chooser(checkpoint, calibration, samples, recordings.action_range())
     scheme, by_observer = chooser.observer(Scheme("static"))
     sensitivity = chooser.sensitivity(scheme)
     mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=0.2, max_cost_pct=5)
 
-Errors are against FP32, in percent of each action's recorded range. An action that never changes in the recordings is
-not judged: its error is None, and `warnings` says so.
+Errors are against FP32, in percent of each action's recorded range; None for an action that never changes there.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import EllipsisType
 from typing import Any
 
 import torch
@@ -24,7 +21,7 @@ from rover_lib.workshop.act import ACT, blocks, inputs_of, multiply_accumulates,
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.frames import ODD, odd_share, usual
 from rover_lib.workshop.int8.observe import Calibration, restore_observed, set_ranges, times_of
-from rover_lib.workshop.int8.quantize import Rangeable, convert, forget_graphs
+from rover_lib.workshop.int8.quantize import convert, forget_graphs
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
@@ -60,10 +57,9 @@ def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) 
 class Chooser:
     """The float policy and its answers on a few samples, prepared once for many conversions.
 
-    odd: some of the odd frames that calibration met. Together with the odd ones among the samples they weigh in every
-    error what odd frames weigh in the recordings: their share of what calibration saw, or of the samples, if that is
-    larger. warnings: a sentence for each action that is not judged. Raises ArtifactError without samples, and where no
-    action changes in the recordings.
+    odd: some of the odd frames that calibration met. With the odd ones among the samples they weigh in every error what
+    odd frames weigh in the recordings: their share of what calibration saw, or of the samples, if that is larger.
+    Raises ArtifactError without samples, and where no action changes in the recordings.
     """
 
     def __init__(
@@ -96,12 +92,11 @@ class Chooser:
     def _observed(self, scheme: Scheme) -> GraphModule:
         return restore_observed(self.checkpoint, scheme, self.calibration)
 
-    def errors(self, module: nn.Module) -> Tensor:
-        """(frames, actions): each frame's mean absolute difference to its own plan in FP32, in units of the actions."""
+    def errors(self, module: nn.Module, some: Sequence[int] | None = None) -> Tensor:
+        """(frames, actions): each frame's mean absolute difference to its plan in FP32. some: of these frames only."""
         forget_graphs()
-        return self._from_reference(predictions(module, self.inputs))
-
-    def _from_reference(self, actions: Tensor, of: Sequence[int] | EllipsisType = ...) -> Tensor:
+        of = list(range(len(self.inputs))) if some is None else list(some)
+        actions = predictions(module, [self.inputs[i] for i in of])
         return (actions - self.reference[of]).abs().mean(1)
 
     def error(self, module: nn.Module) -> Errors:
@@ -119,19 +114,13 @@ class Chooser:
     def observer(
         self, scheme: Scheme, observers: Sequence[str] = OBSERVERS, progress: Progress = silent
     ) -> tuple[Scheme, dict[str, Errors]]:
-        """Quantize with each observer, and return the scheme of `best_of`, and every error.
-
-        `frames` is tried only where there are odd frames, and its ranges are then widened tensor by tensor.
-        """
+        """Quantize with each observer, `frames` only where there are odd frames; return the best scheme, all errors."""
         tried = self._candidates(scheme, observers)
         graph = self._observed(scheme)
-        forget_graphs()
-        policy = Rangeable(graph, self.checkpoint.config, scheme)
 
-        def judge(scheme: Scheme) -> Tensor:
-            set_ranges(graph, scheme, self.calibration)
-            policy.take()
-            return self._from_reference(predictions(policy.module, self.inputs))
+        def judge(trial: Scheme) -> Tensor:
+            set_ranges(graph, trial, self.calibration)
+            return self.errors(convert(graph, self.checkpoint.config, scheme))
 
         table = {}
         for name in progress(tried, desc="observers"):
@@ -180,12 +169,10 @@ class Chooser:
         """Each block quantized alone, everything else in float: {block: errors}."""
         graph, config = self._observed(scheme), self.checkpoint.config
         plain = replace(scheme, float_blocks=())
-        some = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES))
-        inputs, table = [self.inputs[i] for i in some], {}
+        some, table = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES)), {}
         for block in progress(blocks(config), desc="blocks"):
-            forget_graphs()
-            actions = predictions(convert(graph, config, plain, only=[block]), inputs)
-            table[block] = mae_pct(self._from_reference(actions, some), self.weights[some], self.action_range)
+            errors = self.errors(convert(graph, config, plain, only=[block]), some)
+            table[block] = mae_pct(errors, self.weights[some], self.action_range)
         return table
 
     def mixed(
@@ -200,31 +187,22 @@ class Chooser:
         """Leave blocks in float that take much of the error for few instructions, until every action is in the budget.
 
         Blocks are tried in the order of squared error taken per instruction added. One that costs more than is left of
-        `max_cost_pct` of static's instructions, or after which the worse action is not better, stays INT8. Returns the
-        mixed scheme and its steps {float_blocks, cost_pct, <action>_mae_pct}, static first, the best last. blocks:
-        leave these in float instead, whatever they cost. Raises ArtifactError for an unknown one.
+        `max_cost_pct` of static's instructions, or that does not help the worse action, stays INT8. blocks: leave these
+        in float instead, whatever they cost. Returns the mixed scheme and its steps {float_blocks, cost_pct,
+        <action>_mae_pct}, static first, the best last. Raises ArtifactError for an unknown block.
         """
-        if unknown := [block for block in blocks or () if block not in sensitivity]:
-            raise ArtifactError(f"there is no block {', '.join(unknown)}", remedy=f"known: {', '.join(sensitivity)}")
         graph, costs = self._observed(scheme), float_costs_pct(self.checkpoint)
         best = replace(scheme, mode="mixed", float_blocks=())
 
         def step(*in_float: str) -> dict[str, Any]:
             trial = replace(best, float_blocks=in_float)
             errors = self.error(convert(graph, self.checkpoint.config, trial))
-            return {
-                "float_blocks": list(in_float),
-                "cost_pct": sum((costs[block] for block in in_float), 0.0),
-                **errors,
-            }
+            cost_pct = sum((costs[block] for block in in_float), 0.0)
+            return {"float_blocks": list(in_float), "cost_pct": cost_pct, **errors}
 
-        steps = [step()]
-        if blocks is not None:
-            steps.append(step(*blocks))
-            order = []
-        else:
-            order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
-        for block in order:
+        steps = [step()] if blocks is None else [step(), step(*blocks)]
+        order = sorted(sensitivity, key=lambda block: _worst(sensitivity[block]) ** 2 / costs[block], reverse=True)
+        for block in order if blocks is None else ():
             last = steps[-1]
             if _worst(last) <= budget_pct:
                 break

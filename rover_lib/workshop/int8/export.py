@@ -1,7 +1,6 @@
 """Write the artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
 
-export(quantized, checkpoint, "policy_static.pt", samples, calibration)
-export(quantized, checkpoint, "policy_static.onnx.zip", samples, calibration)    # the same, for ONNX Runtime
+export(quantized, checkpoint, "policy_static.pt", samples, calibration)  # or .onnx.zip, for ONNX Runtime
 """
 
 import warnings
@@ -48,7 +47,7 @@ class TorchScript:
         self.traced = _reread(frozen)
 
     def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        """Return the actions for n inputs, (n, C, A) float32, not clipped. inputs: as `inputs_of` gives them."""
+        """Return the actions for n inputs, (n, C, A) float32, not clipped."""
         with torch.jit.optimized_execution(False):
             return predictions(self.traced, inputs)
 
@@ -103,9 +102,7 @@ class Parity:
     """How far an artifact's answers may differ when it is loaded elsewhere, and how many questions it is asked.
 
     tolerance: of FP32, in action units; relative to the largest planned action if that is above 1. int8_errors: INT8
-    may differ by this many times its own largest error against FP32 if that is more, because a flipped rounding is as
-    large as the quantization error itself; steering and throttle never by more than `artifact.largest_tolerance`.
-    vectors: how many samples are stored in the artifact.
+    may differ by this many times its own largest error against FP32, if that is more. vectors: stored samples.
     """
 
     tolerance: float = 1e-4
@@ -116,8 +113,8 @@ class Parity:
 class Exporter:
     """Writes artifacts of one checkpoint.
 
-    samples: recorded observations. `parity.vectors` of them, evenly spaced, become the parity vectors; INT8's largest
-    error is taken over all of them. Raises ArtifactError without samples, and for samples of several cars.
+    samples: recorded observations; `parity.vectors` of them become the parity vectors, INT8's largest error is taken
+    over all. Raises ArtifactError without samples, and for samples of several cars.
     """
 
     def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample], parity: Parity | None = None):
@@ -150,7 +147,7 @@ class Exporter:
         config = self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
-        # The eager policy can be slow, so it answers only the stored samples: enough to see that the form is right.
+        # The eager policy is slow, so it answers only the stored samples.
         expected = predictions(module, [self.inputs[i] for i in self.stored])
         actions = form.predict(self.inputs)
         if not torch.isfinite(actions).all():
@@ -233,10 +230,7 @@ def export(
 
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:
-    """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy.
-
-    The trainer makes 640x360 of 640x480: a car's camera must then give 4:3, as the recorded one did. Else {}.
-    """
+    """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy."""
     seen: Any = sample.frame_bgr()
     shapes = {}
     for name, (h, w) in zip(config.cameras, config.image_sizes, strict=True):

@@ -42,10 +42,7 @@ def usual(extremes: Extremes, usual_pct: float) -> Tensor:
 
 
 def range_over(extremes: Tensor, kept: Tensor, wider: float) -> tuple[float, float]:
-    """The range of the frames that are kept, widened by a share of the way to that of all frames, in logarithms.
-
-    extremes: (frames, 2). kept: (frames,) bool. wider: in [0, 1]. Returns low <= 0 and high >= 0.
-    """
+    """The range of the frames that are kept, (frames,) bool, widened by a share of the way to all frames' range."""
     ends = []
     for few, every in zip(_reach(extremes[kept]), _reach(extremes), strict=True):
         ends.append(max(few, 1e-6) ** (1 - wider) * every**wider if every else 0.0)
@@ -58,10 +55,7 @@ def _reach(extremes: Tensor) -> tuple[float, float]:
 
 
 def odd_samples(extremes: Extremes, seen: Sequence[Frame], samples: Sequence[Sample]) -> tuple[Sample, ...]:
-    """Those of the samples on which calibration met odd frames, or some of them, evenly chosen by their oddness.
-
-    seen: what frame each row of `extremes` is of.
-    """
+    """Some of the samples on which calibration met odd frames, evenly chosen. seen: the frame of each row."""
     times = dict(zip(seen, oddest(extremes).tolist(), strict=True))
     found = [s for s in samples if times.get((s.episode, s.row), 0) > ODD]
     return pick_evenly(sorted(found, key=lambda s: times[s.episode, s.row]), ODD_FRAMES)
@@ -73,9 +67,7 @@ def odd_share(extremes: Extremes) -> float:
 
 
 def describe_odd(extremes: Extremes, seen: Sequence[Frame]) -> dict[str, Any]:
-    """What JSON says of the odd frames: their share, the block that answers most, how many times more, and which they
-    are; empty if there are none. times: the median of the odd frames' oddness there.
-    """
+    """What JSON says of the odd frames: share, the block that answers most and how many times more; {} for none."""
     odd = oddest(extremes) > ODD
     if not odd.any():
         return {}

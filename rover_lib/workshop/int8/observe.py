@@ -25,12 +25,12 @@ from torch.fx import GraphModule, Node
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import open_plain
-from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, blocks, example_inputs, inputs_of
+from rover_lib.workshop.act import ACT, ActConfig, Columns, blocks, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
-from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
+from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -42,9 +42,8 @@ OBSERVER = "activation_post_process"  # in FX's names of observers
 class RangeObserver(UniformQuantizationObserverBase):
     """Sees a tensor's values during calibration; the range is chosen afterwards, in any of four ways.
 
-    Keeps the exact minimum and maximum and a histogram over [-limit, limit] whose limit doubles when it is outgrown:
-    two neighbouring bins merge into one, so nothing is ever re-binned by guess. frames: the least and the largest value
-    of each frame, (2,) each. of_frames: the range that the choice `frames` takes, which depends on the whole policy.
+    Keeps the exact minimum and maximum and a histogram over [-limit, limit]; when it is outgrown, two neighbouring bins
+    merge into one. frames: each frame's least and largest value, (2,). of_frames: the range of the choice `frames`.
     """
 
     BINS = 4096
@@ -85,10 +84,7 @@ class RangeObserver(UniformQuantizationObserverBase):
         return x
 
     def range(self) -> tuple[float, float]:
-        """The range [low, high] to represent, containing 0, by this observer's choice.
-
-        Raises ArtifactError if it saw nothing.
-        """
+        """The range [low, high] to represent, containing 0. Raises ArtifactError if it saw nothing."""
         low, high = self.min_val.item(), self.max_val.item()
         if low > high:
             raise ArtifactError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
@@ -137,9 +133,8 @@ class Calibration:
     smooth: float | None
     checkpoint: str  # its identity
     image_sizes: tuple[tuple[int, int], ...]  # (height, width), one per camera
-    channels: Maxima = field(repr=False)  # in_max, out_max, and the same after scaling
+    channels: Maxima = field(repr=False)
     observers: dict[str, Tensor] = field(repr=False)  # state of the prepared graph's observers
-    ranges: dict[str, dict[str, float]] = field(repr=False)  # of each quantized layer's output: min, max
     seconds: float
     seen: tuple[Frame, ...] = field(repr=False)  # (episode, row) of each sample
     frames: dict[str, Tensor] = field(repr=False)  # (samples, 2) extremes on each, by place
@@ -152,7 +147,9 @@ class Calibration:
         """Read what save() wrote. Raises ArtifactError if the file is missing or not a calibration."""
         try:
             with open_plain(path, OSError("not a plain file")) as file:
-                return cls(**torch.load(file, weights_only=True))
+                content = torch.load(file, weights_only=True)
+            content.pop("ranges", None)  # of earlier versions
+            return cls(**content)
         except FileNotFoundError:
             raise ArtifactError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
         except Exception:  # torch wraps what it meets in many types
@@ -164,8 +161,7 @@ def calibrate(
 ) -> Calibration:
     """Run the float policy over the samples, twice: for the channel scales, then for the observers behind them.
 
-    smooth: SmoothQuant's a, None for no channel scales. Raises ArtifactError without samples, and for activations that
-    are not finite.
+    smooth: as in Scheme. Raises ArtifactError without samples, and for activations that are not finite.
     """
     if not samples:
         raise ArtifactError("calibration needs samples", found="none", remedy="give other recordings")
@@ -182,9 +178,6 @@ def calibrate(
         raise ArtifactError(f"calibration met NaN or Inf at {bad[:3]}", remedy=BROKEN_INPUT)
     if smooth is not None:
         apply_channel_scales(model, channels, smooth)
-        few = samples[:: max(1, len(samples) // 16)]
-        for name, after in channel_maxima(model, (inputs_of(s, config) for s in few)).items():
-            channels[name] |= {f"{k}_scaled": v for k, v in after.items()}
     prepared = _prepare(model, Scheme(smooth=smooth))
     with torch.inference_mode():
         for x in inputs("observers"):
@@ -200,29 +193,14 @@ def calibrate(
         image_sizes=config.image_sizes,
         channels=channels,
         observers={k: v.clone() for k, v in prepared.state_dict().items() if OBSERVER in k},
-        ranges=_seen_ranges(prepared),
         seconds=time.monotonic() - start,
         seen=tuple((s.episode, s.row) for s in samples),
         frames=frames,
     )
 
 
-def _seen_ranges(prepared: GraphModule) -> dict[str, dict[str, float]]:
-    """The least and the largest value that each layer gave, of those that become INT8."""
-    ranges = {}
-    for node in prepared.graph.nodes:
-        if node.op == "call_module" and block_of(str(node.target)) not in STAYS_FLOAT:
-            seen = next(filter(None, (_observer(prepared, user) for user in node.users)), None)
-            if seen is not None:
-                ranges[str(node.target)] = {"min": seen.min_val.item(), "max": seen.max_val.item()}
-    return ranges
-
-
 def _places(prepared: GraphModule) -> dict[str, RangeObserver]:
-    """The observers by the tensor that they see: named after the layer that gives it, or that takes it as input.
-
-    An observer that FX shares, as of a pooling's input and output, has the first of its names.
-    """
+    """The observers by the tensor that they see: named after the layer that gives it, or that takes it as input."""
     places: dict[RangeObserver, str] = {}
     for node in prepared.graph.nodes:
         if (observer := _observer(prepared, node)) is None:
@@ -276,10 +254,7 @@ def _pattern(block: str, relu: bool) -> str:
 
 
 def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> QConfigMapping:
-    """The blocks to quantize (all but the scheme's float blocks, or `only` those); others map to None.
-
-    Raises ArtifactError for a float block that the policy does not have.
-    """
+    """The blocks to quantize: all but the scheme's float blocks, or `only` those. Raises ArtifactError for others."""
     known = blocks(config)
     if unknown := [b for b in scheme.float_blocks if b not in known]:
         raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
@@ -317,11 +292,7 @@ def _prepare(model: ACT, scheme: Scheme) -> GraphModule:
 
 
 def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
-    """Let a layer that runs once for each camera see all of them through the same observers, before and behind it.
-
-    A kernel packs its weights for one scale of its input: with another one for each camera it would pack them again in
-    every inference, from originals that a rover's memory has no room for.
-    """
+    """Let a layer that runs once for each camera see all through the same observers, as its weights are packed once."""
     calls: dict[str, list[Node]] = {}
     for node in prepared.graph.nodes:
         if node.op == "call_module" and _observer(prepared, node) is None:
@@ -342,10 +313,7 @@ def _first_observer(prepared: nn.Module, nodes: Iterable[Node]) -> Node | None:
 
 
 def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
-    """The observed graph as calibration left it, its observers seeing no more.
-
-    Raises ArtifactError for a calibration of another checkpoint, picture size, scheme or version.
-    """
+    """The observed graph as calibration left it. Raises ArtifactError for a calibration of another checkpoint."""
     for what, made, now in (
         ("image sizes", calibration.image_sizes, checkpoint.config.image_sizes),
         ("checkpoint", calibration.checkpoint, checkpoint.identity),

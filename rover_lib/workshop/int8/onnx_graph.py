@@ -3,13 +3,10 @@
     model = onnx_model(graph_of(ACT(config, weights)), {"state": state, "frame_front": frame}, ("chunk",))
     model = onnx_model(quantized.module, {"state": state, "frame_front": frame}, ("chunk",))
 
-A policy that `quantize` made is written as QDQ with exactly the scales, zero points, INT8 weights and INT32 biases of
-the static artifact, so another engine computes the same numbers wherever its arithmetic is exact. torch's own exporter
-goes through TorchScript, which torch is retiring, does not know columns of pixels, and rounds biases again. Any module
-that FX can trace and that is built of ACT's parts can be written, with any number of inputs and outputs.
-
-The graph has static shapes, one domain and operators of opset 17, which ONNX Runtime and the parsers of accelerators
-know; weights are initializers inside. The same module always gives the same bytes.
+Static INT8 is written as QDQ with exactly the scales, zero points, INT8 weights and INT32 biases of the static
+artifact, so another engine computes the same numbers wherever its arithmetic is exact. torch's own exporter does not
+know columns of pixels, and rounds biases again. The graph has static shapes and operators of opset 17; the same module
+always gives the same bytes.
 """
 
 import itertools
@@ -25,7 +22,6 @@ import torch
 import torch.nn.functional as F
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
-from torch.ao.nn.intrinsic import ConvReLU2d
 from torch.ao.nn.intrinsic import quantized as fused_int8
 from torch.ao.nn.quantized import modules as int8
 from torch.fx import GraphModule, Interpreter, Node, Tracer
@@ -51,9 +47,9 @@ def graph_of(module: nn.Module) -> GraphModule:
 def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:
     """Write a graph as an ONNX model, checked by onnx.checker.
 
-    inputs: examples keyed by the names of the model's inputs, in the order of the graph's arguments; the model takes
-    their shapes and dtypes. outputs: names for what the graph returns, a tensor or a tuple of tensors. Raises
-    ArtifactError for a part that this module cannot write, and names it.
+    inputs: examples by name, in the order of the graph's arguments, whose shapes and dtypes the model takes. outputs:
+    names for what the graph returns, a tensor or a tuple of them. Raises ArtifactError for a part that cannot be
+    written.
     """
     writer = _Writer(graph, inputs, outputs)
     with torch.inference_mode():
@@ -66,8 +62,7 @@ def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequen
 class _Writer(Interpreter):
     """Runs a graph once, to learn its shapes and quantization parameters, and writes each node as ONNX.
 
-    names: by node, its ONNX value, or a list of names for several. env: by node, its value in this run. calls: how
-    often each INT8 convolution was called.
+    names: by node, its ONNX value, or a list of them. env: by node, its value. calls: of each INT8 convolution.
     """
 
     def __init__(self, graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]):
@@ -133,7 +128,6 @@ class _Writer(Interpreter):
         return self.constant(name, np.array(values, np.int64))
 
     def floats(self, n: Node) -> list[str]:
-        """Return the names of all arguments of a node, in floats."""
         return [self.as_float(x, n.name) for x in n.args]
 
     def as_float(self, n: Any, user: str = "output") -> str:
@@ -162,8 +156,6 @@ def _as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, (tuple, list)) else [value]
 
 
-# --- writers: (writer, node, result, module or None) -> name ----------------------------------------------------------
-
 STACK, STRIDE = 4, 2  # rows in a stack of columns, and rows from one stack's first to the next one's
 
 
@@ -171,9 +163,8 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     """Cut windows of 8 pixels in each of 4 rows, 96 bytes, that begin at every second pixel of every second row.
 
     The stem's 7x1 convolution over 24 channels becomes one of 2x1 over these 96 (see `stack_stem`), because ONNX
-    Runtime's kernels for a convolution are made for 64 channels, and copy and round again if there are fewer. In a row,
-    the windows with the numbers p, p + 4, p + 8, ... follow each other without a gap. So the row from pixel 2 p on is,
-    without moving a byte, a quarter of its windows, and the four quarters are then interleaved in pieces of 24 bytes.
+    Runtime's kernels are made for 64 channels. In a row, the windows p, p + 4, p + 8, ... follow each other without a
+    gap, so the row from pixel 2 p on is a quarter of its windows, and the four quarters are then interleaved.
     """
     frame, name = n.all_input_nodes[0], n.name
     height, width, channels = w.env[frame].shape
@@ -206,10 +197,6 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     if surplus:
         ends = {"first": 0, "last": m.out_width, "across": 2}
         columns = w.add("Slice", [columns, *(w.ints(f"{name}_{k}", [v]) for k, v in ends.items())], f"{name}_asked")
-    if not result.is_quantized:
-        scale = w.constant(f"{name}_scale", np.array(m.scale, np.float32))
-        floats = [columns, scale, w.constant(f"{name}_zero_point", np.array(m.zero_pixel, np.uint8))]
-        columns = w.add("DequantizeLinear", floats, f"{name}_floats")
     return w.add("Transpose", [columns], name, perm=[0, 3, 1, 2])
 
 
@@ -226,23 +213,9 @@ def _geometry(m: Any) -> dict[str, list[int]]:
     return both | {"pads": both["pads"] * 2}
 
 
-def _stem_or(w: _Writer, n: Node, m: Any, weight: Tensor) -> tuple[Tensor, dict[str, list[int]]]:
-    """Return a convolution's weight and geometry: those over stacks if it reads columns."""
-    source = n.all_input_nodes[0]
-    if source.op == "call_module" and isinstance(w.fetch_attr(str(source.target)), Columns):
-        stacked = {"kernel_shape": [2, 1], "strides": [1, 1], "pads": [0] * 4, "dilations": [STACK // STRIDE, 1]}
-        return stack_stem(weight), stacked
-    return weight, _geometry(m)
-
-
-def _conv(w: _Writer, n: Node, result: Tensor, m: Any, output: str = "") -> str:
-    weight, geometry = _stem_or(w, n, m, m.weight)
-    inputs = [*w.floats(n), w.constant(f"{n.target}.weight", weight), w.constant(f"{n.target}.bias", m.bias)]
-    return w.add("Conv", inputs, output or n.name, **geometry)
-
-
-def _conv_relu(w: _Writer, n: Node, result: Tensor, m: Any) -> str:
-    return w.add("Relu", [_conv(w, n, result, m[0], f"{n.name}_sums")], n.name)
+def _conv(w: _Writer, n: Node, result: Tensor, m: nn.Conv2d) -> str:
+    inputs = [*w.floats(n), w.constant(f"{n.target}.weight", m.weight), w.constant(f"{n.target}.bias", m.bias)]
+    return w.add("Conv", inputs, n.name, **_geometry(m))
 
 
 def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
@@ -252,7 +225,10 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
     scales, zeros = weight.q_per_channel_scales(), weight.q_per_channel_zero_points()
     sums = scales * w.env[source].q_scale()
     whole_bias = torch.quantize_per_channel(bias.detach(), sums, torch.zeros_like(zeros), 0, torch.qint32).int_repr()
-    whole_weight, geometry = _stem_or(w, n, m, weight.int_repr())
+    whole_weight, geometry = weight.int_repr(), _geometry(m)
+    if source.op == "call_module" and isinstance(w.fetch_attr(str(source.target)), Columns):
+        whole_weight = stack_stem(whole_weight)
+        geometry = {"kernel_shape": [2, 1], "strides": [1, 1], "pads": [0] * 4, "dilations": [STACK // STRIDE, 1]}
     inputs = w.floats(n)
     w.calls[n.target] += 1
     again = f"_{w.calls[n.target]}" if w.calls[n.target] > 1 else ""
@@ -260,8 +236,7 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
         ("weight", whole_weight, scales, np.int8),
         ("bias", whole_bias, sums, np.int32),
     ):
-        # The backbone runs once for each camera. Its weights are stored once, its biases for each camera, because their
-        # scale depends on that of the camera's pixels.
+        # The backbone runs once for each camera: one weight, and a bias for each, whose scale is that of its pixels.
         made = f"{n.target}.{part}{again}"
         name = f"{n.target}.{part}" if part == "weight" else made
         scale = w.constant(f"{name}_scale", steps.float())
@@ -380,7 +355,6 @@ def _int8_add(w: _Writer, n: Node, result: Tensor, m: None) -> str:
 WRITERS: dict[Any, Callable[..., Any]] = {
     Columns: _columns,
     nn.Conv2d: _conv,
-    ConvReLU2d: _conv_relu,
     **dict.fromkeys((int8.Conv2d, fused_int8.ConvReLU2d), _int8_conv),
     nn.Linear: _linear,
     nn.MaxPool2d: _max_pool,

@@ -1,7 +1,6 @@
 """Channel scales around the transformer's projections: they even out its activations before anything is rounded.
 
-Activations have one scale per tensor, so a channel ten times larger than the rest takes the precision of all others;
-channel scales move it into the weights, which have a scale per channel. In float the function stays the same.
+Activations have one scale per tensor, so a channel ten times larger than the rest takes the precision of all others.
 """
 
 from collections.abc import Iterable
@@ -46,9 +45,8 @@ def channel_maxima(model: ACT, inputs: Iterable[tuple[Tensor, ...]]) -> Maxima:
 def apply_channel_scales(model: ACT, maxima: Maxima, smooth: float) -> None:
     """Put channel scales around the transformer's projections, in place; the float function stays the same.
 
-    maxima: of this model, from `channel_maxima`. smooth: SmoothQuant's a, how much moves from activations to weights.
     y = so * L'(x * si), L' = diag(1 / so) W diag(1 / si). ReLU lets positive scales pass, so `up` may deliver directly
-    in the scale that `down` wants.
+    in the scale that `down` wants. smooth: SmoothQuant's a, how much moves from activations to weights.
     """
     _scale_memory(model, maxima, smooth)
     for name, part in model.named_modules():

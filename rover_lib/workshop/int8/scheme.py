@@ -23,10 +23,9 @@ class Scheme:
     """How to quantize. A scheme that exists is valid.
 
     mode: dynamic (INT8 weights of linears, activations quantized on the fly), static (both, calibrated), or mixed
-    (static with `float_blocks` left in float). kind: of the activations of static and mixed. observer: how a range is
-    read off what was seen. smooth: SmoothQuant's a of the channel scales, None for no scales. usual_pct: the observer
-    `frames` takes the extremes of all frames but the oddest, of which this many percent are left. wider: (place, share)
-    of tensors whose range reaches further towards all frames' extremes; see `frames`.
+    (static with `float_blocks` left in float). kind: of the activations of static and mixed. smooth: SmoothQuant's a,
+    None for no channel scales. usual_pct: the share of frames of which the observer `frames` takes the extremes. wider:
+    (place, share) of tensors whose range reaches further, see `frames`.
     """
 
     mode: str = "static"

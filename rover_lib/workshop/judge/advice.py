@@ -36,7 +36,7 @@ PHRASES = {  # what people call the parts of a gate's name
     "temperature_c": "temperature, Celsius",
     "throttled": "what the Pi's firmware throttled",
 }
-NEXT_COMMANDS = 3
+NEXT_COMMANDS, MOST_CAUTIONS = 3, 5
 MOST_EPISODES = 3  # a remedy names at most this many
 EARLY_FRAMES = 30  # odd frames below this number all belong to the beginning of a drive
 
@@ -57,11 +57,6 @@ class Names:
 
     def artifact(self, mode: str) -> str:
         return f"{self.run.rstrip('/')}/policy_{mode}.pt"
-
-    def distill(self, *options: str, kind: str) -> str:
-        """A `rover distill` command on the same files. kind: what is added to the name of what it makes."""
-        made = f"{self.name}-{kind}"
-        return shlex.join(["rover", "distill", self.checkpoint, self.episodes, *options, "--name", made])
 
 
 def gate_in_words(gate: str) -> str:
@@ -99,12 +94,10 @@ def _some(names: Sequence[str]) -> str:
 def _lines(template: str, **values: Any) -> list[str]:
     """Fill in a template of this folder, and return its lines that are not empty."""
     pages = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=ChainableUndefined)
-    text = pages.get_template(template).render(some=_some, count=count, error_pct=error_pct, errors=_errors, **values)
+    text = pages.get_template(template).render(
+        some=_some, count=count, error_pct=error_pct, worst=judge.worst, **values
+    )
     return [line.strip() for line in text.splitlines() if line.strip()]
-
-
-def _errors(errors: Mapping[str, float | None]) -> str:
-    return ", ".join(f"{k.removesuffix('_mae_pct')} {v:.2f}" for k, v in errors.items() if v is not None)
 
 
 def list_remedies(
@@ -115,7 +108,6 @@ def list_remedies(
     action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct")
     alone = {block: errors.get(f"{action}_mae_pct") for block, errors in quantized.get("sensitivity", {}).items()}
     judged = {block: error for block, error in alone.items() if error is not None}
-    limit = params["quantization"]["clipped_warn_pct"]
     worst = [w for w in stages["compare"].get("worst", []) if (w["mode"], w["action"]) == (GATED, action)]
     return _lines(
         "remedies.txt",
@@ -126,32 +118,30 @@ def list_remedies(
         most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
         odd=quantized.get("odd"),
         worst_block=max(judged.items(), key=lambda item: item[1], default=None),
-        clipped=[row["name"] for row in quantized.get("layers", []) if (row.get("clipped_pct") or 0) > limit],
         episodes=list(dict.fromkeys(str(w["episode"]) for w in worst if w["episode"])),
     )
 
 
 def _smaller(stages: Stages, names: Names) -> str:
-    """Return a `rover distill` command for half the picture's sides and two decoder layers, or a narrower policy."""
-    report = stages["load"]["checkpoint"]
-    config = report.get("trainer_config") or {}
-    width, height = config.get("image_width"), config.get("image_height")
-    shape = ["--size", f"{width // 2}x{height // 2}"] if width and height else []
-    layers = len({block.split(".")[1] for block in report["macs_by_block"] if block.startswith("decoder.")})
-    if layers > 2:
-        shape += ["--decoder-layers", "2"]
-    return names.distill(*(shape or ["--feedforward", "1600"]), kind="small")
+    """Return a `rover distill` command for half the picture's sides, or for a narrower policy."""
+    config = stages["load"]["checkpoint"].get("trainer_config") or {}
+    width, height = (config.get(f"image_{side}", 0) // 2 for side in ("width", "height"))
+    shape = ["--size", f"{width}x{height}"] if width and height else ["--feedforward", "1600"]
+    return shlex.join(["rover", "distill", names.checkpoint, names.episodes, *shape, "--name", f"{names.name}-small"])
 
 
 def list_cautions(
     stages: Stages, params: Mapping[str, Any], judged: Mapping[str, Any], best: Mapping[str, Any], busy: str
 ) -> list[str]:
-    """Say what weakens the verdict: cautions.txt. best: the row of the mode that the rule takes. busy: what shows that
-    the machine was.
+    """Say what weakens the verdict, at most MOST_CAUTIONS lines of cautions.txt, the most important first.
+
+    best: the row of the mode that the rule takes. busy: what shows that the machine was.
     """
     load, compared, quantized = stages["load"], stages["compare"], stages["quantize"]
-    told = [stage.get("warnings", []) for stage in (compared, quantized)]
-    return _lines(
+    clipped = quantized.get("clipped", {})
+    if quantized["modes"].get(GATED, {}).get("scheme", {}).get("observer") == "frames":
+        clipped = {}  # it clips odd frames on purpose
+    cautions = _lines(
         "cautions.txt",
         **stages,
         judged=judged,
@@ -160,17 +150,15 @@ def list_cautions(
         limits=params["verdict"],
         early_frames=EARLY_FRAMES,
         odd=quantized.get("odd"),
+        clipped=clipped if clipped.get("clipped_pct", 0) > params["quantization"]["clipped_warn_pct"] else {},
         most_throttle=compared.get("action_range", {}).get("throttle", (0, 0))[1],
         throttle_limit=params["drive"]["throttle_limit"],
         held_out=load["split"]["held_out"],
         shared=set(load["split"]["held_out"]) & set(load["split"]["calibration"]),
-        # Two stages may say the same.
-        warnings=dict.fromkeys([*load["checkpoint"].get("notes", []), *told[0], *told[1]]),
+        warnings=dict.fromkeys(w for stage in (compared, quantized) for w in stage.get("warnings", [])),
         allowed=[why for kind, why in judged["refused"].items() if kind in MAY_DIFFER and kind != "mode"],
     )
-
-
-# --- what to type next ------------------------------------------------------------------------------------------------
+    return cautions[:MOST_CAUTIONS]
 
 
 def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names) -> list[dict[str, str]]:

@@ -5,10 +5,8 @@
 
 The policy's state is its last action. So for each frame it plans twice more: with the state of another frame, and with
 the picture of another frame. The plans of a policy that only copies change with the state and not with the picture.
-Such a policy looks good on recordings, but on a car it leaves the track.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,58 +20,42 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
 
 FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size
+WAYS = ("by_picture", "by_state", "apart")  # another frame's picture, another frame's state, both
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Looking:
-    """How much plans change, as a mean over frames and steps, in units of each action.
+    """How much plans change, as a mean over frames and steps, in % of the recorded range: by action, then by WAYS.
 
-    by_picture: with another frame's picture and the frame's own state. by_state: with another frame's state and the
-    frame's own picture. apart: the difference between the plans of the two frames. Each is (A,) float64.
+    None for an action that is not judged.
     """
 
-    report: Fidelity
     frames: int
-    by_picture: np.ndarray
-    by_state: np.ndarray
-    apart: np.ndarray
+    moved_pct: dict[str, dict[str, float] | None]
 
     def summary(self) -> dict[str, Any]:
-        """Return the changes by action and unit, for compare.json. The percentages of an unjudged action are None."""
+        """Return the changes as `<action>_<way>_pct`, for compare.json."""
         summary: dict[str, Any] = {"frames": self.frames}
-        for i, action in enumerate(self.report.action_names):
-            for name, moved in (("by_picture", self.by_picture), ("by_state", self.by_state), ("apart", self.apart)):
-                summary[f"{action}_{name}_pct"] = self.report.in_pct(float(moved[i]), action)
-                if math.isfinite(us := self.report.us(action)):
-                    summary[f"{action}_{name}_us"] = float(moved[i]) * us
+        for action, moved in self.moved_pct.items():
+            summary |= {f"{action}_{way}_pct": moved[way] if moved else None for way in WAYS}
         return summary
 
     def table(self) -> Table:
         """Return the changes as a table for people."""
-        moves = self.by_picture, self.by_state, self.apart
-        rows = [(a, *(self._pct(moved, i) for moved in moves)) for i, a in enumerate(self.report.action_names)]
+        rows = []
+        for action, moved in self.moved_pct.items():
+            rows.append((action, *(format_pct(moved[way] if moved else None).strip() for way in WAYS)))
         return Table(("a plan moves by", "another picture", "another state", "both"), rows)
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
-        names = enumerate(self.report.action_names)
-        judged = [(i, a, pct) for i, a in names if (pct := self.report.pct(a)) is not None]
-        if judged and all(self.apart[i] * pct < FLOOR_PCT for i, _, pct in judged):
+        judged = {action: moved for action, moved in self.moved_pct.items() if moved}
+        if judged and all(moved["apart"] < FLOOR_PCT for moved in judged.values()):
             return ["this policy plans the same whatever it is shown, do not drive it"]
-        blind = [(i, a) for i, a, pct in judged if not follows(self.by_picture[i] * pct, self.apart[i] * pct)]
+        blind = [a for a, moved in judged.items() if not follows(moved["by_picture"], moved["apart"])]
         if judged and len(blind) == len(judged):
-            return [f"this policy ignores its camera: {self._moves(blind)}; it copies its state, do not drive it"]
-        return [f"{action} hardly follows the camera: {self._moves([(i, action)])}" for i, action in blind]
-
-    def _moves(self, actions: list[tuple[int, str]]) -> str:
-        told = []
-        for i, a in actions:
-            by_picture, by_state = self._pct(self.by_picture, i), self._pct(self.by_state, i)
-            told.append(f"another picture moves {a} by {by_picture}, another state by {by_state}")
-        return ", ".join(told)
-
-    def _pct(self, moved: np.ndarray, i: int) -> str:
-        return format_pct(self.report.in_pct(float(moved[i]), self.report.action_names[i])).strip()
+            return ["this policy ignores its camera and copies its state, do not drive it"]
+        return [f"{action} hardly follows the camera" for action in blind]
 
 
 def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress = silent) -> Looking:
@@ -92,5 +74,9 @@ def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress
         by_picture = policy.predict_chunk(another.frame_bgr(), sample.state)
         by_state = policy.predict_chunk(sample.frame_bgr(), another.state)
         moved.append(tuple(np.abs(p - plan).mean(axis=0) for p in (by_picture, by_state, report.reference[other])))
-    by_picture, by_state, apart = np.mean(moved, axis=0)
-    return Looking(report, len(rows), by_picture, by_state, apart)
+    means = np.mean(moved, axis=0)  # (ways, actions)
+    moved_pct: dict[str, dict[str, float] | None] = {}
+    for i, action in enumerate(report.action_names):
+        pct = report.pct(action)
+        moved_pct[action] = None if pct is None else dict(zip(WAYS, (means[:, i] * pct).tolist(), strict=True))
+    return Looking(len(rows), moved_pct)

@@ -1,14 +1,12 @@
 """What quantization changed: the same frames through every artifact, differences in units that the car feels.
 
     report = fidelity(fp32, {"static": static}, split.held_out, recordings.action_range())
-    compared = metrics(report, policies, trials, driven)
+    compared = metrics(report, policies, trials)
     gates(compared, params()["gates"])
 
-Errors are absolute differences to the FP32 artifact, never to the recorded action: how well the policy
-imitates is another question, whose answer (`recorded_error`) is given beside it as a yardstick.
-Padding: a sample near its episode's end has fewer recorded actions than a chunk is long. The car would drive the whole
-chunk all the same, so every step counts in `mae`; `mae_recorded_steps` and `recorded_error` count recorded steps only.
-An action that never changes in the recordings has no range to be a share of: it is not judged (see judge).
+Errors are absolute differences to the FP32 artifact; `recorded_error` is against the driver. Near an episode's end a
+sample has fewer recorded actions than a chunk is long: `mae` counts all steps, `mae_recorded_steps` and
+`recorded_error` only the recorded ones.
 """
 
 import math
@@ -26,11 +24,11 @@ from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import CarError, PolicyError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act import Affine, lerobot_act
+from rover_lib.workshop.act import Affine
+from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.samples import pick_evenly
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES, "static_affine")
@@ -38,17 +36,6 @@ GATED_WORLDS = 40  # in which params.yml counts balloons
 GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
 
 RELATIONS = {"<=": operator.le, ">=": operator.ge}
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """What a policy saw in a driven world. state: (S,) float32."""
-
-    frame: np.ndarray  # (h, w, 3) uint8 BGR
-    state: np.ndarray
-
-    def frame_bgr(self) -> np.ndarray:
-        return self.frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,20 +50,13 @@ class WorstFrame:
     reference: np.ndarray
     other: np.ndarray
 
-    def summary(self) -> dict[str, Any]:
-        """The same for compare.json, without the picture."""
-        sample = {"episode": getattr(self.sample, "episode", None), "frame": getattr(self.sample, "frame_name", None)}
-        found = {"mode": self.mode, "action": self.action, "error_pct": self.error_pct}
-        return found | sample | {"fp32": self.reference, "int8": self.other}
-
 
 @dataclass(frozen=True, eq=False)
 class Fidelity:
     """Chunks of every artifact on the same n frames.
 
-    reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody
-    drove; is_pad: (n, C) bool, steps after the end of the recording; action_range: name -> (least, most); car: the
-    one whose actions FP32 plans.
+    reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody drove;
+    is_pad: (n, C) bool, steps after the end of the recording; car: whose actions FP32 plans.
     """
 
     action_names: tuple[str, ...]
@@ -162,10 +142,7 @@ class Fidelity:
 
 
 class LerobotEager:
-    """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface. Downloads nothing.
-
-    car: the one whose actions it plans; None: this machine's.
-    """
+    """LeRobot's own ACTPolicy in eager FP32, behind an artifact's interface. car: None is this machine's."""
 
     def __init__(self, checkpoint: Checkpoint, car: Car | None = None):
         c = self.config = checkpoint.config
@@ -201,10 +178,7 @@ def artifacts(run_dir: Path | str) -> dict[str, Path]:
 
 
 def load_policies(run_dir: Path | str, threads: int | None = None) -> dict[str, Policy]:
-    """Every artifact of a run by mode, loaded and checked as on the Pi.
-
-    Raises ArtifactError for one that does not pass, PolicyError where there is no policy_fp32.pt.
-    """
+    """Every artifact of a run by mode, loaded and checked as on the Pi. Raises ArtifactError and PolicyError."""
     policies = {mode: load_policy(path, threads=threads) for mode, path in artifacts(run_dir).items()}
     if "fp32" not in policies:
         raise PolicyError(f"{run_dir}: no policy_fp32.pt in it", found=sorted(policies), remedy="run notebook 03")
@@ -216,12 +190,6 @@ def hashes(run_dir: Path | str) -> dict[str, str]:
     return {path.name: content_hash(path) for path in artifacts(run_dir).values()}
 
 
-def observe_trials(trials: Mapping[str, Any], at_most: int = 200) -> tuple[Observation, ...]:
-    """Observations from the (frame_bgr, state) that trial reports kept: places no recording went to."""
-    frames = [frame for trial in trials.values() for frame in trial.frames]
-    return tuple(Observation(frame, np.asarray(state, np.float32)) for frame, state in pick_evenly(frames, at_most))
-
-
 def fidelity(
     reference: Any,
     others: Mapping[str, Any],
@@ -231,10 +199,8 @@ def fidelity(
 ) -> Fidelity:
     """Run every policy on every sample.
 
-    reference, others: policies with predict_chunk(frame_bgr, state) -> (C, A), chunk and action_names; the reference
-    also has car. samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording.
-    action_range: name -> (least, most).
-    Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
+    samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording. action_range: name ->
+    (least, most). Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
     """
     names = tuple(reference.action_names)
     if not samples:
@@ -269,12 +235,10 @@ def metrics(
     report: Fidelity,
     policies: Mapping[str, Any],
     trials: Mapping[str, Any] | None = None,
-    on_drives: Fidelity | None = None,
 ) -> dict[str, Any]:
     """The metrics of compare.json: fp32, modes and what they were measured on.
 
-    policies: "fp32" and the modes, with .path and .manifest. trials: reports by mode (hits, trials, wilson); modes that
-    were not driven have None, not 0. on_drives: fidelity on the frames of those drives. Sizes are artifact files.
+    policies: "fp32" and the modes. trials: reports by mode; modes that were not driven have None, not 0.
     """
     own = {}
     for mode in ("fp32", *report.chunks):
@@ -291,8 +255,11 @@ def metrics(
     fp32, modes = own.pop("fp32"), {}
     for mode, found in own.items():
         modes[mode] = found | report.summary(mode) | {"size_ratio": fp32["size_mb"] / found["size_mb"]}
-        if on_drives is not None:
-            modes[mode]["driven"] = on_drives.summary(mode)
+    worst = []
+    for w in (w for mode in report.chunks for w in report.worst(mode)):
+        at = {"episode": getattr(w.sample, "episode", None), "frame": getattr(w.sample, "frame_name", None)}
+        found = {"mode": w.mode, "action": w.action, "error_pct": w.error_pct}
+        worst.append(found | at | {"fp32": w.reference, "int8": w.other})
     return {
         "fp32": fp32 | report.recorded_error(report.reference),
         "modes": modes,
@@ -300,17 +267,14 @@ def metrics(
         "warnings": judge.not_judged(report.action_range),
         "frames": len(report.samples),
         "padded_steps_pct": 100 * report.is_pad.mean(),
-        "driven_frames": len(on_drives.samples) if on_drives else 0,
-        "worst": [w.summary() for mode in report.chunks for w in report.worst(mode)],
+        "worst": worst,
     }
 
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
     """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
-    if found is None or (isinstance(found, float) and math.isnan(found)):
-        found = passed = None
-    else:
-        passed = bool(RELATIONS[relation](found, limit))
+    found = None if isinstance(found, float) and math.isnan(found) else found
+    passed = None if found is None else bool(RELATIONS[relation](found, limit))
     return {"gate": name, "relation": relation, "limit": limit, "found": found, "passed": passed}
 
 
@@ -320,10 +284,7 @@ def hits_needed(limits: Mapping[str, Any], trials: int | None) -> int:
 
 
 def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GATED) -> list[dict[str, Any]]:
-    """The gates of params.yml that a comparison can judge. compared: `metrics`; limits: params.yml's `gates`.
-
-    The error gates are for every action that the policy has and params.yml names, as `<action>_mae_pct`.
-    """
+    """The gates of params.yml that a comparison can judge. compared: `metrics`; limits: params.yml's `gates`."""
     fp32, judged, original = compared["fp32"], compared["modes"][mode], limits["original"]
     size_mb = judged["size_mb"]
     errors = [key for key in judged if key.endswith("_mae_pct")]

@@ -10,7 +10,7 @@ little, that is asked of many draws of the held-out ones (a bootstrap).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
@@ -32,12 +32,14 @@ class Guess:
     All in percent of the recorded range. The interval has SURE_PCT % of the draws.
     """
 
-    name: str
     errors_pct: dict[str, float]
     better: float
     low: float
     high: float
     beaten: bool
+
+    def lead(self) -> str:
+        return f"{self.better:.1f} points ({self.low:.1f} to {self.high:.1f})"
 
 
 @dataclass(frozen=True)
@@ -45,37 +47,25 @@ class Judged:
     """The result of `against_guesses`. drawn: how many episodes or pieces of them were drawn from, in words."""
 
     errors_pct: dict[str, float]
-    guesses: tuple[Guess, ...]
+    guesses: dict[str, Guess]
     drawn: str
 
     def table(self) -> Table:
         """The policy and the guesses beside each other, for people."""
         rows = [("the policy", *(f"{e:.2f} %" for e in self.errors_pct.values()), "")]
-        for g in self.guesses:
-            rows.append((g.name, *(f"{e:.2f} %" for e in g.errors_pct.values()), _interval(g)))
+        for name, g in self.guesses.items():
+            rows.append((name, *(f"{e:.2f} %" for e in g.errors_pct.values()), g.lead()))
         return Table(("", *self.errors_pct, "the policy is better by"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each guess that is not beaten."""
-        return [
-            f"this policy is no better than a guess without eyes: {g.name} ({_words(g.errors_pct)} off the driver, "
-            f"the policy {_words(self.errors_pct)}; better by {_interval(g)} over {self.drawn})"
-            for g in self.guesses
-            if not g.beaten
-        ]
+        what = "this policy is no better than a guess without eyes"
+        lost = {name: g for name, g in self.guesses.items() if not g.beaten}
+        return [f"{what}: {name} (better by {g.lead()} over {self.drawn})" for name, g in lost.items()]
 
     def summary(self) -> dict[str, Any]:
         """The same as plain JSON types, for compare.json."""
-        guesses = {g.name: {k: v for k, v in vars(g).items() if k != "name"} for g in self.guesses}
-        return {"errors_pct": self.errors_pct, "guesses": guesses, "drawn": self.drawn, "warnings": self.warnings()}
-
-
-def _words(errors_pct: dict[str, float]) -> str:
-    return " / ".join(f"{e:.1f}" for e in errors_pct.values()) + " %"
-
-
-def _interval(guess: Guess) -> str:
-    return f"{guess.better:.1f} points ({guess.low:.1f} to {guess.high:.1f})"
+        return {**asdict(self), "warnings": self.warnings()}
 
 
 def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
@@ -93,7 +83,6 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     every = acted[~pads]
     # At a step that no plan reaches, the last one that was reached stands.
     steps = np.ma.masked_array(acted, np.broadcast_to(pads[..., None], acted.shape)).mean(0).filled(every.mean(0))
-
     judged = [i for i, a in enumerate(report.action_names) if a in units]
 
     def errors_of(plans: np.ndarray) -> np.ndarray:
@@ -111,7 +100,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
     counts = np.array([len(p) for p in pieces])
-    guesses, own_pct = [], dict(zip(units, own.mean(0).tolist(), strict=True))
+    guesses, own_pct = {}, dict(zip(units, own.mean(0).tolist(), strict=True))
     for name, errors in found.items():
         gain = (errors - own).mean(1)
         sums = np.array([gain[p].sum() for p in pieces])
@@ -119,8 +108,8 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         low, high = np.percentile(means, [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]).tolist()
         errors_pct = dict(zip(units, errors.mean(0).tolist(), strict=True))
         beaten = low > 0 and all(own_pct[action] < error for action, error in errors_pct.items())
-        guesses.append(Guess(name, errors_pct, float(gain.mean()), low, high, beaten))
-    return Judged(own_pct, tuple(guesses), drawn)
+        guesses[name] = Guess(errors_pct, float(gain.mean()), low, high, beaten)
+    return Judged(own_pct, guesses, drawn)
 
 
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:

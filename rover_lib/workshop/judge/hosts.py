@@ -2,11 +2,10 @@
 
 benchmarks = read_benchmarks("runs/demo", "runs/rovers")
 print(benchmarks.table())
-plots.latency(benchmarks.by_host)
 """
 
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from rover_lib.workshop.notebook_table import Table
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
 NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
 CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # its program: commit 545214c
-SAME_WORK = 0.01
-NO_SOAK = "none of the rovers was soaked; -e rover_soak_minutes=30 shows temperature, clock and throttling over time"
 
 
 @dataclass(frozen=True)
@@ -31,25 +28,6 @@ class Benchmarks:
 
     by_host: dict[str, dict[str, Any]]
     unusable: list[str]
-
-    def soaks(self) -> dict[str, dict[str, Any]]:
-        """The benchmarks with a time series, by host."""
-        return {host: b for host, b in self.by_host.items() if b["metrics"].get("series")}
-
-    def beside_clock(self, policies: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Rovers' own static artifacts, as rows of the clock's policies with `host` and `measured_ms`, the p50.
-
-        policies: those of clock.json. One is the rover's if it has its multiply-accumulates, to 1 %, and threads.
-        """
-        rows = []
-        for host, b in self.by_host.items():
-            own = b["metrics"]["artifacts"].get("static")
-            if host == THIS or own is None or not own.get("gmac"):
-                continue
-            for row in policies:
-                if row["threads"] == b["metrics"].get("threads") and abs(row["gmac"] / own["gmac"] - 1) < SAME_WORK:
-                    rows.append({**row, "host": host, "measured_ms": own["latency_p50_ms"]})
-        return rows
 
     def table(self) -> Table:
         """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
@@ -65,9 +43,8 @@ class Benchmarks:
                 rows.append((host, name, *times, str(v["n"]), *state))
                 host, state = "", ("", "", "")  # shown only once for each host
         notes = [f"left out: {sentence}" for sentence in self.unusable]
-        rovers = self.by_host.keys() - {THIS}
-        if not rovers & self.soaks().keys():
-            notes.insert(0, NO_SOAK if rovers else NO_ROVER)
+        if not self.by_host.keys() - {THIS}:
+            notes.insert(0, NO_ROVER)
         return Table(header, rows, notes=notes)
 
 
@@ -77,10 +54,7 @@ def read_clock() -> dict[str, Any] | None:
 
 
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
-    """Read all benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers.
-
-    A rover is named as in the inventory, by the file's name. Of two with one name, the fetched one is used.
-    """
+    """Read all benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers."""
     by_host: dict[str, dict[str, Any]] = {}
     unusable: list[str] = []
     for folder in (Path(run_dir), Path(fetched)):
@@ -100,10 +74,7 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
 
 
 def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> Path | None:
-    """Return the benchmark of a run's own artifacts, preferably of this machine; None if there is none.
-
-    made: quantize.json's modes. Others there measured earlier artifacts. Raises RoverError for a damaged file.
-    """
+    """Return the benchmark of a run's own artifacts, preferably of this machine. made: quantize.json's modes."""
     paths = sorted(Path(run_dir).glob("benchmark-*.json"))
     for path in sorted(paths, key=lambda p: p.stem != f"benchmark-{socket.gethostname()}"):
         if is_of(read_stage(path, "benchmark")["inputs"], made):
@@ -132,9 +103,5 @@ def _name_by_mode(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[s
     for name, v in metrics["artifacts"].items():
         mode = ours.get(content["inputs"].get(f"{name}.pt"), f"{v.get('mode') or _mode(name)}, another")
         names[name] = name if mode in names.values() else mode
-
-    def renamed(point: Mapping[str, Any]) -> dict[str, Any]:
-        return {**point, "artifacts": {names.get(n, n): v for n, v in point["artifacts"].items()}}
-
-    series = [renamed(point) for point in metrics.get("series") or ()]
-    return {**content, "metrics": {**renamed(metrics), "main": names[metrics["main"]], "series": series}}
+    artifacts = {names[name]: v for name, v in metrics["artifacts"].items()}
+    return {**content, "metrics": {**metrics, "artifacts": artifacts, "main": names[metrics["main"]]}}

@@ -25,72 +25,56 @@ BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share o
 MOST_BEYOND_PCT = 5.0
 LEAST_SPREAD = 0.1  # a policy whose predictions vary by less than this share of the recorded spread does not drive
 LARGEST_STATE = 10.0  # standard deviations; in wrong units there are hundreds
-
-
-@dataclass(frozen=True)
-class Action:
-    """One action's recorded and predicted range, and the ratio of the predictions' spread to the recorded one.
-
-    beyond_pct: percentage of predicted values that lie outside the recorded range by more than BEYOND of that range.
-    """
-
-    name: str
-    recorded: Range
-    predicted: Range
-    beyond_pct: float
-    spread: float
+REMEDY = "are these the recordings, and the statistics, that it was trained with?"
 
 
 @dataclass(frozen=True)
 class Fit:
     """The result of `fits`.
 
-    largest_state: by name, the largest normalised recorded state; None if states are not normalised. plans_hz: steps
-    per second of the policy's plans. other_rates_hz: frames per second of each episode that has another rate.
+    recorded: range by action. actions: {predicted: [least, most], beyond_pct, spread} by action: the percentage of
+    predicted values that lie outside the recorded range by more than BEYOND of it, and their spread divided by the
+    recorded one. largest_state: by name, the largest normalised recorded state. plans_hz: steps per second of the
+    policy's plans. other_rates_hz: frames per second of each episode that has another rate.
     """
 
     frames: int
-    actions: tuple[Action, ...]
-    largest_state: dict[str, float] | None
+    recorded: Mapping[str, Range]
+    actions: dict[str, dict[str, Any]]
+    largest_state: dict[str, float]
     plans_hz: float
     other_rates_hz: dict[str, float]
 
     def table(self) -> Table:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
-        rows = [
-            (a.name, *("{:.3g} to {:.3g}".format(*ends) for ends in (a.recorded, a.predicted))) for a in self.actions
-        ]
+        rows = []
+        for name, found in self.actions.items():
+            rows.append(
+                (name, *("{:.3g} to {:.3g}".format(*ends) for ends in (self.recorded[name], found["predicted"])))
+            )
         return Table(("", "recorded", "predicted"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit."""
-        found = []
-        for a in self.actions:
-            if a.beyond_pct > MOST_BEYOND_PCT:
-                ends = f"({a.predicted[0]:.3g} to {a.predicted[1]:.3g})"
-                found.append(
-                    f"{a.name}: {a.beyond_pct:.0f} % of its predictions are far outside of what was recorded {ends}"
-                )
-            elif a.spread < LEAST_SPREAD:
-                found.append(f"{a.name}: its predictions vary {100 * a.spread:.0f} % as much as what was recorded")
-        for name, largest in (self.largest_state or {}).items():
+        warnings = []
+        for name, found in self.actions.items():
+            if found["beyond_pct"] > MOST_BEYOND_PCT:
+                what = f"{found['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
+                warnings.append(f"{name}: {what}; {REMEDY}")
+            elif found["spread"] < LEAST_SPREAD:
+                what = f"its predictions vary {100 * found['spread']:.0f} % as much as what was recorded"
+                warnings.append(f"{name}: {what}; {REMEDY}")
+        for name, largest in self.largest_state.items():
             if not largest <= LARGEST_STATE:
-                found.append(f"state {name}: the policy is told up to {largest:.3g} standard deviations")
-        remedy = "are these the recordings, and the statistics, that it was trained with?"
-        warnings = [f"{what}; {remedy}" for what in found]
-        if self.other_rates_hz:
-            episode, found_hz = next(iter(self.other_rates_hz.items()))
-            others = f" and {len(self.other_rates_hz) - 1} more" if len(self.other_rates_hz) > 1 else ""
-            what = f"the policy plans {self.plans_hz:g} steps a second, and {episode}{others} has {found_hz:.1f} frames"
+                warnings.append(f"state {name}: the policy is told up to {largest:.3g} standard deviations; {REMEDY}")
+        for episode, found_hz in list(self.other_rates_hz.items())[:1]:
+            what = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
             warnings.append(f"{what}: the car would drive at another speed than the human did")
         return warnings
 
     def summary(self) -> dict[str, Any]:
         """The same values as plain JSON types, for load.json."""
-        actions = {}
-        for a in self.actions:
-            actions[a.name] = {"predicted": list(a.predicted), "beyond_pct": a.beyond_pct, "spread": a.spread}
-        return {"frames": self.frames, "actions": actions, "warnings": self.warnings()}
+        return {"frames": self.frames, "actions": self.actions, "warnings": self.warnings()}
 
 
 def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mapping[str, Range]) -> Fit:
@@ -103,16 +87,18 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()
     known = ~np.stack([s.is_pad for s in few])
     recorded = np.stack([s.chunk for s in few])
-    actions = []
+    actions = {}
     for i, (name, (low, high)) in enumerate(action_range.items()):
         if name in constant_actions(action_range):
             continue
         values, margin = plans[..., i], BEYOND * (high - low)
         beyond = (values < low - margin) | (values > high + margin)
-        spread = float(values[known].std() / max(recorded[..., i][known].std(), 1e-12))
-        ends = float(values.min()), float(values.max())
-        actions.append(Action(name, (low, high), ends, 100 * float(beyond.mean()), spread))
-    largest = None
+        actions[name] = {
+            "predicted": [float(values.min()), float(values.max())],
+            "beyond_pct": 100 * float(beyond.mean()),
+            "spread": float(values[known].std() / max(recorded[..., i][known].std(), 1e-12)),
+        }
+    largest: dict[str, float] = {}
     if (norm := config.state_norm) is not None:
         states = np.stack([s.state for s in samples]) * np.asarray(norm.scale) + np.asarray(norm.shift)
         largest = dict(zip(config.state_names, np.abs(states).max(0).tolist(), strict=True))
@@ -121,4 +107,4 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
         found_hz = frame_rate_hz(list(episode))
         if found_hz is not None and is_another_rate(found_hz, config.rate_hz):
             others_hz[name] = found_hz
-    return Fit(len(few), tuple(actions), largest, config.rate_hz, others_hz)
+    return Fit(len(few), action_range, actions, largest, config.rate_hz, others_hz)

@@ -1,7 +1,6 @@
 """One unit for every error of a policy: percent of the range that an action has in the recordings.
 
-A recording whose throttle never changes says nothing of how much an error in throttle matters: that action is not
-judged. Its errors are None, it takes no part in a choice or a budget, and a warning says so.
+An action that never changes in the recordings is not judged: its errors are None, and it takes no part in a choice.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,8 +29,7 @@ def constant_actions(action_range: Mapping[str, Range]) -> list[str]:
 
 def not_judged(action_range: Mapping[str, Range]) -> list[str]:
     """A warning for each action that never changes in the recordings."""
-    why = "never changes in these recordings, so its error has no range to be a share of and is not judged"
-    return [f"{name} {why}" for name in constant_actions(action_range)]
+    return [f"{name} never changes in these recordings: not judged" for name in constant_actions(action_range)]
 
 
 def follows(moved_pct: float, apart_pct: float) -> bool:

@@ -29,9 +29,8 @@ def verdict(
     """Return the verdict on a run, as run.json stores it.
 
     stages: the metrics of the stages load, quantize, compare and benchmark, and of arm and students if they were made.
-    params: the content of params.yml. refusals: by mode, what a rover would refuse its artifact for, as
-    `Expected.refusals`. "ready" in the result: whether the policy drives; "deploy" is None if no artifact of it should
-    drive this car.
+    params: the content of params.yml. refusals: by mode, as `Expected.refusals`. "ready" in the result: whether the
+    policy drives; "deploy" is None if no artifact of it should drive this car.
     """
     limits, benchmark = params["verdict"], stages["benchmark"]
     rows = _rows(stages, params)
@@ -66,9 +65,6 @@ def verdict(
     return judged | {"next": advice.list_next(judged, best["mode"], stages, names)}
 
 
-# --- the modes beside each other --------------------------------------------------------------------------------------
-
-
 def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return a row for each mode that was compared, FP32 first. Units are in the keys."""
     compared, timed = stages["compare"], stages["benchmark"]["artifacts"]
@@ -92,14 +88,12 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "hits": found["hits"],
             "trials": found["trials"],
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
-            "not_timed": "",
             "missed_gates": [] if mode == "fp32" else _list_missed(compared, params["gates"], mode),
         }
     static, mixed = rows.get("static"), rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
         # It does the same work and some of it in float: its shorter time is chance.
-        noise = f"its {mixed['time_ms']:.1f} ms are within the noise of static's time, which is used for it"
-        mixed |= {"not_timed": noise, "time_ms": static["time_ms"], "times_faster": static["times_faster"]}
+        mixed |= {key: static[key] for key in ("time_ms", "times_faster")}
     return rows
 
 
@@ -127,8 +121,7 @@ def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str
 
 
 def _candidates(rows: Iterable[Mapping[str, Any]]) -> list[Any]:
-    """Return the modes that keep their gates. A mixed one with no block in float is static INT8 again, and left out."""
-    return [row for row in rows if not row["missed_gates"] and (row["mode"] != "mixed" or row["float_blocks"])]
+    return [row for row in rows if not row["missed_gates"]]
 
 
 def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
@@ -137,10 +130,7 @@ def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
 
 
 def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
-    """Return which time of a mode is compared: the median, or the smallest if the machine was busy with other things.
-
-    INT8's threads wait for each other at each layer, so another process can make its median slower than FP32's.
-    """
+    """Return which time of a mode is compared: the median, or the smallest if the machine was busy."""
     least = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
     return "latency_min_ms" if least and _busy(benchmark, limits) else "latency_p50_ms"
 
@@ -157,16 +147,10 @@ def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     return f"p95 is {spread:.1f} times p50" if spread > limits["busy_p95"] else ""
 
 
-# --- what failed ------------------------------------------------------------------------------------------------------
-
-
 def _list_failures(
     stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return each gate that the policy, or the mode that a Pi is meant to run, misses, with its remedies, best first.
-
-    Time and memory measured on this workstation are not judged here: those gates are for a Pi.
-    """
+    """Return each gate that FP32 or static misses, with its remedies; those of a Pi's time and memory are left out."""
     limits, fp32, static = params["gates"], stages["compare"]["fp32"], rows.get(GATED, {})
     promised = limits["original"]["latency_mean_ms"][1]
     trained = gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32["trials"]))
@@ -182,10 +166,8 @@ def _list_failures(
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared, lines = stages["compare"], []
-    for warning in (
-        *compared.get("guesses", {}).get("warnings", []),
-        *stages["load"].get("fit", {}).get("warnings", []),
-    ):
+    warnings = compared.get("guesses", {}).get("warnings", []) + stages["load"].get("fit", {}).get("warnings", [])
+    for warning in warnings:
         lines.append(f"{warning[0].upper()}{warning[1:]}{'' if warning.endswith('?') else '.'}")
     looking = compared.get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
@@ -196,14 +178,8 @@ def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str
         lines.append(f"As it was trained, in FP32, it hits {fp32['hits']} of {fp32['trials']} balloons.")
     if lines:
         episodes = len({name for part in stages["load"]["split"].values() for name in part})
-        lines.append(
-            "What helps: the dataset that it was trained on, if this is another; more training steps; more recordings "
-            f"than these {episodes}, with standing starts, other places and light (docs: which recordings help)."
-        )
+        lines.append(f"What helps: its own dataset, more training steps, and more recordings than these {episodes}.")
     return lines
-
-
-# --- why --------------------------------------------------------------------------------------------------------------
 
 
 def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
@@ -217,12 +193,9 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
         lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
     size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
     if best["instructions_g"] and fp32["instructions_g"]:
-        counts = f"{best['instructions_g']:.3g} G instructions instead of {fp32['instructions_g']:.3g}"
-        size += f", and needs {counts} ({COUNTED})"
+        size += f", and {fp32['instructions_g'] / best['instructions_g']:.1f} times fewer instructions ({COUNTED})"
     elif best["times_faster"]:
-        which = "p50" if best["time_ms"] == best["latency_p50_ms"] else "the least of each"
-        times = f"{best['time_ms']:.1f} ms instead of {fp32['time_ms']:.1f}, {which}, measured here"
-        size += f", and {best['times_faster']:.1f} times as fast ({times})"
+        size += f", and is {best['times_faster']:.1f} times as fast, measured here"
     return [*lines, f"{size}."]
 
 
@@ -232,15 +205,10 @@ def _because(row: Mapping[str, Any], best: Mapping[str, Any], limits: Mapping[st
         return "the one to deploy"
     if row["missed_gates"]:
         return "misses " + "; ".join(advice.against(missed) for missed in row["missed_gates"])
-    if row["not_timed"] and best["mode"] == "static":
-        return f"is no faster than static INT8: {row['not_timed']}"
-    if row["mode"] == "mixed" and not row["float_blocks"]:
-        return "is the same as static INT8: no block had to stay in float"
-    key, other, worth = _work_key([row, best]), CALLED[best["mode"]], 1 + limits["worth_pct"] / 100
-    if key and row[key] > best[key] * worth:
-        times, size = row[key] / best[key], row["size_mb"] / best["size_mb"]
+    key, other = _work_key([row, best]), CALLED[best["mode"]]
+    if key and row[key] > best[key] * (1 + limits["worth_pct"] / 100):
         how = "takes {:.1f} times as long as {}" if key == "time_ms" else "needs {:.1f} times the instructions of {}"
-        return how.format(times, other) + (f", and its file is {size:.1f} times as large" if size > worth else "")
+        return how.format(row[key] / best[key], other)
     if error_pct(row) > error_pct(best) + limits["better_points"]:
         return f"is no faster than {other}, and its error is {error_pct(row):.2f} %"
     return f"is no better than {other}: as fast, as accurate and no smaller"

@@ -8,17 +8,15 @@ Each subject has a module; `style` has what all figures share.
 # ruff: noqa: F401, these are the names that notebooks use
 
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.benchmarks import latency, soak
-from rover_lib.workshop.plots.comparison import action_error, drives_from_above, hits, sizes, worst_frames
-from rover_lib.workshop.plots.counting import instruction_counts, whole_size
-from rover_lib.workshop.plots.quantization import errors_by_choice, layers, outlier_channels, sensitivity
+from rover_lib.workshop.plots.benchmarks import latency
+from rover_lib.workshop.plots.comparison import action_error, hits, worst_frames
+from rover_lib.workshop.plots.counting import whole_size
+from rover_lib.workshop.plots.quantization import sensitivity
 from rover_lib.workshop.plots.recordings import (
-    calibration_coverage,
     checkpoint_size,
     episode_overview,
     faults,
     frame,
-    observer_ranges,
     odd_frames,
     work_per_block,
 )

@@ -1,15 +1,13 @@
-"""Notebook 05: how long inference takes, by host, and what heat does to it."""
+"""Notebook 05: how long inference takes, by host."""
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rover_lib.workshop.plots import style
-from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, NAMES, NOW_BITS, OTHERS, RED, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, NAMES, RED, legend_below, new_figure
 
 
 def latency(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -45,40 +43,3 @@ def _times(ax: Axes, artifacts: Mapping[str, Mapping[str, Any]]) -> None:
         style.annotate_row(ax, y, f"{p50:.1f} / {p95:.1f} / {p99:.1f} ms")
     ax.set_yticks(range(len(artifacts)), [NAMES.get(n, n) for n in artifacts])
     ax.set(xlim=(0, None), ylim=(len(artifacts) - 0.5, -0.5))
-
-
-def soak(benchmarks: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Draw what a soak did to a host over time: latency, temperature, clock, and when the firmware held it back.
-
-    benchmarks: contents of benchmark-<host>.json with a series, by host. A reading that a host lacks is not drawn.
-    """
-    fig, axes = new_figure(4, height_in=7.0, height_ratios=(2.0, 1.4, 1.4, 0.7), sharex=True)
-    times, temperature, clock, held = axes[:, 0]
-    for row, (host, colour) in enumerate(zip(benchmarks, itertools.cycle(OTHERS), strict=False)):
-        metrics = benchmarks[host]["metrics"]
-        points, main = metrics["series"], metrics["main"]
-        minutes = np.array([p["t_s"] for p in points]) / 60
-        ours = [p["artifacts"].get(main, {}) for p in points]
-        label = f"{host}, {NAMES.get(main, main)}"
-        times.plot(minutes, _values(ours, "latency_p50_ms"), color=colour, lw=1.8, label=label)
-        times.plot(minutes, _values(ours, "latency_p95_ms"), ":", color=colour, lw=1.2)
-        temperature.plot(minutes, _values(points, "temperature_c"), color=colour, lw=1.8)
-        clock.plot(minutes, _values(points, "clock_mhz"), color=colour, lw=1.8)
-        since = np.r_[0.0, minutes[:-1]]  # a point describes the time since the one before
-        bits = [int(p.get("throttled") or "0x0", 16) & NOW_BITS for p in points]
-        spans = [(s, m - s) for s, m, b in zip(since, minutes, bits, strict=True) if b]
-        held.broken_barh(spans, (row - 0.35, 0.7), color=colour)
-    times.plot([], [], ":", color=BLACK, lw=1.2, label="p95 (line: p50)")
-    times.set(ylabel="latency of one\ninference (ms)", ylim=(0, None), xlim=(0, None))
-    temperature.set_ylabel("temperature\n(°C)")
-    clock.set_ylabel("clock of the\nslowest core (MHz)")
-    held.set_yticks(range(len(benchmarks)), list(benchmarks))
-    what = "held back by the firmware: under-voltage, capped clock, throttled or too warm"
-    held.set(xlabel="time (min)", title=what, ylim=(len(benchmarks) - 0.5, -0.5))
-    legend_below(fig, times, 3)
-    return fig
-
-
-def _values(points: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
-    """Return one reading over time, NaN where it is missing."""
-    return np.array([np.nan if p.get(key) is None else p[key] for p in points], float)

@@ -1,28 +1,16 @@
-"""Notebook 04: INT8 beside FP32, in error, size and hits."""
+"""Notebook 04: INT8 beside FP32, in error and hits."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.plots import style
 from rover_lib.workshop.plots.style import COLOURS, GREY, MOST_ACTIONS, Note, legend_below, line_of, new_figure
 
 AHEAD = "step of the plan (s ahead)"
-
-
-def sizes(metrics: Mapping[str, Any]) -> Figure:
-    """Draw the sizes of the artifact files, which hold weights without an optimizer. metrics: those of compare.json."""
-    sizes_mb = {"fp32": metrics["fp32"]["size_mb"]} | {m: v["size_mb"] for m, v in metrics["modes"].items()}
-    fig, ax = style.bars_figure(len(sizes_mb), 1.3)
-    ax.barh(range(len(sizes_mb)), list(sizes_mb.values()), color=[COLOURS.get(m, GREY) for m in sizes_mb])
-    style.bar_values(ax, range(len(sizes_mb)), sizes_mb.values(), "{:.1f} MB")
-    style.name_rows(ax, sizes_mb)
-    ax.set_xlabel("artifact file (MB, 10^6 bytes)")
-    return fig
 
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
@@ -97,32 +85,4 @@ def hits(metrics: Mapping[str, Any]) -> Figure:
     ax.set(xlim=(max(0, min(lows, default=0) - 5), 101), ylim=(-0.5, len(rows) - 0.5))
     style.name_rows(ax, rows)
     ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
-    return fig
-
-
-def drives_from_above(trials: Mapping[str, Any], count: int = 4) -> Figure:
-    """Draw the worlds in which the modes' drives differ most. trials: closed-loop reports by mode, with FP32's."""
-
-    def apart(index: int) -> float:
-        base, gap = trials["fp32"].per_world[index].trajectory, 0.0
-        for trial in trials.values():
-            other = trial.per_world[index].trajectory
-            n = min(len(base.x_m), len(other.x_m))
-            gap = max(gap, np.hypot(base.x_m[:n] - other.x_m[:n], base.y_m[:n] - other.y_m[:n]).max())
-        return gap
-
-    worlds = sorted(range(len(trials["fp32"].per_world)), key=lambda i: -apart(i))[:count]
-    fig, axes = new_figure(1, count, height_in=3.8)
-    for ax, i in zip(axes[0], worlds, strict=False):
-        for mode, trial in trials.items():
-            path = trial.per_world[i].trajectory
-            # Forward is up. Positive y is to the left of the car.
-            ax.plot(-path.y_m, path.x_m, "-" if mode == "fp32" else "--", **line_of(mode))
-        x, y = trials["fp32"].per_world[i].trajectory.balloon_xy_m
-        ax.add_patch(Circle((-y, x), 0.16, color=style.RED))
-        ax.set_aspect("equal", adjustable="datalim")
-        hit = sum(t.per_world[i].hit for t in trials.values())
-        ax.set(xlabel="to the right (m)", title=f"{100 * apart(i):.0f} cm apart, {hit} of {len(trials)} hit")
-    axes[0, 0].set_ylabel("ahead of the start (m)")
-    legend_below(fig, axes[0, 0], 5)
     return fig

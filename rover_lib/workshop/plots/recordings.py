@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from rover_lib.workshop.act import block_of
 from rover_lib.workshop.int8 import frames
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver
+from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.plots import style
-from rover_lib.workshop.plots.style import BLUE, GREY, MIST, OTHERS, RED, SLATE, Note, legend, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLUE, GREY, MIST, OTHERS, RED, SLATE, Note, legend, new_figure
 from rover_lib.workshop.recordings.episodes import Episode, Recordings, Sample
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, HANDLED
 
@@ -116,66 +116,6 @@ def faults(recordings: Recordings) -> Figure | Note:
     return fig
 
 
-def calibration_coverage(
-    pool: Sequence[Sample], chosen: Sequence[Sample], held_out: Sequence[Sample], names: Sequence[str] = ACTION_NAMES
-) -> Figure:
-    """Draw which recorded actions the calibration samples cover, beside those that judge later."""
-    first_two = list(names[:2])
-    fig, fields = style.figure_of(1 + len(names), 3, 3.4)
-    unit = " (share of full)" if tuple(names) == ACTION_NAMES else ""
-    sets = (("could calibrate", pool, GREY), ("held out", held_out, OTHERS[1]), ("calibrate", chosen, SLATE))
-    for label, samples, colour in sets:
-        first = np.stack([s.chunk[0] for s in samples])
-        x, y = first[:, 0], first[:, len(first_two) - 1]
-        fields[0].scatter(x, y, s=10, c=colour, marker="x" if label == "held out" else "o", label=f"{label} ({len(x)})")
-    fields[0].set(xlabel=f"{first_two[0]}{unit}", ylabel=f"{first_two[-1]}{unit}", title="one point per frame")
-    for i, ax in enumerate(fields[1:]):
-        every = np.concatenate([s.chunk[:, i] for s in pool])
-        bins = np.linspace(every.min(), every.max(), 25) if every.max() > every.min() else 25
-        for samples, colour, kind in ((pool, GREY, "stepfilled"), (chosen, SLATE, "step")):
-            values = np.concatenate([s.chunk[:, i] for s in samples])
-            ax.hist(values, bins, weights=np.full(len(values), 100 / len(values)), color=colour, histtype=kind, lw=1.5)
-        ax.set(xlabel=f"{names[i]}{unit}", ylabel="actions (%)", title=f"{names[i]} over whole plans")
-    legend_below(fig, fields[0], 3)
-    return fig
-
-
-def observer_ranges(calibration: Calibration, count: int = 3) -> Figure:
-    """Draw what calibration saw in a few layers, and the range over which each observer would spread INT8's 256 steps.
-
-    For each part of the policy, up to `count` parts, it is the layer in which the observers disagree most.
-    """
-    rows = []
-    styles = {"minmax": ":", "percentile": "--", "histogram": "-"}
-    for layer, seen in _observers(calibration).items():
-        ranges = {}
-        for choice in styles:
-            seen.choice = choice
-            ranges[choice] = seen.range()
-        widths = [high - low for low, high in ranges.values()]
-        rows.append((max(widths) / max(min(widths), 1e-12), layer, seen, ranges))
-    rows.sort(key=lambda row: -row[0])
-    worst_of_part: dict[str, Any] = {}
-    for row in rows:
-        worst_of_part.setdefault(row[1].split(".")[0], row)
-    shown = list(worst_of_part.values())[:count]
-    fig, axes = new_figure(1, len(shown), height_in=3.6)
-    for ax, (_, layer, seen, ranges) in zip(axes[0], shown, strict=False):
-        share = 100 * seen.histogram / seen.histogram.sum()
-        limit = seen.limit.item()
-        edges = np.linspace(-limit, limit, 129)
-        ax.bar(edges[:-1], share.view(128, -1).sum(1), np.diff(edges), align="edge", color=GREY)
-        for name, dashes in styles.items():
-            for i, x in enumerate(ranges[name]):
-                ax.axvline(x, color=SLATE, ls=dashes, lw=1.6, label=name if i == 0 else None)
-        low, high = ranges["minmax"]
-        ax.set_xlim(low - 0.06 * (high - low), high + 0.06 * (high - low))
-        ax.set(yscale="log", title=layer, xlabel="activation (no unit)")
-    axes[0, 0].set_ylabel("values seen (%, logarithmic)")
-    legend_below(fig, axes[0, 0], 3)
-    return fig
-
-
 def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int = 4) -> Figure:
     """Draw each frame's largest value in each block, against the median frame's, and the oddest frames as pictures.
 
@@ -199,20 +139,3 @@ def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int =
     for ax, i in zip(axes[1], oddest, strict=True):
         style.show_picture(ax, samples[i], f"{samples[i].episode.removeprefix('episode_')}\nframe {samples[i].row}")
     return fig
-
-
-def _observers(calibration: Calibration) -> dict[str, RangeObserver]:
-    """Return for each layer with a recorded range an observer with what calibration saw there."""
-    states: dict[str, dict[str, torch.Tensor]] = {}
-    for key, tensor in calibration.observers.items():
-        name, _, buffer = key.rpartition(".")
-        states.setdefault(name, {})[buffer] = tensor
-    by_range = {(s["min_val"].item(), s["max_val"].item()): s for s in states.values() if "histogram" in s}
-    observers = {}
-    for layer, ends in calibration.ranges.items():
-        if state := by_range.get((ends["min"], ends["max"])):
-            o = RangeObserver(dtype=torch.qint8, quant_min=-128, quant_max=127, choice="minmax", percentile=99.99)
-            for buffer in ("min_val", "max_val", "limit", "histogram"):
-                getattr(o, buffer).copy_(state[buffer])
-            observers[layer] = o
-    return observers

@@ -204,13 +204,6 @@ def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
     return shown
 
 
-def simd_bars(ax: Axes, y: np.ndarray, total: np.ndarray, simd: np.ndarray) -> None:
-    """Draw bars of instructions, divided into SIMD and others. y: the bars' places. total, simd: in 10^9. (n,) each."""
-    ax.barh(y, simd, color=SLATE, label="SIMD (vector) instructions")
-    ax.barh(y, total - simd, left=simd, color=MIST, label="all others")
-    bar_values(ax, y, total, "{:.3g}")
-
-
 def action_colour(key: str, index: int) -> str:
     """Return the colour of an action, or of a key such as steering_mae_pct. index: chooses one for other actions."""
     return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])

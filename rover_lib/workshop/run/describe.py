@@ -69,7 +69,7 @@ def _calibration(path: Path) -> dict[str, Any]:
     from rover_lib.workshop.int8.observe import Calibration
 
     found = Calibration.load(path)
-    described = {"samples": found.samples, "smooth": found.smooth, "ranges": len(found.ranges)}
+    described = {"samples": found.samples, "smooth": found.smooth, "tensors": len(found.frames)}
     return described | {"checkpoint_sha256": found.checkpoint}
 
 

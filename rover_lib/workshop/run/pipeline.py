@@ -85,11 +85,16 @@ def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
-    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all. Raises ArtifactError."""
+    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all. Raises ArtifactError.
+
+    Mixed is among them only if it leaves a block in float.
+    """
     dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
     schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
     if unknown := [mode for mode in modes or () if mode not in schemes]:
         raise ArtifactError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
+    if not mixed.float_blocks:
+        del schemes["mixed"]  # it is static
     return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
 
 
@@ -220,7 +225,6 @@ def write_calibrate(
         "samples": calibration.samples,
         "note": note,
         "seconds_s": calibration.seconds,
-        "ranges": calibration.ranges,
         "odd": describe_odd(calibration.frames, calibration.seen),
         "episodes": sorted({s.episode for s in samples}),
     }

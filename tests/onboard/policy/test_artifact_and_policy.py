@@ -2,7 +2,6 @@
 
 import mmap
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,6 @@ from rover_lib.onboard.policy import memory
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)
-
-
-def test_artifacts_go_by_names_that_tell_them_apart(tmp_path):
-    for given, names in (
-        (["runs/a/policy_static.pt", "runs/b/policy_mixed.pt"], ["policy_static", "policy_mixed"]),
-        (["a/p.pt", "b/p.pt", "c.pt"], ["a/p.pt", "b/p.pt", "c"]),
-    ):
-        paths = [Path(g) for g in given]
-        assert artifact.distinct_names(paths) == dict(zip(names, paths, strict=True))
-    (tmp_path / "p.pt").touch()
-    (tmp_path / "link.pt").symlink_to("p.pt")
-    with pytest.raises(ArtifactError):
-        artifact.distinct_names([tmp_path / "p.pt", tmp_path / "link.pt"])
 
 
 @pytest.mark.parametrize("mode", ["fp32", "dynamic", "static", "mixed"])
@@ -104,21 +90,6 @@ def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny
     assert np.array_equal(policy.predict_chunk(frame, state), before)
 
 
-@pytest.mark.slow
-def test_an_artifact_that_was_written_is_not_kept_in_memory(tiny, tmp_path):
-    """torch never frees a frozen module's type, whose graph held the 47 MB of weights. Tracing leaves 7 MB."""
-    from rover_lib.workshop.act import ACT
-    from rover_lib.workshop.int8.export import export
-    from rover_lib.workshop.int8.quantize import forget_graphs
-
-    held = []
-    for _ in range(4):
-        export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "policy.pt", memory_samples(1))
-        forget_graphs()
-        held.append(int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6)
-    assert min(after - before for before, after in pairwise(held)) < 25  # other memory may be taken in between
-
-
 def test_refuses_a_policy_that_changes_when_memory_is_given_back(artifacts, monkeypatch):
     def take_what_is_used(module):
         bias = next(n.output().toIValue() for n in module.graph.nodes() if str(n.output().type()) == "Tensor")
@@ -126,45 +97,30 @@ def test_refuses_a_policy_that_changes_when_memory_is_given_back(artifacts, monk
         return bias.nbytes
 
     monkeypatch.setattr("rover_lib.onboard.policy.torch_engine.give_back_packed_weights", take_what_is_used)
-    assert "once the memory of its original weights was given back; do not drive" in refused(artifacts["static"])
-
-
-def refused(path) -> str:
-    with pytest.raises(ArtifactError) as e:
-        load_policy(path)
-    assert str(path) in str(e.value) and "\n" not in str(e.value)
-    return str(e.value)
+    with pytest.raises(ArtifactError, match="without its original weights"):
+        load_policy(artifacts["static"])
 
 
 def test_refuses_damaged_files(artifacts, tmp_path):
     whole = artifacts["static"].read_bytes()
-    path = tmp_path / "x.pt"
-    assert "not found" in refused(path)
-    for content in (b"", b"text", whole[: len(whole) // 2]):
-        path.write_bytes(content)
-        refused(path)
+    path, expected = tmp_path / "x.pt", load_policy(artifacts["static"]).predict_chunk(FRAME, STATE)
+    with pytest.raises(ArtifactError, match="not found"):
+        load_policy(path)
     for at in range(0, len(whole), len(whole) // 25):  # flip a bit anywhere, in weights too
         flipped = bytearray(whole)
         flipped[at] ^= 0x10
         path.write_bytes(flipped)
         try:
-            same = np.array_equal(load_policy(path).predict_chunk(FRAME, STATE), reference(artifacts))
+            same = np.array_equal(load_policy(path).predict_chunk(FRAME, STATE), expected)
         except ArtifactError:
             continue
         assert same  # a flip may pass only in bytes without a meaning, such as padding between records
 
 
-def reference(artifacts):
-    return load_policy(artifacts["static"]).predict_chunk(FRAME, STATE)
-
-
 def test_nothing_is_left_when_writing_fails(artifacts, tmp_path, monkeypatch):
-    module = torch.jit.load(str(artifacts["fp32"]))
+    module, path = torch.jit.load(str(artifacts["fp32"])), tmp_path / "x.pt"
     with artifact.Artifact(artifacts["fp32"]) as opened:
         manifest, parity = opened.manifest, opened.parity
-    path = tmp_path / "x.pt"
-    with pytest.raises(ArtifactError, match="gmac"):
-        artifact.save_artifact(path, module, {k: v for k, v in manifest.items() if k != "gmac"}, parity)
 
     def full(self, data):
         raise OSError(28, "No space left on device")

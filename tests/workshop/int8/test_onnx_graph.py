@@ -2,7 +2,6 @@
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
@@ -12,9 +11,9 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.int8.observe import calibrate, restore_observed, set_ranges
+from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model, stack_stem
-from rover_lib.workshop.int8.quantize import Rangeable, int8_layers, quantize
+from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
 SHAPES = {
@@ -29,18 +28,8 @@ def named(inputs, config: ActConfig) -> dict[str, torch.Tensor]:
     return dict(zip(["state", *(f"frame_{c}" for c in config.cameras)], inputs, strict=True))
 
 
-def session(model: onnx.ModelProto, exact: bool = False) -> onnxruntime.InferenceSession:
-    """As a rover runs it. exact: nothing fused, so that INT8 gives what its numbers say, whatever kernels make it."""
-    if not exact:
-        return session_of(model.SerializeToString(), threads=1)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    return onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-
-
-def answers(model: onnx.ModelProto, inputs, config: ActConfig, exact: bool = False) -> np.ndarray:
-    run = session(model, exact).run
+def answers(model: onnx.ModelProto, inputs, config: ActConfig) -> np.ndarray:
+    run = session_of(model.SerializeToString(), threads=1).run
     return np.concatenate([run(None, {k: v.numpy() for k, v in named(x, config).items()})[0] for x in inputs])
 
 
@@ -55,11 +44,10 @@ def observations(config: ActConfig, count: int = 3) -> list[tuple[torch.Tensor, 
 
 
 @pytest.mark.parametrize("name", ["tiny", *(pytest.param(n, marks=pytest.mark.slow) for n in SHAPES if n != "tiny")])
-@pytest.mark.parametrize("for_int8", [False, True], ids=["linears", "columns and convolutions"])
-def test_float_policy_is_the_same(name, for_int8, tmp_path):
+def test_float_policy_is_the_same(name, tmp_path):
     saved(lerobot_policy(**SHAPES[name]), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
-    model = ACT(checkpoint.config, checkpoint.weights, for_int8=for_int8)
+    model = ACT(checkpoint.config, checkpoint.weights)
     inputs = observations(checkpoint.config)
     written = onnx_model(graph_of(model), named(inputs[0], checkpoint.config), ("chunk",))
     expected = predictions(model, inputs).numpy()
@@ -71,18 +59,14 @@ def test_float_policy_is_the_same(name, for_int8, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "scheme",
-    [Scheme(), Scheme(kind="affine"), Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward"))],
-    ids=["static", "affine", "mixed"],
-)
+@pytest.mark.parametrize("scheme", [Scheme(), Scheme(kind="affine")], ids=["static", "affine"])
 def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibration):
     quantized = quantize(tiny, scheme, calibration)
     inputs = [inputs_of(s, tiny.config) for s in memory_samples(4, seed=1)]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
     own_error = np.abs(torchs - predictions(ACT(tiny.config, tiny.weights), inputs).numpy()).max()
-    # A rounding that flips grows over the layers: 0.4 times its own error to FP32, and 1.3 times where most is float
+    # A rounding that flips grows over the layers: 0.4 times its own error to FP32
     assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 1.5 * own_error
     stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
     for name, layer in int8_layers(quantized.module).items():
@@ -104,18 +88,12 @@ def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
         )
         for sample in memory_samples(10)
     ]
-    calibration = calibrate(checkpoint, samples[:8])
-    quantized = quantize(checkpoint, Scheme(), calibration)
+    quantized = quantize(checkpoint, Scheme(), calibrate(checkpoint, samples[:8]))
     inputs = [inputs_of(s, checkpoint.config) for s in samples[8:]]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], checkpoint.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
-    graph = restore_observed(checkpoint, Scheme(), calibration)
-    tried = Rangeable(graph, checkpoint.config, Scheme())
-    set_ranges(graph, Scheme(), calibration)
-    tried.take()
-    assert np.array_equal(predictions(tried.module, inputs).numpy(), torchs)
     own_error = np.abs(torchs - predictions(ACT(checkpoint.config, checkpoint.weights), inputs).numpy()).max()
-    assert np.abs(answers(written, inputs, checkpoint.config, exact=True) - torchs).max() < own_error
+    assert np.abs(answers(written, inputs, checkpoint.config) - torchs).max() < 1.5 * own_error
     assert len(written.SerializeToString()) < 15e6  # 12 with one camera
 
 
@@ -126,7 +104,7 @@ def test_part_with_two_outputs():
 
     x = torch.randn(1, 2, 3)
     written = onnx_model(graph_of(Part()), {"x": x}, ("turned", "twice"))
-    turned, twice = session(written).run(None, {"x": x.numpy()})
+    turned, twice = session_of(written.SerializeToString(), 1).run(None, {"x": x.numpy()})
     assert np.array_equal(turned, x.transpose(1, 2).numpy()) and np.array_equal(twice, 2 * x.numpy())
     with pytest.raises(ArtifactError, match="Tanh has no form in ONNX"):
         onnx_model(graph_of(nn.Sequential(nn.Tanh())), {"x": torch.zeros(1, 2)}, ("y",))

@@ -1,6 +1,5 @@
 """Quantization: exact where it claims to be, acting where it claims to act, loud where it cannot."""
 
-import gc
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -22,7 +21,7 @@ from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct, mae_pct
 from rover_lib.workshop.int8.export import Exporter, Parity, export
-from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, restore_observed, set_ranges
+from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, restore_observed
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
 from rover_lib.workshop.int8.scheme import ENGINE, OBSERVERS, SMALLEST_SCALE, Scheme
@@ -45,7 +44,7 @@ def static(tiny, calibration):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "variant", [{}, {"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
+    "variant", [{"pre_norm": True, "n_encoder_layers": 2}, {"feedforward_activation": "gelu"}], ids=str
 )
 def test_channel_scales_are_exact_in_float(variant, tmp_path):
     saved(lerobot_policy(**(TINY | variant)), tmp_path)
@@ -76,9 +75,11 @@ def test_channel_scales_even_out_an_outlier_channel(tiny):
     """One channel of the last feed-forward's output fifty times the rest: what cost the throttle 2.8 %."""
     weights = {k: v.clone() for k, v in tiny.weights.items()}
     weights["decoder.layers.1.linear2.weight"][5] *= 50
-    seen = calibrate(replace(tiny, weights=weights), memory_samples(8)).channels["decoder.1.feed_forward.down"]
-    before, after = (seen[key].max() / seen[key].median() for key in ("out_max", "out_max_scaled"))
-    assert before > 10 and after < 3
+    model, seen, name = ACT(tiny.config, weights), inputs(tiny, 3), "decoder.1.feed_forward.down"
+    maxima = channel_maxima(model, seen)
+    apply_channel_scales(model, maxima, 0.5)
+    before, after = (found[name]["out_max"] for found in (maxima, channel_maxima(model, seen)))
+    assert before.max() / before.median() > 10 and after.max() / after.median() < 3
 
 
 # What becomes INT8
@@ -110,10 +111,6 @@ def slow_layers():
     torch.backends.quantized.engine = ENGINE  # weights are packed for it
     steps, zeros = torch.full((16,), 0.02), torch.zeros(16, dtype=torch.long)
 
-    linear = q.int8.Linear(16, 16)
-    linear.set_weight_bias(torch.quantize_per_tensor(torch.randn(16, 16), 0.02, 0, torch.qint8), torch.zeros(16))
-    linear.scale, linear.zero_point = 0.1, 0
-
     def conv(zero_point: int = 0, scale: float = 0.1, largest: float = 1.0):
         w = torch.randn(16, 16, 1, 1).clamp(-1, 1) * largest
         m = q.int8.Conv2d(16, 16, 1)
@@ -122,7 +119,6 @@ def slow_layers():
         return m
 
     picture = torch.randn(1, 16, 3, 3)
-    yield linear, torch.randn(1, 4, 16), torch.qint8, 0.05
     yield conv(largest=9.0), picture, torch.qint8, 0.05  # -128 is in it
     yield conv(), picture, torch.quint8, 0.05
     yield conv(zero_point=3), picture, torch.qint8, 0.05
@@ -196,30 +192,19 @@ def test_refusals(tiny, calibration, tmp_path):
             act_on()
 
 
-def test_inspect_layers_sees_clipping_at_either_end(tiny, calibration):
+def test_clipping_at_either_end_counts(tiny, calibration):
     quantized, few = quantize(tiny, Scheme(observer="minmax"), calibration), memory_samples(12)[:4]
-    rows = {r["name"]: r for r in q.inspect_layers(quantized, tiny, calibration, few)}
-    assert len(rows) == quantized.report["int8_modules"]
-    # The calibration's own samples, min-max: nothing is clipped, and every layer carries a signal.
-    assert max(r["clipped_pct"] for r in rows.values()) < 0.5
-    assert min(r["snr_db"] for r in rows.values()) > 5
-    assert not q.warn_of_clipping(list(rows.values()), 1.0)
-    name = "image_project"  # its values have both signs
-    layer = quantized.module.get_submodule(name)
+    assert q.most_clipped(quantized, tiny, calibration, few)["clipped_pct"] < 0.5  # they calibrated
+    layer = quantized.module.get_submodule("image_project")  # its values have both signs
     layer.scale = float(layer.scale) / 4
-    rows = q.inspect_layers(quantized, tiny, calibration, few[:1])
     low, high = ((end - layer.zero_point + beyond) * layer.scale for end, beyond in ((-128, -0.5), (127, 0.5)))
-    given = []
-    for module in (restore_observed(tiny, Scheme(observer="minmax"), calibration), quantized.module):
-        module.get_submodule(name).register_forward_hook(lambda m, args, out: given.append(out.dequantize()))
-        module(*inputs_of(few[0], tiny.config))
-    x, y = given
-    below, above = (x < low).float().mean().item(), (x > high).float().mean().item()
+    given, graph = [], restore_observed(tiny, Scheme(observer="minmax"), calibration)
+    graph.get_submodule("image_project").register_forward_hook(lambda m, args, out: given.append(out))
+    graph(*inputs_of(few[0], tiny.config))
+    below, above = (beyond.float().mean().item() for beyond in (given[0] < low, given[0] > high))
     assert below > 0.01 and above > 0.01
-    row = next(r for r in rows if r["name"] == name)
-    assert row["clipped_pct"] == pytest.approx(100 * (below + above))
-    assert row["snr_db"] == pytest.approx(10 * np.log10((x.square().sum() / (x - y).square().sum()).item()), rel=1e-4)
-    assert any(name in w for w in q.warn_of_clipping(rows, 1.0))
+    found = q.most_clipped(quantized, tiny, calibration, few[:1])
+    assert found == {"layer": "image_project", "clipped_pct": pytest.approx(100 * (below + above))}
 
 
 # Choosing
@@ -243,9 +228,7 @@ def test_a_frames_error_is_the_mean_of_its_plans_steps(tiny, chooser):
         def forward(self, *x):
             return predictions(ACT(tiny.config, tiny.weights), [x]) - off
 
-    found = chooser.error(Off())
-    assert found == pytest.approx({"steering_mae_pct": 1.0, "throttle_mae_pct": 2.0}, rel=1e-3)
-    assert chooser.error_by_kind(Off()) == {"usual": pytest.approx(found)}
+    assert chooser.error(Off()) == pytest.approx({"steering_mae_pct": 1.0, "throttle_mae_pct": 2.0}, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -254,17 +237,10 @@ def test_chooses_by_error(tiny, chooser):
     assert set(table) == set(OBSERVERS) - {"frames"}  # no frame is odd
     least = min(max(row.values()) for row in table.values())
     assert max(table[scheme.observer].values()) == least or scheme.observer == "minmax"
-    gc.collect()
-    gc.disable()  # which collects when it likes, and would hide what is held
-    try:
-        before = sum(isinstance(thing, torch.fx.GraphModule) for thing in gc.get_objects())
-        sensitivity = chooser.sensitivity(scheme)
-        after = sum(isinstance(thing, torch.fx.GraphModule) for thing in gc.get_objects())
-        assert after <= before + 4, "the observed graph and the last policy, each with its graph's own module"
-    finally:
-        gc.enable()
+    sensitivity = chooser.sensitivity(scheme)
     assert list(sensitivity) == blocks(tiny.config)
     assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
+    assert 300 < sum(float_costs_pct(tiny).values()) <= 100 * 3.2  # all in float: 4.2 times the instructions
     mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=20)
     assert len(steps) > 1 and list(mixed.float_blocks) == steps[-1]["float_blocks"]
 
@@ -294,7 +270,6 @@ def by_hand(chooser, monkeypatch):
         (1.5, 99, ("much",)),
         (0.0, 99, ("much", "dear", "little")),  # by squared error per instruction; what makes it worse stays INT8
         (0.0, 20, ("much", "little")),
-        (0.0, 0, ()),
         (0.0, 10, ("much",)),  # a cost at the limit is allowed
     ],
 )
@@ -307,19 +282,12 @@ def test_mixed_leaves_in_float_what_gains_most_for_its_cost(by_hand, budget_pct,
     assert errors == sorted(errors, reverse=True) and len(steps) == 1 + len(in_float)
 
 
-def test_float_costs_three_times_what_int8_does(tiny):
-    costs = float_costs_pct(tiny)
-    assert list(costs) == blocks(tiny.config)
-    assert 300 < sum(costs.values()) <= 100 * 3.2  # all in float, but for the head: 4.2 times the instructions
-
-
 @pytest.mark.parametrize(
     ("errors", "chosen"),
     [
         ({"histogram": (0.1, 0.27), "minmax": (0.1, 0.3), "percentile": (0.1, 0.35)}, "minmax"),  # hardly better
         ({"histogram": (0.1, 0.23), "minmax": (0.1, 0.3), "percentile": (0.1, 0.25)}, "histogram"),
         ({"histogram": (0.2, None), "minmax": (0.3, None)}, "histogram"),  # throttle never changes: not judged
-        ({"histogram": (0.2, None), "minmax": (0.21, None)}, "minmax"),
         ({"histogram": (0.1, 0.3), "percentile": (0.1, 0.29)}, "percentile"),
     ],
 )
@@ -327,27 +295,6 @@ def test_an_observer_that_clips_must_win_clearly(errors, chosen):
     keys = "steering_mae_pct", "throttle_mae_pct"
     table = {name: dict(zip(keys, row, strict=True)) for name, row in errors.items()}
     assert best_of({name: Scheme(observer=name) for name in errors}, table) == chosen
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["symmetric", "affine"])
-def test_one_conversion_takes_the_ranges_of_every_scheme(tiny, calibration, kind):
-    """To the last bit as if each were converted: choosing converts once, as conversions took most of its time."""
-    schemes = [Scheme(kind=kind), Scheme(kind=kind, observer="minmax")]
-    graph, x = restore_observed(tiny, schemes[1], calibration), inputs(tiny)
-    policy = q.Rangeable(graph, tiny.config, schemes[1])
-    for scheme in (*schemes, schemes[0]):
-        set_ranges(graph, scheme, calibration)
-        policy.take()
-        assert torch.equal(predictions(policy.module, x), predictions(quantize(tiny, scheme, calibration).module, x))
-
-
-@pytest.mark.slow
-def test_an_action_that_never_changes_takes_no_part_in_choosing(tiny, calibration):
-    chooser = Chooser(tiny, calibration, memory_samples(2, seed=8), {"steering": (-0.5, 0.5), "throttle": (0.06, 0.06)})
-    assert [w.partition(",")[0] for w in chooser.warnings] == ["throttle never changes in these recordings"]
-    _, table = chooser.observer(Scheme(), ["minmax", "histogram"])
-    assert all(row["throttle_mae_pct"] is None and row["steering_mae_pct"] > 0 for row in table.values())
 
 
 # Observers
@@ -390,17 +337,6 @@ def test_the_least_squares_range_is_the_best_of_all_pairs():
     pairs = [(o.min_val.item() * a, o.max_val.item() * b) for a in shares for b in shares]
     assert o.range() == pytest.approx(min(pairs, key=lambda pair: error(*pair)), rel=1e-6)
     assert o.range()[1] < 0.9 * o.max_val.item(), "it clips what is rare"
-
-
-def test_growing_the_histogram_keeps_it_exact():
-    one, two = observer(), observer()
-    small, large = torch.linspace(-1, 1, 1001), torch.linspace(-4, 4, 1001)
-    for o, seen in ((one, (small, large)), (two, (large, small))):  # the second one's limit is 4 from the start
-        for x in seen:
-            o(x)
-    assert one.limit == two.limit == 4
-    # A value on the border of two bins may fall on either side, nothing moves further.
-    assert (one.histogram.cumsum(0) - two.histogram.cumsum(0)).abs().max() <= 2
 
 
 def test_a_percentile_leaves_half_of_the_rest_out_at_each_end():

@@ -19,16 +19,11 @@ def drive(episode, frames=60, rise=200):
     times = np.arange(frames + CHUNK)
     actions = np.stack([0.8 * np.sin(times / 9 + rng.uniform(0, 6)), np.minimum(times / rise, 0.1)], 1)
     pads = np.arange(frames)[:, None] + np.arange(CHUNK) >= frames
-    return [
-        SimpleNamespace(
-            episode=f"episode_{episode}",
-            row=i,
-            state=np.float32(actions[max(i - 1, 0)]),
-            chunk=np.float32(actions[i : i + CHUNK]),
-            is_pad=pads[i],
-        )
-        for i in range(frames)
-    ]
+    samples = []
+    for i in range(frames):
+        did = {"state": np.float32(actions[max(i - 1, 0)]), "chunk": np.float32(actions[i : i + CHUNK])}
+        samples.append(SimpleNamespace(episode=f"episode_{episode}", row=i, is_pad=pads[i], **did))
+    return samples
 
 
 def judge(plan, episodes=6, action_range=RANGE, rise=200):
@@ -57,19 +52,17 @@ def noisy(sample):
         (noisy, []),
         (lambda s: np.tile(s.state, (CHUNK, 1)), ["the last action again"]),
         (lambda s: np.zeros((CHUNK, 2)), GUESSES),
-        (lambda s: -s.chunk, GUESSES),
         (lambda s: s.chunk * [1, 0], ["the last action again"]),  # it steers well, and its throttle is no better
     ],
-    ids=["good", "copies", "always zero", "the other way", "never drives off"],
 )
 @pytest.mark.parametrize("episodes", [1, LEAST_EPISODES])
 def test_only_a_policy_that_sees_beats_the_guesses(plan, unbeaten, episodes):
     judged = judge(plan, episodes)
-    assert [g.name for g in judged.guesses] == GUESSES
-    assert {g.name for g in judged.guesses if not g.beaten} >= set(unbeaten)
+    assert list(judged.guesses) == GUESSES
+    assert {name for name, g in judged.guesses.items() if not g.beaten} >= set(unbeaten)
     assert bool(judged.warnings()) == bool(unbeaten)
     assert ("pieces" in judged.drawn) == (episodes == 1) and str(episodes) in judged.drawn
-    for guess in judged.guesses:
+    for guess in judged.guesses.values():
         assert guess.low <= guess.better <= guess.high
         errors = (np.mean(list(errors.values())) for errors in (guess.errors_pct, judged.errors_pct))
         assert guess.better == pytest.approx(np.subtract(*errors))
@@ -79,8 +72,8 @@ def test_only_a_policy_that_sees_beats_the_guesses(plan, unbeaten, episodes):
 @pytest.mark.parametrize("far", [[0.6, 0], [0, 0.03]])
 def test_a_guess_is_beaten_only_in_every_action(far):
     """Perfect in one action and so better in the mean, but in the other one further off than some guesses."""
-    judged = judge(lambda s: s.chunk + np.float64(far))
-    assert [g.low > 0 for g in judged.guesses] == [True, False, True] and not any(g.beaten for g in judged.guesses)
+    guesses = judge(lambda s: s.chunk + np.float64(far)).guesses.values()
+    assert [g.low > 0 for g in guesses] == [True, False, True] and not any(g.beaten for g in guesses)
 
 
 def test_the_guesses_know_only_what_could_be_learned_from():
@@ -96,12 +89,12 @@ def test_the_guesses_know_only_what_could_be_learned_from():
 
     constants = [off(lambda s, c=c: np.tile(c, (CHUNK, 1))) for c in (every.mean(0), np.median(every, 0))]
     expected = [min(constants, key=lambda e: sum(e.values())), off(lambda s: s.state), off(lambda s: steps)]
-    assert [g.errors_pct for g in judged.guesses] == [pytest.approx(e, rel=1e-4) for e in expected]
+    assert [g.errors_pct for g in judged.guesses.values()] == [pytest.approx(e, rel=1e-4) for e in expected]
 
 
 def test_the_interval_has_95_percent_of_the_draws():
     """Of whole episodes, drawn with replacement: the oracle draws by itself, and many more."""
-    guess, rng, gains = judge(noisy).guesses[1], np.random.default_rng(1), []
+    guess, rng, gains = judge(noisy).guesses["the last action again"], np.random.default_rng(1), []
     for samples in map(drive, range(6)):
         plans = np.stack([[np.tile(s.state, (CHUNK, 1)), np.float32(noisy(s))] for s in samples])
         errors = np.abs(plans - np.stack([s.chunk for s in samples])[:, None]) / [0.02, 0.001]
@@ -115,5 +108,5 @@ def test_the_interval_has_95_percent_of_the_draws():
 
 def test_what_is_not_judged_counts_for_nothing():
     judged = judge(noisy, action_range=RANGE | {"throttle": (0.1, 0.1)})
-    assert judged.errors_pct.keys() == judged.guesses[0].errors_pct.keys() == {"steering"}
+    assert judged.errors_pct.keys() == judged.guesses["the mean plan"].errors_pct.keys() == {"steering"}
     assert judge(noisy, action_range={name: (0.0, 0.0) for name in RANGE}) is None

@@ -30,7 +30,7 @@ def test_a_run_its_report_a_flight_log_and_a_calibration(demo, calibration, tmp_
     assert "drives" in describe(Source(tmp_path / "flight.log"))["flight log"]
     calibration.save(tmp_path / "calibration.pt")
     described = describe(Source(tmp_path / "calibration.pt"))["calibration"]
-    assert described["samples"] == calibration.samples and described["ranges"] == len(calibration.ranges)
+    assert described["samples"] == calibration.samples and described["tensors"] == len(calibration.frames)
 
 
 def test_runs_are_listed_with_their_verdicts(demo):

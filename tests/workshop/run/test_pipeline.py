@@ -38,6 +38,7 @@ def test_the_recipe_is_what_params_yml_says():
         "dynamic": ("dynamic", "symmetric"), "static": ("static", "symmetric"), "mixed": ("mixed", "symmetric"),
         "static_affine": ("static", "affine"),
     }  # fmt: skip
+    assert "mixed" not in pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed"))  # it is static
 
 
 @pytest.mark.slow
