@@ -40,8 +40,7 @@ def drive_car(
     of the one at the options' camera and port. As a service, this drives each time that a human arms the car, until it
     is told to stop.
     """
-    given = {name: getattr(options, name) for name in ("throttle_limit", "blend_ticks", "ensemble")}
-    settings = Settings.of(params()["drive"], **given)
+    settings = Settings.of(params()["drive"], throttle_limit=options.throttle_limit)
     with ExitStack() as stack:
         # Resolved: `current` may point to another one later. Opened first: it may be missing, or no artifact.
         artifact = stack.enter_context(Artifact(options.artifact.resolve()))

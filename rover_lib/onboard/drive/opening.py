@@ -36,7 +36,7 @@ class DriveOptions:
 
     hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
     much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
-    throttle_limit, blend_ticks, ensemble: replace the values of params.yml. threads: of the policy; None: all cores but
+    throttle_limit: replaces the value of params.yml. threads: of the policy; None: all cores but
     one. log_file: None: the user's. service: run as a systemd service, disarmed until a human arms it. film: the camera
     may be recorded pictures (a folder or a FIFO), which do not show where the car is. latency_ms: make each
     plan take at least this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when
@@ -53,8 +53,6 @@ class DriveOptions:
     max_seconds: float | None = None
     ticks: int | None = None
     throttle_limit: float | None = None
-    blend_ticks: int | None = None
-    ensemble: float | None = None
     threads: int | None = None
     log_file: Path | None = None
     service: bool = False
