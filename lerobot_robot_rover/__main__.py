@@ -1,8 +1,4 @@
-"""Pack an artifact into a folder that LeRobot takes for a pretrained policy.
-
-python -m lerobot_robot_rover runs/mine/policy_static.pt mine
-lerobot-record --policy.path=mine ...
-"""
+"""Pack an artifact into a folder that LeRobot takes for a pretrained policy."""
 
 from pathlib import Path
 
@@ -16,10 +12,7 @@ from rover_lib.onboard.errors import RoverError
 
 
 def pack(artifact: Path, folder: Path) -> Path:
-    """Write the new folder and return it: the artifact, its config.json and processors that do nothing.
-
-    Raises PolicyError for another file, RoverError for a folder that exists.
-    """
+    """Write the new folder and return it. Raises PolicyError for another file, RoverError for a folder that exists."""
     if folder.exists():
         raise RoverError(f"{folder}: is there already", remedy="name a new folder")
     config = RoverArtifactConfig(artifact=str(artifact), push_to_hub=False)

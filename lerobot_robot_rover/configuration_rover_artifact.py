@@ -1,7 +1,4 @@
-"""The configuration by which LeRobot runs an artifact.
-
-LeRobot prescribes the name of this module, and those of the modeling_ and processor_ modules beside it.
-"""
+"""The configuration by which LeRobot runs an artifact. LeRobot prescribes this module's name, and its neighbours'."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,8 +1,4 @@
-"""Share a serial port between a robot and its transmitter: both find its only owner by the port's name.
-
-line = line_to("/dev/ttyUSB0")      # the same line for everyone in this process who names this port
-link = line.open()                  # the first user opens the port, and the last close() closes it
-"""
+"""Share a serial port between a robot and its transmitter: both find its only owner by the port's name."""
 
 from __future__ import annotations
 

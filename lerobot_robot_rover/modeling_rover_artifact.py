@@ -44,13 +44,9 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self._queue: deque[Tensor] = deque()
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
         self._process = PolicyProcess(config.file)
-        self._close = weakref.finalize(self, self._process.close)  # at the program's end too
+        weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
         self._process.__enter__()  # returns after the first inferences, which are slow
-        try:
-            self._check(self._process.manifest, dataset_meta)
-        except BaseException:
-            self._close()
-            raise
+        self._check(self._process.manifest, dataset_meta)
         if self._process.unconfined:
             _log.warning("the policy's process is not confined: %s", self._process.unconfined)
 

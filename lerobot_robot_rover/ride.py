@@ -1,7 +1,6 @@
 """Drive by actions that come from elsewhere: `rover drive`'s control loop, in a thread beside LeRobot's loop.
 
-LeRobot calls when it likes, but the Arduino wants a command every 34 ms. So the control loop repeats the newest action,
-for at most HOLD_S. After that the car is put in neutral and disarmed, as after every fault that the loop detects.
+It repeats LeRobot's newest action for at most HOLD_S. After that the car is put in neutral and disarmed.
 """
 
 import sys
