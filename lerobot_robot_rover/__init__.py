@@ -1,7 +1,5 @@
 """The rover in LeRobot's own commands: robot `rover`, teleoperator `rover_transmitter`, policy `rover_artifact`.
 
-    lerobot-record --robot.type=rover --teleop.type=rover_transmitter ...
-
 LeRobot imports this package because of its distribution's name, and finds the classes by the names of their configs.
 """
 

@@ -1,30 +1,21 @@
-"""Pack an artifact into a folder that LeRobot takes for a pretrained policy.
-
-python -m lerobot_robot_rover runs/mine/policy_static.pt mine
-lerobot-record --policy.path=mine ...
-"""
+"""Pack an artifact into a folder that LeRobot takes for a pretrained policy."""
 
 from pathlib import Path
 
 import click
 
-from lerobot_robot_rover.configuration_rover_artifact import N_ACTION_STEPS, RoverArtifactConfig
+from lerobot_robot_rover.configuration_rover_artifact import RoverArtifactConfig
 from lerobot_robot_rover.modeling_rover_artifact import RoverArtifactPolicy
 from lerobot_robot_rover.processor_rover_artifact import make_rover_artifact_pre_post_processors
 from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
 
 
-def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_ACTION_STEPS) -> Path:
-    """Write the new folder and return it. It contains the artifact, its config.json and processors that do nothing.
-
-    n_action_steps: see RoverArtifactConfig. Raises PolicyError for a file that is no artifact, RoverError for a
-    folder that exists.
-    """
-    folder = Path(folder)
+def pack(artifact: Path, folder: Path) -> Path:
+    """Write the new folder and return it. Raises PolicyError for another file, RoverError for a folder that exists."""
     if folder.exists():
         raise RoverError(f"{folder}: is there already", remedy="name a new folder")
-    config = RoverArtifactConfig(artifact=str(artifact), n_action_steps=n_action_steps, push_to_hub=False)
+    config = RoverArtifactConfig(artifact=str(artifact), push_to_hub=False)
     policy = RoverArtifactPolicy(config)
     with build_folder(folder) as new:
         policy.save_pretrained(new)
@@ -36,11 +27,10 @@ def pack(artifact: Path | str, folder: Path | str, *, n_action_steps: int = N_AC
 @click.command()
 @click.argument("artifact", type=click.Path(path_type=Path))
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--n-action-steps", type=click.IntRange(min=1), default=N_ACTION_STEPS, help="Actions used of a chunk.")
-def main(artifact: Path, folder: Path, n_action_steps: int) -> None:
+def main(artifact: Path, folder: Path) -> None:
     """Pack ARTIFACT into the new FOLDER, for LeRobot's --policy.path."""
     try:
-        click.echo(f"packed: {pack(artifact, folder, n_action_steps=n_action_steps)}")
+        click.echo(f"packed: {pack(artifact, folder)}")
     except (RoverError, OSError) as error:
         raise click.ClickException(str(error)) from None
 

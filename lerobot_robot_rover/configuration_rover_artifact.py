@@ -1,7 +1,4 @@
-"""The configuration by which LeRobot runs an artifact.
-
-LeRobot prescribes the name of this module, and those of the modeling_ and processor_ modules beside it.
-"""
+"""The configuration by which LeRobot runs an artifact. LeRobot prescribes this module's name, and its neighbours'."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,8 +8,6 @@ from lerobot.optim.optimizers import OptimizerConfig
 
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
-N_ACTION_STEPS = 8  # at 30 a second: so no action's plan is older than half a second, as in `rover drive`
-
 
 @PreTrainedConfig.register_subclass("rover_artifact")
 @dataclass
@@ -20,28 +15,24 @@ class RoverArtifactConfig(PreTrainedConfig):
     """How LeRobot runs an artifact. Raises ParamsError for impossible values.
 
     artifact: a policy_<mode>.pt or .onnx.zip; a relative path is looked for in the pretrained folder first.
-    n_action_steps: how many actions of a chunk are used before the next chunk is computed. threads: of the policy;
-    None: all cores but one.
+    n_action_steps: how many actions of a chunk are used before the next chunk is computed.
     """
 
     artifact: str = ""
-    n_action_steps: int = N_ACTION_STEPS
-    threads: int | None = None
+    n_action_steps: int = 8  # so no action's plan is older than half a second, as in `rover drive`
     device: str | None = field(default="cpu")
     # LeRobot asks for these; an artifact looks at one moment.
     observation_delta_indices = action_delta_indices = reward_delta_indices = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.n_action_steps < 1 or (self.threads is not None and self.threads < 1):
-            found = f"{self.n_action_steps} and {self.threads}"
-            raise ParamsError("a policy needs n_action_steps and threads from 1", found=found)
+        if self.n_action_steps < 1:
+            raise ParamsError("a policy needs n_action_steps from 1", found=self.n_action_steps)
 
     @property
     def file(self) -> Path:
         """The artifact's file. Raises ParamsError if it does not exist."""
-        places = [Path(self.pretrained_path or "") / self.artifact, Path(self.artifact)]
-        for place in places:
+        for place in (Path(self.pretrained_path or "") / self.artifact, Path(self.artifact)):
             if place.is_file():
                 return place
         remedy = "--policy.artifact=runs/mine/policy_static.pt, or a packed --policy.path"

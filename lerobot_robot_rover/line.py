@@ -1,8 +1,4 @@
-"""Share a serial port between a robot and its transmitter: both find its only owner by the port's name.
-
-line = line_to("/dev/ttyUSB0")      # the same line for everyone in this process who names this port
-link = line.open()                  # the first user opens the port, and the last close() closes it
-"""
+"""Share a serial port between a robot and its transmitter: both find its only owner by the port's name."""
 
 from __future__ import annotations
 
@@ -24,11 +20,10 @@ _lines: WeakValueDictionary[str, Line] = WeakValueDictionary()
 
 
 class Line:
-    """A port and its users. Get it from line_to(). For one thread.
+    """A port and its users, of line_to(). For one thread.
 
-    transmitters: the teleoperators on the port; if there is one, a human may drive without arming anything.
-    humans_action: whether a teleoperator has returned the human's own action, and the robot has not been given it yet.
-    before_drive: waits until the car can be armed; None while no robot is connected.
+    transmitters: the teleoperators on the port. humans_action: whether one has returned the human's own action, and the
+    robot has not been given it yet. before_drive: waits until the car can be armed; None without a robot.
     """
 
     def __init__(self, port: str):
@@ -41,24 +36,18 @@ class Line:
 
     def open(self) -> ServoLink:
         """Return the link, which the first user opens. Raises CarError, and LinkError, as ServoLink.open() does."""
+        link = self._link or ServoLink(self.port)
         if self._link is None:
-            link = ServoLink(self.port)
             link.open()
-            self._link = link
-        self._users += 1
-        return self._link
+        self._link, self._users = link, self._users + 1
+        return link
 
     def close(self) -> None:
         """Give the link back. When the last user does, neutral is sent and the port is closed. Raises nothing."""
-        self._users = max(0, self._users - 1)
+        self._users -= 1
         if not self._users and self._link:
             link, self._link = self._link, None
             link.close()
-
-    def take_humans_action(self) -> bool:
-        """Return whether the action that the robot is given now is the human's own. Asked again, it is not."""
-        humans, self.humans_action = self.humans_action, False
-        return humans
 
 
 class CarPart:
@@ -71,21 +60,15 @@ class CarPart:
         """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
         return dict(FEATURES)
 
-    def calibrate(self) -> None:
-        """Do nothing."""
-
     def configure(self) -> None:
         """Do nothing: the Arduino is told of the car when its port is opened."""
+
+    calibrate = configure
 
 
 def line_to(port: str) -> Line:
     """Return this process's only line to a port. Any name of the port will do, also /dev/serial/by-id/..."""
-    key = os.path.realpath(port)  # the port need not exist yet
-    line = _lines.get(key)
-    # Devices may have been plugged in anew since: then the line's own name may lead to another port than this one.
-    if line is None or os.path.realpath(line.port) != key:
-        line = _lines[key] = Line(port)
-    return line
+    return _lines.setdefault(os.path.realpath(port), Line(port))  # the port need not exist yet
 
 
 def wait_for_humans() -> None:

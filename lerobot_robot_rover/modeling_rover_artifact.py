@@ -30,10 +30,8 @@ _log = logging.getLogger("rover")
 
 
 class RoverArtifactPolicy(PreTrainedPolicy):
-    """Runs an artifact. It has no weights that LeRobot could see, save or train.
-
-    Raises ParamsError or PolicyError for an artifact that is missing, damaged or made for other actions, and for a
-    dataset whose rate or camera is not the artifact's.
+    """Runs an artifact. Raises ParamsError or PolicyError for one that is missing, damaged or made for other actions,
+    and for a dataset whose rate or camera is not the artifact's.
     """
 
     config_class = RoverArtifactConfig
@@ -45,36 +43,25 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self._limits = this_car().limits
         self._queue: deque[Tensor] = deque()
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
-        self._process = PolicyProcess(config.file, threads=config.threads)
-        self._close = weakref.finalize(self, self._process.close)  # at the program's end too
+        self._process = PolicyProcess(config.file)
+        weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
         self._process.__enter__()  # returns after the first inferences, which are slow
-        try:
-            self._check(self._process.manifest, dataset_meta)
-        except BaseException:
-            self._close()
-            raise
+        self._check(self._process.manifest, dataset_meta)
         if self._process.unconfined:
             _log.warning("the policy's process is not confined: %s", self._process.unconfined)
 
-    def get_optim_params(self) -> dict:
+    def get_optim_params(self, *args: Any) -> Any:
         raise not_trained()
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        raise not_trained()
+    forward = get_optim_params
 
     def reset(self) -> None:
-        """Prepare for an episode.
-
-        If a rover is connected, this waits for the human's gesture, so that the gesture is not part of the episode.
-        """
+        """Prepare for an episode: wait for the human's gesture, which is not part of it, if a rover is connected."""
         self._queue.clear()
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps, that of a new chunk.
-
-        A chunk that is older than the stop_s of params.yml is dropped.
-        """
+        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps or stop_s, a new one's."""
         if boottime() - self._planned_s > _stop_s():
             self._queue.clear()
         if not self._queue:
@@ -90,8 +77,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         Raises PolicyError if one of them is missing, and for a prediction that is not finite or far out of range.
         """
         camera = f"{OBS_IMAGES}.{self._camera}"
-        if missing := {camera, OBS_STATE} - set(batch):
-            raise PolicyError(f"the policy needs {', '.join(sorted(missing))}", found=sorted(map(str, batch)))
+        if not {camera, OBS_STATE} <= set(batch):
+            raise PolicyError(f"the policy needs {camera} and {OBS_STATE}", found=sorted(map(str, batch)))
         pictures = (batch[camera].detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
         states = batch[OBS_STATE].detach().cpu().numpy()
         chunks = []
@@ -114,7 +101,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         return cls(config, **kwargs).eval()
 
     def _save_pretrained(self, save_directory: Path, state_dict: Any = None) -> None:
-        """Write the artifact and a config that names it, and says what it sees and gives."""
+        """Write the artifact and a config that names it."""
         file, inputs = self.config.file, {OBS_STATE: PolicyFeature(FeatureType.STATE, (2,))}
         for c in self._process.manifest["cameras"]:
             inputs[f"{OBS_IMAGES}.{c['name']}"] = PolicyFeature(FeatureType.VISUAL, (3, c["height"], c["width"]))
@@ -129,7 +116,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         names = manifest["state_names"], manifest["action_names"]
         if names != ([*ACTIONS], [*ACTIONS]) or len(cameras) != 1:
             what = "the rover has one camera, and steering and throttle as state and actions"
-            raise PolicyError(what, found=f"an artifact of {cameras}, {names[0]} and {names[1]}")
+            raise PolicyError(what, found=f"{cameras} and {names}")
         self._camera = cameras[0]
         rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), _stop_s()
         if self.config.n_action_steps > (most := min(chunk, int(stop_s * rate_hz))):
@@ -139,8 +126,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             _log.warning(sentence)
         for asks, option in ((find_rollout(), "--fps"), (dataset_meta, "--dataset.fps")):
             if asks is not None and asks.fps != rate_hz:
-                remedy = f"{option}={rate_hz:g}"
-                raise PolicyError(f"this artifact's actions are {rate_hz:g} a second", found=asks.fps, remedy=remedy)
+                raise PolicyError("not this artifact's rate", found=asks.fps, remedy=f"{option}={rate_hz:g}")
         pictures = sorted(n for n in dataset_meta.features if n.startswith(OBS_IMAGES)) if dataset_meta else []
         if dataset_meta and f"{OBS_IMAGES}.{self._camera}" not in pictures:
             remedy = f"--robot.camera_name={self._camera} --dataset.video=true"

@@ -19,14 +19,9 @@ def make_rover_artifact_pre_post_processors(
     config: RoverArtifactConfig, dataset_stats: Any = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Return the two pipelines. LeRobot's commands set values in the steps for names and device, so they must exist."""
-    before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](
-        steps=[
-            RenameObservationsProcessorStep(rename_map={}),
-            AddBatchDimensionProcessorStep(),
-            DeviceProcessorStep(device=config.device or "cpu"),
-        ],
-        name=POLICY_PREPROCESSOR_DEFAULT_NAME,
-    )
+    device = DeviceProcessorStep(device=config.device or "cpu")
+    steps = [RenameObservationsProcessorStep(rename_map={}), AddBatchDimensionProcessorStep(), device]
+    before = PolicyProcessorPipeline[dict[str, Any], dict[str, Any]](steps, name=POLICY_PREPROCESSOR_DEFAULT_NAME)
     after = PolicyProcessorPipeline[PolicyAction, PolicyAction](
         steps=[DeviceProcessorStep(device="cpu")],
         name=POLICY_POSTPROCESSOR_DEFAULT_NAME,

@@ -1,7 +1,6 @@
 """Drive by actions that come from elsewhere: `rover drive`'s control loop, in a thread beside LeRobot's loop.
 
-LeRobot calls when it likes, but the Arduino wants a command every 34 ms. So the control loop repeats the newest action,
-for at most HOLD_S. After that the car is put in neutral and disarmed, as after every fault that the loop detects.
+It repeats LeRobot's newest action for at most HOLD_S. After that the car is put in neutral and disarmed.
 """
 
 import sys
@@ -20,22 +19,16 @@ from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.watch import SWITCH_S, HealthWatch
 from rover_lib.onboard.errors import DriveFault
 
-RATE_HZ = 50.0  # an action waits 20 ms at most; at 100 Hz a busy machine's pauses of 10 ms would count as missed ticks
-# How long an action is repeated: LeRobot's loop, at 30 Hz, may miss two turns. The Arduino allows a silent host 150 ms,
-# and a host whose LeRobot loop hangs must not get more: the first tick after HOLD_S, at 120 ms or before, sends
-# neutral.
+RATE_HZ = 50.0  # an action waits 20 ms at most
+# How long an action is repeated: LeRobot's loop, at 30 Hz, may miss two turns. Neutral goes out at 120 ms or before,
+# where the Arduino allows a silent host 150 ms.
 HOLD_S = 0.1
 ARMED_S = 3.0  # the answers to the cap and to arming, 0.5 s each, and time for a busy machine
-
-
 Clock = Callable[[], float]
 
 
 class Ride:
-    """One drive, from arming to neutral. For one thread beside its own.
-
-    Use it once: begin(), then put() at least every HOLD_S, then end().
-    """
+    """One drive, from arming to neutral: begin(), then put() at least every HOLD_S, then end()."""
 
     def __init__(
         self, camera: Camera, link: ServoLink, settings: Settings, log: FlightLog, clock: Clock = time.monotonic
@@ -57,10 +50,7 @@ class Ride:
         return self._thread.ident is not None and (bool(self.report.ended) or not self._thread.is_alive())
 
     def begin(self, steering: float, throttle: float) -> None:
-        """Arm the car and drive by this action.
-
-        Raises LinkError or CameraError if arming is refused, DriveFault if it takes too long.
-        """
+        """Arm the car and drive by this action. Raises LinkError, CameraError or DriveFault if it cannot be armed."""
         self._sight.check()
         self._action = (steering, throttle)
         self._thread.start()
@@ -114,8 +104,7 @@ class Ride:
         return f"no action came from LeRobot for {HOLD_S * 1e3:g} ms" if late else None
 
     def _arm(self) -> Telemetry:
-        limit = self._settings.throttle_limit
-        telemetry = arm_capped(self._link, limit, self._log.event)
+        telemetry = arm_capped(self._link, self._settings.throttle_limit, self._log.event)
         self._given_s = self._clock()
         self._settled.set()
         return telemetry

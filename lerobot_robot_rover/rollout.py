@@ -5,14 +5,9 @@ from typing import Any
 
 from rover_lib.onboard.errors import ParamsError
 
-DAGGER = "DAggerStrategyConfig"
-
 
 def find_rollout() -> Any:
-    """Return the config of the `lerobot-rollout` that calls this; None in every other command.
-
-    LeRobot gives a robot, and a policy, only their own part of it: so it is looked for among the callers' variables.
-    """
+    """Return the config of the `lerobot-rollout` that calls this, by the callers' variables; None in other commands."""
     frame = sys._getframe(1)
     while frame:
         if type(config := frame.f_locals.get("cfg")).__name__ == "RolloutConfig":
@@ -24,7 +19,7 @@ def find_rollout() -> Any:
 def check_rollout(config: Any) -> None:
     """Raise ParamsError for what a car cannot take, with all options that must be given. config: of find_rollout."""
     strategy, options = config.strategy, []
-    if type(strategy).__name__ == DAGGER:  # its pause repeats an action, by which a car drives on
+    if type(strategy).__name__ == "DAggerStrategyConfig":  # its pause repeats an action, by which a car drives on
         raise ParamsError("DAgger's pause would drive a car on", remedy="record takeovers: rover drive --record")
     if config.interpolation_multiplier != 1:  # the robot waits for a new picture each time: a plan would last longer
         options.append("--interpolation_multiplier=1")
@@ -33,5 +28,4 @@ def check_rollout(config: Any) -> None:
     if config.teleop is None and getattr(strategy, "reset_to_initial_position", False):
         options.append("--strategy.reset_to_initial_position=false")
     if options:
-        what = "lerobot-rollout would move this car as an arm, between positions that a car does not have"
-        raise ParamsError(what, remedy=" ".join(options))
+        raise ParamsError("lerobot-rollout would move this car as an arm", remedy=" ".join(options))

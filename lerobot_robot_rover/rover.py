@@ -35,9 +35,8 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 class RoverConfig(RobotConfig):
     """The rover's settings in LeRobot.
 
-    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder or a FIFO of JPEGs. camera_name:
-    the picture is `observation.images.<camera_name>` in the dataset. width, height: size of the pictures that LeRobot
-    gets, in pixels; camera frames are resized to it as they are for a policy (prepare_frame). throttle_limit: in
+    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder or a FIFO of JPEGs. camera_name: of
+    `observation.images.<camera_name>`. width, height: of the pictures that LeRobot gets, in pixels. throttle_limit: in
     [0, 1]; None: that of params.yml. log: file of the flight log; None: where `rover drive` writes it.
     """
 
@@ -52,11 +51,10 @@ class RoverConfig(RobotConfig):
 
 
 class Rover(CarPart, Robot):
-    """A car with a camera and an Arduino, as LeRobot's commands drive and record it.
+    """A car with a camera and an Arduino, as LeRobot's commands drive and record it. For one thread at a time.
 
-    With a `rover_transmitter` on the same port the human drives, and nothing is sent. Otherwise send_action() drives:
-    it arms the car, for which a human must make the gesture each time. When no action comes for 0.1 s, the car is
-    stopped and disarmed. For one thread at a time.
+    With a `rover_transmitter` on the same port the human drives, and nothing is sent. Otherwise send_action() arms the
+    car, for which a human must make the gesture each time. When no action comes for 0.1 s, it is stopped and disarmed.
     """
 
     config_class = RoverConfig
@@ -81,11 +79,10 @@ class Rover(CarPart, Robot):
         return self._open is not None
 
     def connect(self, calibrate: bool = True) -> None:
-        """Open camera and Arduino. Nothing is armed yet: the first action does that.
+        """Open camera and Arduino, and without a `rover_transmitter` wait until a human has made the gesture.
 
-        Without a `rover_transmitter`, this then waits until a human has made the gesture for arming, and says what is
-        missing. Raises CameraError, LinkError or CarError for what is not there or does not fit, ParamsError, also for
-        options of lerobot-rollout that a car cannot take, and DeviceAlreadyConnectedError.
+        Nothing is armed yet: the first action does that. Raises CameraError, LinkError or CarError for what is not
+        there, ParamsError for options that a car cannot take, and DeviceAlreadyConnectedError.
         """
         if self._open:
             raise DeviceAlreadyConnectedError(f"the rover at {self.config.port} is connected already")
@@ -117,9 +114,8 @@ class Rover(CarPart, Robot):
     def get_observation(self) -> dict[str, Any]:
         """Return the newest picture, (height, width, 3) uint8 RGB, and steering and throttle of the previous action.
 
-        Both are neutral before the first action. Waits for a picture that LeRobot has not seen. If the car is not
-        armed, it first waits for the human's gesture, as connect() does. Raises CameraError for a camera that stopped,
-        froze or shows nothing, LinkError if the link is gone, and DriveFault if that ended the drive.
+        Waits for a picture that LeRobot has not seen, and for the human's gesture if the car is not armed. Raises
+        CameraError for a camera that stopped, froze or shows nothing, LinkError, and DriveFault for what ended a drive.
         """
         self._check_connected()
         if self._ride:
@@ -144,13 +140,13 @@ class Rover(CarPart, Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Drive by an action and return what the car was told. A human's own action is not sent: the car follows them.
 
-        action: finite steering and throttle, at most 0.25 beyond an end of their range. They are clipped to it, and the
-        throttle of an action that is sent also to the limit. Raises PolicyError for other actions, LinkError if arming
-        is refused, and what ended the drive.
+        action: finite steering and throttle, at most 0.25 beyond an end of their range, to which they are clipped.
+        Raises PolicyError for other actions, LinkError if arming is refused, and what ended the drive.
         """
         self._check_connected()
         steering, throttle = self._valid(action)
-        if self._line.take_humans_action():
+        if self._line.humans_action:
+            self._line.humans_action = False
             self._end_ride()
             self._sight.sent(time.monotonic(), throttle)
         else:
@@ -163,16 +159,15 @@ class Rover(CarPart, Robot):
         """Send neutral, then close everything. Raises DeviceNotConnectedError."""
         self._check_connected()
         opened, self._open = self._open, None
-        if opened:
-            opened.close()
+        opened.close()  # type: ignore[union-attr]  # it is connected
 
     def _check_connected(self) -> None:
         if not self._open:
             raise DeviceNotConnectedError(f"the rover at {self.config.port} is not connected: connect() first")
 
     def _flight_log(self) -> FlightLog:
-        (max_bytes, keep), path, car = log_limits(), self.config.log or default_log(), this_car()
-        header = {"artifact": "LeRobot", "hz": RATE_HZ, **vars(self.settings), "car": car.description()}
+        (max_bytes, keep), path = log_limits(), self.config.log or default_log()
+        header = {"artifact": "LeRobot", "hz": RATE_HZ, **vars(self.settings), "car": this_car().description()}
         return FlightLog(path, header=header, max_bytes=max_bytes, keep=keep)
 
     def _wait_for_human(self) -> None:
@@ -187,8 +182,7 @@ class Rover(CarPart, Robot):
             after = max(after, newest.number)
         if frame := self._camera.wait(after, LATE_FRAME_S):
             return frame
-        what = f"{self.config.camera}: no new frame for {LATE_FRAME_S:g} s"
-        raise CameraError(what, remedy="is the camera plugged in?")
+        raise CameraError(f"{self.config.camera}: no new frame for {LATE_FRAME_S:g} s", remedy="is it plugged in?")
 
     def _valid(self, action: dict[str, Any]) -> tuple[float, float]:
         """Return steering and throttle, checked and clipped as at the last boundary of `rover drive`."""
@@ -221,6 +215,6 @@ class Rover(CarPart, Robot):
         return steering, throttle
 
     def _end_ride(self) -> None:
-        ride, self._ride = self._ride, None
-        if ride:
-            ride.end()
+        if self._ride:
+            self._ride.end()
+        self._ride = None

@@ -27,10 +27,9 @@ class RoverTransmitterConfig(TeleoperatorConfig):
 
 
 class RoverTransmitter(CarPart, Teleoperator):
-    """The sticks of a human who drives the car in manual: the Arduino passes their pulses on, and measures them.
+    """The sticks of a human who drives: the Arduino passes on and measures their pulses. For one thread at a time.
 
-    LeRobot has no word for "not measured", and a lost signal is not a zero, so get_action() raises then. For one thread
-    at a time.
+    LeRobot has no word for "not measured", and a lost signal is not a zero, so get_action() raises then.
     """
 
     config_class = RoverTransmitterConfig
@@ -54,10 +53,7 @@ class RoverTransmitter(CarPart, Teleoperator):
         return self._link is not None
 
     def connect(self, calibrate: bool = True) -> None:
-        """Open the port and wait until the transmitter gives a signal; say so if it does not yet.
-
-        Raises LinkError and CarError as the robot does, and DeviceAlreadyConnectedError.
-        """
+        """Open the port and wait for the transmitter's signal. Raises as Rover.connect() does."""
         if self._link:
             raise DeviceAlreadyConnectedError(f"the transmitter at {self.config.port} is connected already")
         link = self._line.open()
@@ -72,10 +68,7 @@ class RoverTransmitter(CarPart, Teleoperator):
         self._link = link
 
     def get_action(self) -> dict[str, float]:
-        """Return steering and throttle of the sticks, by this machine's car.yml.
-
-        Raises LinkError if the signal is lost, if the Arduino does not pass the throttle on, or if the link is gone.
-        """
+        """Return the sticks' steering and throttle. Raises LinkError if signal, link or throttle is lost."""
         link = self._connected()
         telemetry = link.latest()
         sticks = _sticks(telemetry)
@@ -103,10 +96,7 @@ class RoverTransmitter(CarPart, Teleoperator):
         return self._link
 
     def _check_passed_on(self, telemetry: Telemetry, channel: Channel) -> None:
-        """Raise LinkError if the Arduino has withheld the throttle for longer than WITHHELD_S.
-
-        It does so until the throttle has been at rest once after a reset, a lost signal or a takeover.
-        """
+        """Raise LinkError if the throttle was withheld for WITHHELD_S: it was not at rest yet since a fault."""
         throttle = telemetry.receiver_throttle_us
         if throttle is None or not channel.moves(throttle) or channel.moves(telemetry.throttle_us):
             self._withheld_s = None

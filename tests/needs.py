@@ -126,9 +126,7 @@ def real_time(test: Callable[..., None]) -> Callable[..., None]:
                     if heartbeat.late_s < LATE_S and not isinstance(error, Late):
                         raise
                     if attempt == ATTEMPTS:
-                        error.add_note(
-                            f"this machine was too busy in {ATTEMPTS} attempts: {heartbeat.late_s:.3f} s late"
-                        )
+                        error.add_note(f"this machine was too busy, {heartbeat.late_s:.3f} s late")
                         raise
 
     return repeated

@@ -36,9 +36,7 @@ class Workstation(Rover):
                 formatter.write_dl([(str(c.name), c.get_short_help_str(width)) for c in commands])
 
 
-@click.group(
-    "rover", cls=Workstation, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
-)
+@click.group("rover", cls=Workstation, context_settings=onboard.main.context_settings)
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
 @VERSION
 def main(debug: bool) -> None:

@@ -30,9 +30,7 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
 
 Turned = tuple[tuple[str, str], ...]
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
-ACTION_NAMES = click.option(
-    "--action-names", default="", help="Of a LeRobotDataset's actions in order, if it has none."
-)
+ACTION_NAMES = click.option("--action-names", default="", help="Of a LeRobotDataset's actions, if it has none.")
 CAMERA = click.option("--camera", default="", help="A LeRobotDataset's cameras that the policy uses, with commas.")
 
 
@@ -67,14 +65,12 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
 
     EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; give a dataset on the
     Hub as user/name@revision.
-    Executes five notebooks and leaves reports, artifacts, figures and the executed notebooks in the run's folder. Ends
-    with a verdict, printed and written as report.html and run.json: which artifact to deploy, what failed, and what to
-    do about it.
+    Executes five notebooks in the run's folder. Ends with a verdict, also in report.html and run.json: which artifact
+    to deploy, what failed, and what to do about it.
 
     -p turns any of the notebooks' parameters; a value is YAML: 0.5, affine, [static, mixed].
 
-    --only 03 --name try1: execute one notebook on that run again. Its results replace those in the folder, so take a
-    copy of a run that you want to keep (`make notebooks-open NAME=demo AS=try1`), and judge it by `rover report`.
+    --only 03 --name try1: execute one notebook on that run again, whose results are replaced; `rover report` judges it.
     """
     from rover_lib.workshop.run.run import execute, find_notebook
     from rover_lib.workshop.run.run import run as run_notebooks
@@ -103,10 +99,7 @@ def _values_of(turned: Turned) -> dict[str, Any]:
 @click.argument("run_dir", type=PathTo("run"))
 @AS_JSON
 def report(run_dir: Path, as_json: bool) -> None:
-    """Judge the existing run in RUN_DIR again, as `rover run` does at its end.
-
-    Use it after `make count` has counted instructions, after `rover world students`, or when params.yml has changed.
-    """
+    """Judge the run in RUN_DIR again, after `make count` or `rover world students`, or when params.yml has changed."""
     _judge(run_dir, as_json)
 
 
@@ -126,8 +119,7 @@ def _judge(run_dir: Path, as_json: bool = False) -> None:
 def inspect(episodes: "Source", as_json: bool) -> None:
     """Say what FILE is and what is in it: everything that this project writes, and what it reads.
 
-    A run, an artifact, a checkpoint (a trainer's or LeRobot's), an episode or a folder of them, a LeRobotDataset, a
-    flight log, a calibration, a stage's report. Of a folder of runs, or without FILE, each run's verdict.
+    Of a folder of runs, or without FILE, each run's verdict.
     """
     from rover_lib.workshop.run.describe import describe
 
@@ -143,12 +135,8 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int) -> None:
     """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 
-    --onnx: for ONNX Runtime, with the run's own calibration. Such a file can be used like any artifact (benchmark,
-    compare, drive, release), and a rover with that engine needs no torch; model.onnx is inside.
-
-    --card: what the verdict and the recordings say of the artifacts, for the Hub; docs/lerobot.md says how to publish.
-
-    --hailo: a kit of networks, calibration set and scripts, calibrated on the run's recordings; see docs/hailo.md.
+    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md. --hailo: a
+    kit of networks, calibration set and scripts, see docs/hailo.md.
     """
     if not (onnx or card) and kit is None:
         raise click.UsageError("for what? --onnx, --card, or --hailo OUT")
@@ -162,19 +150,17 @@ def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int
         for name, digest in export_onnx(run_dir, terminal_bar()).items():
             path = run_dir / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
-    if kit is None:
-        return
-    (hailo,) = entry_points(group="rover.kits", name="hailo")
-    hailo.load()(run_dir, kit, samples)
+    if kit:
+        (hailo,) = entry_points(group="rover.kits", name="hailo")
+        hailo.load()(run_dir, kit, samples)
 
 
 @click.command(short_help="Collect the packages for a Pi without internet.")
 @click.argument("folder", type=FILE, default="wheels")
-@click.option("--python", "pythons", multiple=True, help="A Pi's Python [default: 3.11 and 3.13].")
 @click.option("--only-rover", is_flag=True, help="Only rover_lib's own wheel: Pis with internet fetch the others.")
 @click.option("--engine", type=click.Choice(["torch", "onnxruntime"]), default="torch", show_default=True)
-def wheelhouse(folder: Path, pythons: tuple[str, ...], only_rover: bool, engine: str) -> None:
+def wheelhouse(folder: Path, only_rover: bool, engine: str) -> None:
     """Download all packages that a Pi installs into FOLDER, for a rover without internet (154 MB per Python)."""
-    from rover_lib.workshop.wheelhouse import PYTHONS, make
+    from rover_lib.workshop.wheelhouse import make
 
-    show(vars(make(folder, pythons=pythons or PYTHONS, only_rover=only_rover, engine=engine)), True)
+    show(vars(make(folder, only_rover=only_rover, engine=engine)), True)

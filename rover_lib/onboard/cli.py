@@ -6,7 +6,6 @@ It is thin: it parses arguments, calls the library and prints.
 import contextlib
 import json
 import os
-import platform
 import sys
 import traceback
 from collections.abc import Callable
@@ -37,7 +36,6 @@ from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
 
 ALLOWED = click.Choice(["mode", "chunk", "camera", "aspect"])
 LOG = Output("flight log", appended=True)
-BUSY = 0.5  # load per core in the last minute; above it, times are only rough
 
 
 @click.group("rover", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -69,19 +67,10 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--ticks", type=FROM_1, help="End after this number of commands."),
     click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
-    click.option(
-        "--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in the user's state folder]."
-    ),
-    click.option(
-        "--json",
-        "json_file",
-        type=Output(appended=True),
-        help="Write a summary of the drive to this file; - prints it.",
-    ),
+    click.option("--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in your state folder]."),
+    click.option("--json", "json_file", type=Output(appended=True), help="Write a summary to this file; - prints it."),
     click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
-    click.option(
-        "--view", type=FILE, help="Socket of the view that shows the drive [default: that of your `rover view`]."
-    ),
+    click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
 
@@ -112,8 +101,6 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     o = DriveOptions(**options, asked_s=asked_s)
     if o.service and o.dry_run:
         raise click.UsageError("--service drives a car: no --dry-run")
-    if o.record_mb and not o.record:
-        raise click.UsageError("--record-mb belongs to --record")
     report, code = Report(), 0
     try:
         drive_car(o, report, car)
@@ -176,8 +163,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
 def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
     """Note in each EPISODE, a folder of one recorded drive, whether it hit or missed; `none` removes the note.
 
-    The note is metadata.outcome in its episode_data.json, where nothing else changes. A drive that failed is kept:
-    `rover inspect` counts outcomes, and `rover export-dataset` writes them.
+    A drive that failed is kept: `rover inspect` counts outcomes, and `rover export-dataset` writes them.
     """
     from rover_lib.onboard.recording.outcome import label
 
@@ -196,8 +182,8 @@ def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
 def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
-    Nothing is armed, and only the transmitter can move a servo. Exit code 1 if anything that driving needs fails;
-    warnings do not count. With --receiver it asks you to move a stick and to switch the transmitter off: do that once.
+    Nothing is armed. Exit code 1 if anything that driving needs fails; warnings do not count. With --receiver it asks
+    you to move a stick and to switch the transmitter off: do that once.
     """
     from rover_lib.onboard.car.host import default_log
     from rover_lib.onboard.care import doctor as checking
@@ -229,8 +215,7 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bo
 def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, force: bool, **more: Any) -> None:
     """Guide a human with the transmitter through both sticks, measure the pulses, and write them as car.yml.
 
-    Recorder, drive, doctor and the balloon world read it from then on, and the Arduino is told it. Take the wheels off
-    the ground and unplug the motor first. Ctrl-C leaves everything as it was.
+    Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
     from rover_lib.onboard.car.calibrate import measure, write_car
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
@@ -248,8 +233,7 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
         more["camera"] = {"field_of_view_deg": field_of_view_deg}
     with ServoLink(port, car=Car()) as link:
         car = measure(link, ask, notify=notify, **more)
-        # The Arduino still has the last one that was tried. It may refuse this one while the throttle's stick is off
-        # that one's rest; the next command that opens the port tells it again.
+        # The Arduino has the last one that was tried. If it refuses this one, the next command tells it again.
         with contextlib.suppress(LinkError):
             link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
@@ -261,7 +245,7 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
 @click.argument("file", type=FILE)
 @AS_JSON
 def inspect(file: Path, as_json: bool) -> None:
-    """Say what the artifact FILE is. A workstation's `rover inspect` knows checkpoints and recordings too."""
+    """Say what the artifact FILE is."""
     show(describe_artifact(file), as_json)
 
 
@@ -284,11 +268,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
 def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_json: bool, **options: Any) -> None:
-    """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors.
-
-    With --json or --output the first artifact's figures are at the top level. Needs nothing but the artifacts: this is
-    what runs on the Pi.
-    """
+    """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
     from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
     from rover_lib.onboard.car.host import usable_cores
     from rover_lib.onboard.care.benchmark import benchmark_artifacts
@@ -297,11 +277,8 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
     from rover_lib.onboard.stage import write_stage
 
     files = distinct_names(artifacts)
-    contents = {f"{name}{path.suffix}": content_hash(path) for name, path in files.items()}
-    busy = os.getloadavg()[0] / (os.cpu_count() or 1)
+    contents = {name.removesuffix(path.suffix) + path.suffix: content_hash(path) for name, path in files.items()}
     metrics = benchmark_artifacts(files, options["threads"] or usable_cores(), options)
-    if busy > BUSY:
-        notify(f"rover: warning: this machine was busy before ({busy:.0%} of its cores): times are rough")
     if output:
         write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
     if gates:
@@ -311,8 +288,6 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
     click.echo("\n".join(align(benchmark_rows(metrics))))
     machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
     show({k: v for k, v in machine.items() if v is not None}, False)
-    if gates and platform.machine() != "aarch64":
-        click.echo("limits apply to a Raspberry Pi: torch's CUDA build alone takes 530 MB")
     for row in metrics.get("gates", []):
         passed = {True: "kept", False: "MISSED", None: "not measured"}[row["passed"]]
         found = row["found"] if isinstance(row["found"], str) else number(row["found"], ".4g")
@@ -328,8 +303,8 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
 def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
-    Says what the Arduino still wants, and waits for it: the transmitter switched on, its throttle stick at rest, its
-    steering stick just wiggled. Moving a stick takes the car back; `sudo systemctl restart rover-drive` disarms it.
+    Says what the Arduino still wants, and waits for it. Moving a stick takes the car back;
+    `sudo systemctl restart rover-drive` disarms it.
     """
     from rover_lib.onboard.drive.service import Request, ask_service
     from rover_lib.onboard.drive.service import arm_car as arm
@@ -343,8 +318,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    said = arm(Request(**limits), model=model, confirm=confirm, notify=click.echo)
-    click.echo(said)
+    click.echo(arm(Request(**limits), model=model, confirm=confirm, notify=click.echo))
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")
@@ -355,10 +329,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
 def release(ctx: click.Context, models: Path, sandboxed: bool, **expected: Any) -> None:
-    """Manage the rover's models: stage them, verify them, use them. A switch happens completely or not at all.
-
-    `ansible-playbook ansible/deploy.yml` does all of it over a network.
-    """
+    """Manage the rover's models, as `ansible-playbook ansible/deploy.yml` does it over a network."""
     from rover_lib.onboard.artifact.acceptance import Expected
     from rover_lib.onboard.care.release import Releases, check_in_sandbox
 
@@ -446,9 +417,7 @@ def status(releases: Any, as_json: bool) -> None:
 
 
 view_options = with_options(  # on the rover and on a workstation
-    click.option(
-        "--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any that is free."
-    ),
+    click.option("--web-port", type=click.IntRange(0, 65535), default=8470, show_default=True, help="0: any free one."),
     click.option("--interface", default="", help="A network that may open it too, such as wlan0 [default: none]."),
     click.option("--token-file", type=FILE, help="File with the token of the URL [default: a new token, printed]."),
     click.option("--feed", type=FILE, help="Socket to which drives connect [default: that of your `rover drive`]."),
@@ -461,8 +430,7 @@ view_options = with_options(  # on the rover and on a workstation
 def view(**options: Any) -> None:
     """Show the drive of this machine in a browser: its picture, its plan, what the pins do. A drive may come and go.
 
-    The page can stop the car and nothing else. Whoever has its URL may do so; without --interface, only from this
-    machine, or through `ssh -L 8470:127.0.0.1:8470`.
+    Whoever has the page's URL can stop the car, and nothing else; without --interface, only from this machine.
     """
     open_view(**options)
 
@@ -476,11 +444,7 @@ def open_view(
     opened: Callable[[str], object] = lambda url: None,
     shown: Any = None,
 ) -> None:
-    """Serve the view until SIGINT or SIGTERM.
-
-    opened: called with its URL. shown: what is shown instead of the drives that connect: balloon_world's Simulation,
-    whose `ask` gets what is asked for on the page.
-    """
+    """Serve the view until SIGINT or SIGTERM. opened: called with its URL. shown: a Simulation to show, not drives."""
     import asyncio
     import secrets
 
@@ -506,11 +470,7 @@ def open_view(
 @LOG_DRIVE
 @AS_JSON
 def log(file: Path, drive: int, as_json: bool) -> None:
-    """Summarize the flight log FILE of `rover drive`. A workstation's `rover log` draws it too.
-
-    Missed ticks, jitter, ages and latencies of plans, who drove, temperature, and what happened. Older parts of the
-    same log (FILE.1, FILE.2, ...) are read with it.
-    """
+    """Summarize the flight log FILE of `rover drive`, with its older parts (FILE.1, ...)."""
     sum_up(file, drive, as_json)
 
 
@@ -520,12 +480,9 @@ def sum_up(file: Path, drive: int, as_json: bool) -> Any:
 
     flight = read_log(file, drive)
     summary = flight.summary()
-    if as_json:
-        show(summary, as_json)
-    else:
-        show({k: v for k, v in summary.items() if k != "events"}, as_json)
-        for event in flight.events:
-            click.echo(f"{event.t_s:9.2f} s  {event}")
+    show(summary if as_json else {k: v for k, v in summary.items() if k != "events"}, as_json)
+    for event in () if as_json else flight.events:
+        click.echo(f"{event.t_s:9.2f} s  {event}")
     return flight
 
 

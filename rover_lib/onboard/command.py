@@ -2,7 +2,9 @@
 
 import functools
 import json
+import platform
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +18,10 @@ ARTIFACT = PathTo("artifact")
 MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
 LONG_LIST = 12  # longer lists are for programs, and not printed for people
 # Options that several commands share:
-CAMERA = click.option(
-    "--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, or a folder or FIFO."
-)
+CAMERA = click.option("--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, a folder or FIFO.")
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
-LOG_DRIVE = click.option(
-    "--drive", type=int, default=-1, show_default=True, help="Which of FILE's drives: 0 the first, -1 the last."
-)
+LOG_DRIVE = click.option("--drive", type=int, default=-1, show_default=True, help="Of FILE: 0 the first, -1 the last.")
 POSITIVE = Number(min=0, min_open=True)
 FROM_0, FROM_1 = click.IntRange(min=0), click.IntRange(min=1)
 
@@ -46,9 +44,8 @@ class Rover(click.Group):
 
 def _sentence_of(error: Exception) -> object:
     if isinstance(error, ModuleNotFoundError):
-        if error.name == "aiohttp":
-            return "the view needs aiohttp: provision the rover with -e rover_view=true; on a laptop, make demo"
-        return f"this command needs {error.name}, which only a workstation has: make demo sets one up"
+        remedy = "provision with -e rover_view=true" if error.name == "aiohttp" else "make demo sets a workstation up"
+        return f"this command needs {error.name}; {remedy}"
     if isinstance(error, OSError):
         return of_system(error)
     return printable(str(error)) if isinstance(error, RoverError) else "out of memory: end other programs, or use less"
@@ -79,20 +76,18 @@ def show(value: Any, as_json: bool) -> None:
 
 def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
     if asked and not ctx.resilient_parsing:
-        from rover_lib.onboard.versions import versions
+        from rover_lib.onboard.artifact.engines import PACKAGES
+        from rover_lib.onboard.stage import version_of
 
-        click.echo("\n".join(versions()))
+        click.echo(f"rover {version_of('rover-policy') or 'not installed'}\nPython {platform.python_version()}")
+        for engine, package in PACKAGES.items():  # of which none is imported
+            version = (version_of(package) or "") if find_spec(package) else "is not installed"
+            click.echo(f"engine {engine}: {package} {version}".rstrip())
         ctx.exit()
 
 
-VERSION = click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_versions,
-    help="Show the versions of this program, Python and the engines.",
-)
+_FIRST: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False}
+VERSION = click.option("--version", **_FIRST, callback=_print_versions, help="Show versions, the engines' too.")
 
 
 def with_options(*options: Callable) -> Callable[[Callable], Callable]:

@@ -2,8 +2,7 @@
 
     raise CameraError("the camera delivers no frames", found=source, remedy="is it plugged in?")
 
-The command line prints an error as one sentence and exits with 1; it shows a traceback only with --debug. Code that
-needs a part of an error reads that field and never parses the text.
+The command line prints an error as one sentence. Code that needs a part of an error reads that field.
 """
 
 import errno
@@ -22,9 +21,8 @@ SYSTEM_REMEDIES = {  # what a user can do about an error of the system
 class RoverError(Exception):
     """Base of every error that is caused by the input and not by the program.
 
-    what: what was wrong, a clause without a full stop. found: what was found instead of what was expected; None if
-    `what` already says it. remedy: what the user can do about it; "" if there is nothing to suggest. kind: by which
-    code tells it from others of its class: "not armed", "taken over" (by the human) or "exists".
+    what: what was wrong, a clause without a full stop. found: what was found instead; None if `what` says it. remedy:
+    what the user can do, or "". kind: by which code tells it from others: "not armed", "taken over" or "exists".
     """
 
     def __init__(self, what: str, *, found: object = None, remedy: str = "", kind: str = ""):

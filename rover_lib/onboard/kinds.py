@@ -3,8 +3,7 @@
     kinds_of("runs/mine/policy_static.pt")                  # ("artifact",)
     check_kind(path, "checkpoint")                          # RoverError: ... this is an artifact, not a checkpoint; ...
 
-A folder may be of several kinds: `rover distill` makes one that is both a run and a LeRobot checkpoint. A path of an
-unknown kind is not refused here; the command itself then reports what is wrong with it.
+A folder may be of several kinds, such as a run and a LeRobot checkpoint. A path of an unknown kind is not refused here.
 """
 
 import math
@@ -63,7 +62,7 @@ def check_kind(path: Path | str, wanted: str) -> None:
     if not found or set(found) & set(takes):
         return
     if found[0] == "tub":
-        remedy = "rover export-dataset TUB OUT makes a LeRobotDataset of it"
+        remedy = "rover export-dataset TUB OUT"
     raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 
@@ -85,21 +84,15 @@ def check_output(path: Path, kind: str | None, *, appended: bool = False) -> Non
         raise RoverError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
     if found := set(kinds_of(path)) - {kind}:
         raise RoverError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
-    if path.exists() and appended:
-        return
-    folder = next((p for p in path.absolute().parents if p.exists()), Path("/"))
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if not (path.exists() and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise RoverError(f"{folder}: cannot be written to", remedy="name a file elsewhere")
 
 
 class Output(click.Path):
-    """A command's option that names a file to write.
+    """A command's option that names a file to write. What would be lost or cannot be written is refused at once.
 
-    It is refused before any work is done if it could not be written, or if it exists and is of another known kind, and
-    so would be lost.
-
-    kind: of the file that is written, a key of CALLED; None if it has none of these kinds. appended: the file is
-    appended to and not replaced.
+    kind: of the file that is written, a key of CALLED, or None. appended: the file is not replaced.
     """
 
     def __init__(self, kind: str | None = None, *, appended: bool = False):
@@ -113,10 +106,7 @@ class Output(click.Path):
 
 
 class Number(click.FloatRange):
-    """A command's option that is a finite number within limits.
-
-    click alone accepts "nan", which is neither below nor above any limit.
-    """
+    """A command's option that is a finite number within limits: click alone accepts "nan"."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)

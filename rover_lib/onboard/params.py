@@ -52,17 +52,11 @@ def read_params(path: Path | str) -> dict[str, Any]:
     """The content of one file. Raises ParamsError if it is missing, unreadable, or not a YAML mapping."""
     try:
         content = yaml.load(read_plain(path, MOST_BYTES).decode(), _EachKeyOnce)
-    except FileNotFoundError:
-        raise ParamsError(f"{path}: not found", remedy="it came with this package: install that again") from None
-    except OSError as e:
-        raise ParamsError(f"{path}: cannot be read ({e.strerror})") from None
     except Exception as e:  # PyYAML passes on Python's own errors, of a bad date or number, or too deep nesting
         raise ParamsError(f"{path}: not readable as YAML ({' '.join(str(e).split())})") from None
-    if content is None:  # nothing but comments
-        return {}
-    if not isinstance(content, dict):
+    if not isinstance(content or {}, dict):
         raise ParamsError(f"{path}: expected a mapping", found=type(content).__name__)
-    return content
+    return content or {}  # None: nothing but comments
 
 
 def _set(values: dict[str, Any], changes: dict[str, Any], where: str) -> None:

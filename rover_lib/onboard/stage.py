@@ -41,7 +41,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
     What a killed process left beside it is removed too. A lock tells it from what another process is writing.
 
-    Raises RoverError if torch.save cannot write the whole file, and OSError that names `path` for all else.
+    Raises RoverError if torch.save cannot write the whole file, OSError that names `path` for all else.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,8 +68,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 def _create_locked(path: Path) -> BufferedWriter:
     """Create a file, with a lock that tells it from what a killed process left."""
     while True:
-        # Not mkstemp, whose mode of 0600 would hide the file from the service's user. Here the kernel applies the
-        # umask; a process can learn its umask only by setting it, which would affect all of its threads.
+        # Not mkstemp, whose mode of 0600 would hide the file from the service's user.
         file = os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666), "wb")
         fcntl.flock(file, fcntl.LOCK_EX)
         if os.fstat(file.fileno()).st_nlink:
@@ -189,10 +188,8 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
     path = Path(path)
     try:
         content = json.loads(read_plain(path))
-    except FileNotFoundError:
-        raise RoverError(f"{path}: not found", remedy=f"run the notebook of stage '{stage}' first") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
-        raise RoverError(f"{path}: not readable as JSON ({e})", remedy="delete it and run its stage again") from None
+        raise RoverError(f"{path}: not readable as JSON ({e})", remedy=f"run the stage '{stage}' (again)") from None
     found = content if isinstance(content, dict) else {}
     whole = all(isinstance(found.get(part), dict) for part in PARTS)
     if not whole or (found.get("schema"), found.get("stage")) != (SCHEMA, stage or found.get("stage")):

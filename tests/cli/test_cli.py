@@ -4,7 +4,6 @@ import errno
 import json
 import shutil
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
@@ -18,20 +17,11 @@ def rover(*args):
     return CliRunner().invoke(main, [str(a) for a in args])
 
 
-@pytest.mark.parametrize("command", ["benchmark", "drive"])
-def test_more_threads_than_any_machine_has_are_refused(command, artifacts):
-    """torch would take the number, and crash."""
-    result = rover(command, artifacts["static"], "--threads", 100_000)
-    assert result.exit_code == 2 and "100000 is not in the range" in result.output
-
-
 def test_each_command_has_help_and_they_are_few():
-    groups = [main, main.commands["world"], main.commands["release"]]
-    for group in groups:
+    for group in (main, main.commands["world"], main.commands["release"]):
         for command in group.commands.values():
-            result = CliRunner().invoke(command, ["--help"])
-            assert result.exit_code == 0 and "Usage" in result.output and len(result.output) > 120
-    assert len(main.commands) <= 21
+            assert command.help and command.get_short_help_str()
+    assert len(main.commands) <= 21 and rover("--help").exit_code == 0
 
 
 def test_inspects_each_kind_of_file(artifacts, tiny_file):
@@ -70,20 +60,12 @@ def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monke
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_a_training_that_is_stopped_says_that_it_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr("rover_learn.train.train", Mock(side_effect=KeyboardInterrupt))
-    result = rover("train", tmp_path, tmp_path / "out.pth")
-    assert result.exit_code == 130 and "resume" in result.output
-
-
 def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr("rover_lib.workshop.run.run.execute", lambda *args, **given: asked.append((args, given)))
     result = rover("run", "--only", "03", "--name", "try1", "--runs-dir", tmp_path, "-p", "modes", "[static]")
     assert result.exit_code == 0, result.output
     assert asked == [(("03_quantize", tmp_path / "try1"), {"modes": ["static"]})]
-    result = rover("run", "--only", "03", "--name", "try1", "-p", "modes", "[static")
-    assert result.exit_code == 2 and "YAML" in result.output
 
 
 def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch):
@@ -93,8 +75,7 @@ def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("rover_lib.workshop.run.describe.describe", full)
-    result = rover("inspect", "a")
-    assert result.exit_code == 1
+    assert (result := rover("inspect", "a")).exit_code == 1
     assert result.output.startswith(f"rover: {tmp_path}/o.pt: no space left on device; make room"), result.output
     assert list(tmp_path.iterdir()) == []
 
@@ -102,11 +83,6 @@ def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch):
 def test_what_a_file_says_cannot_control_the_terminal(capsys):
     show({"labels": ["drive \x1b[31mred"], "layout": "a\nb"}, False)
     assert "drive \\x1b[31mred" in (out := capsys.readouterr().out) and "a\\nb" in out and "\x1b" not in out
-
-
-def test_debug_shows_the_traceback(tmp_path):
-    result = rover("--debug", "inspect", tmp_path / "nothing.pt")
-    assert result.exit_code == 1 and result.exception is not None
 
 
 def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypatch):
@@ -121,30 +97,20 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
     assert result.exit_code == 0, result.output
     for metrics in (json.loads(result.stdout), read_stage(out, "benchmark")["metrics"]):
         timed = metrics["artifacts"]
-        assert {k: v["mode"] for k, v in timed.items()} == {"a/policy_static": "static", "b/policy_static": "mixed"}
-        assert (metrics["main"], metrics["threads"]) == ("a/policy_static", 1)
+        assert {k: v["mode"] for k, v in timed.items()} == {str(files[0]): "static", str(files[1]): "mixed"}
+        assert (metrics["main"], metrics["threads"]) == (str(files[0]), 1)
         assert all(v["n"] == 2 for v in timed.values())
-    assert set(read_stage(out, "benchmark")["inputs"]) == {"a/policy_static.pt", "b/policy_static.pt"}
-    monkeypatch.setattr("os.getloadavg", lambda: (1000.0, 0.0, 0.0))
+    assert set(read_stage(out, "benchmark")["inputs"]) == {*map(str, files)}
     result = rover("benchmark", *files, "--iterations", 1, *few, "--gates")
-    assert "a/policy_static" in result.stdout and "model_size_mb" in result.stdout
-    assert "this machine was busy" in result.stderr
+    assert str(files[0]) in result.stdout and "model_size_mb" in result.stdout
     assert rover("benchmark", files[0], files[0]).exit_code == 1  # given twice
 
 
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory):
-    """Four drives of the expert, through the command line."""
-    folder = tmp_path_factory.mktemp("drives")
-    result = rover("world", "record", folder / "episodes", "--count", 4, "--seed", 5)
-    assert result.exit_code == 0, result.output
-    return folder / "episodes"
-
-
 @pytest.mark.slow
-def test_inspects_recordings_and_drives_a_trial(drives, artifacts):
-    content = json.loads(rover("inspect", drives, "--json").output)
-    assert content["recordings"]["episodes"] == 4
+def test_inspects_recordings_and_drives_a_trial(tmp_path, artifacts):
+    result = rover("world", "record", tmp_path / "episodes", "--count", 2, "--seed", 5)
+    assert result.exit_code == 0, result.output
+    assert json.loads(rover("inspect", tmp_path / "episodes", "--json").output)["recordings"]["episodes"] == 2
     result = rover("world", "trial", artifacts["static"], "--worlds", 1, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.output)["trials"] == 1

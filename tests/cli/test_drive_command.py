@@ -56,8 +56,7 @@ def test_a_drive_leaves_its_report_its_log_and_an_episode(demo_run, tmp_path):
     assert 50 <= report["latency_p50_ms"] < 150 and report["memory_mb"] > 50
     flight = read_log(folder / "flight.log")
     assert len(flight.ticks["t_s"]) == 60 and set(flight.ticks["state"]) == {"A"}
-    texts = [e.text for e in flight.events]
-    assert "armed" in texts and any("neutral: stopped" in text for text in texts) and "armed" in done.stderr
+    assert any("neutral: stopped" in event.text for event in flight.events) and "armed" in done.stderr
     (episode,) = load_recordings(folder / "episodes").episodes
     assert len(episode.samples) > 30 and {s.driver for s in episode.samples} == {"policy"}
     data = json.loads(next((folder / "episodes").glob("*/episode_data.json")).read_text())
@@ -101,18 +100,12 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp
     pytest.importorskip("aiohttp", reason="needs the extra view")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
-    view = subprocess.Popen(served, stdout=subprocess.PIPE, text=True)
-    try:
+    with subprocess.Popen(served, stdout=subprocess.PIPE, text=True) as view:
         url = view.stdout.readline().strip()
         with subprocess.Popen(in_world(demo_run, folder, "--ticks", 300, "--view", folder / "view")) as process:
-            try:
-                heads = asyncio.run(watch_and_stop(url))
-                assert process.wait(60) == 0
-            finally:
-                process.kill()
-    finally:
+            heads = asyncio.run(watch_and_stop(url))
+            assert process.wait(60) == 0
         view.terminate()
-        view.communicate()
     ended = json.loads((folder / "drive.json").read_text())["ended"]
     assert ended == heads[-1]["text"] == "stopped from the view (127.0.0.1)"
     assert heads[-1]["stopped"] and heads[-1]["pins"][1] == 120
@@ -136,30 +129,12 @@ def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
         done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
         with ServoLink(car.port) as link:  # the car stands after it
             until(lambda: link.latest() and link.latest().throttle_us == 120)
-    assert done.returncode == 3, done.stderr
-    assert "is the camera unplugged?" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert done.returncode == 3 and "Traceback" not in done.stderr, done.stderr
     assert "unplugged" in json.loads((folder / "j").read_text())["ended"]
 
 
-def test_a_dry_run_needs_no_arduino(artifact, tmp_path):
-    for i, picture in enumerate(pictures(0) * 50):
-        (tmp_path / f"{i:05}.jpg").write_bytes(picture)
-    options = ["--camera", tmp_path, "--dry-run", "--ticks", 30, "--log", tmp_path / "l", "--json", "-"]
-    done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["ticks"] == 30
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (["--hz", "5"], 2, "--hz"),
-        (["--port", "/dev/nothing"], 1, "/dev/nothing: cannot be opened"),
-        (["--dry-run", "--camera", "/dev/video77"], 1, "/dev/video77: no such camera"),
-        (["--camera", "."], 1, ".: recorded pictures know nothing of where the car is"),
-    ],
-)
-def test_what_cannot_begin(options, code, message, artifact, tmp_path):
-    result = CliRunner().invoke(main, ["drive", str(artifact), *options, "--log", str(tmp_path / "flight.log")])
-    assert result.exit_code == code and message in result.output
+def test_what_cannot_begin(artifact, tmp_path):
+    cases = {"--hz=5": 2, "--port=/dev/nothing": 1, "--camera=/dev/video77": 1, "--camera=.": 1}  # . is no camera
+    for option, code in cases.items():
+        words = ["drive", str(artifact), option, "--log", str(tmp_path / "flight.log")]
+        assert CliRunner().invoke(main, words).exit_code == code, option

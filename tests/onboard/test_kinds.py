@@ -21,7 +21,6 @@ def archive(path, name, data=b""):
     ("name", "data", "kind"),
     [
         ("data.pkl", b"..model_state_dict..", ("checkpoint",)),
-        ("data.pkl", b"samples smooth image_sizes", ("calibration",)),
         ("data.pkl", b"somebody's tensors", ()),
         ("code/net.py", b"", ("artifact",)),
         ("photo", b"", ()),

@@ -1,6 +1,5 @@
 """The status line: on a terminal, elsewhere, and where nobody reads it."""
 
-import io
 import logging
 import os
 import pty
@@ -10,7 +9,6 @@ import sys
 import time
 
 import pytest
-from needs import until
 
 from rover_lib.onboard.status_line import StatusLine
 
@@ -32,14 +30,6 @@ def test_a_terminal_has_one_line_that_is_overwritten():
     assert seen.count("\n") == 2  # the record's, and the end's
     assert "\r\x1b[Kcamera unplugged\r\n" in seen and seen.count("\r\x1b[Ktick") > 2
     assert all(len(part) <= 80 for part in seen.replace("\x1b[K", "").split("\r"))
-
-
-def test_elsewhere_it_is_a_plain_line_now_and_then():
-    with StatusLine(lambda: "all well", stream := io.StringIO(), every_s=0.02) as status:
-        until(lambda: stream.getvalue().count("all well\n") >= 2)
-        status.handle(record("camera unplugged"))
-        until(lambda: "camera unplugged\n" in stream.getvalue())
-    assert not set("\r\x1b") & set(stream.getvalue()) and stream.getvalue().endswith("all well\n")
 
 
 @pytest.mark.slow

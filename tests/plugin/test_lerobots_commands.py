@@ -1,8 +1,6 @@
 """LeRobot's own commands, as processes, with the rover: on the emulated Arduino, and in the balloon world."""
 
-import functools
 import importlib
-import inspect
 import os
 import re
 import shlex
@@ -16,14 +14,13 @@ import typing
 import zipfile
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import needs
 import numpy as np
 import pandas as pd
 import pytest
 
-from balloon_world.car import CameraFeed, VirtualCar
+from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import HUMAN, STOPPED, Gates, Observation, judge
@@ -93,7 +90,7 @@ class LeRobot:
     def over(self):
         """Whether it has ended. Raises Late where its loop was too slow for the car."""
         if self.waits_for_a_human():
-            raise needs.Late(f"LeRobot's loop was late:\n{self.text[-1500:]}")
+            raise needs.Late("LeRobot's loop was late")
         return self.process.poll() is not None
 
     def ended(self, seconds=60.0):
@@ -140,9 +137,6 @@ def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
     """Those of this LeRobot: in 0.6 lerobot-record drives no policy, and in 0.4 there is no lerobot-rollout."""
     import draccus
 
-    # draccus reads a class's source once more for each of its fields.
-    once = SimpleNamespace(getsource=functools.cache(inspect.getsource))
-    monkeypatch.setattr("draccus.wrappers.docstring.inspect", once)
     text, parsed = "".join(p.read_text() for p in (ROOT / "docs").glob("*.md")).replace("\\\n", " "), []
     for line in re.findall(r"^    (lerobot-\w+ .*)$", text, re.M):
         program, *words = shlex.split(line.partition(" # ")[0])
@@ -187,7 +181,6 @@ def test_a_humans_episodes_are_recorded_read_and_replayed(eyes, plugin, tmp_path
         actions = np.stack(episode["action"])
         distance = np.abs(pulses_of(actions)[:, None] - np.array(STICKS)).max(2)  # to each of the sticks' positions
         assert len(actions) >= 20 and (distance.min(1) <= ARDUINO_STEP_US).mean() > 0.8  # a status may be in between
-        assert (distance.min(0) <= ARDUINO_STEP_US).all()  # each was there
         np.testing.assert_array_equal(np.stack(episode["observation.state"])[1:], actions[:-1])
     ours = load_recordings(folder / "drives", 8)
     assert len(ours.episodes) == 2 and not ours.faults and 60 < ours.samples[5].frame_bgr().mean() < 160
@@ -215,28 +208,11 @@ def artifact(tmp_path_factory):
     return path
 
 
-def interrupt(process, board):
-    process.send_signal(signal.SIGINT)
-
-
-def kill(process, board):
-    process.kill()
-
-
-def stop(process, board):
-    process.send_signal(signal.SIGSTOP)
-
-
-def take_over(process, board):
-    board.ready(False)  # he does not wiggle the stick again
-    board.transmitter(1700, REST_US[1])
-
-
 @pytest.mark.emulated
 @pytest.mark.slow
 @needs.simavr
 @pytest.mark.parametrize(
-    "happens", [interrupt, *(pytest.param(what, marks=pytest.mark.release) for what in (kill, stop, take_over))]
+    "happens", ["SIGINT", *(pytest.param(what, marks=pytest.mark.release) for what in ("SIGKILL", "SIGSTOP", "human"))]
 )
 @needs.real_time
 def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifact, plugin, tmp_path):
@@ -255,18 +231,21 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
             needs.until(lambda: throttle() > 190 or record.over(), START_S)
             time.sleep(0.8)
             at_s = time.monotonic()
-            happens(record.process, board)
+            if happens == "human":
+                board.ready(False)  # he does not wiggle the stick again
+                board.transmitter(1700, REST_US[1])
+            else:
+                record.process.send_signal(getattr(signal, happens))
             time.sleep(1.0)
             throttle()  # all that came since
             seen = Observation(events, [], at_s, at_s + 1.0)
-            expected, human_us = (HUMAN, (1700, REST_US[1])) if happens is take_over else (STOPPED, REST_US)
+            expected, human_us = (HUMAN, (1700, REST_US[1])) if happens == "human" else (STOPPED, REST_US)
             verdict = judge(expected, seen, GATES, human_us=human_us)
-            wrong = verdict.wrong
-            if wrong and seen.stalled_ms():
-                raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {wrong}")
-            assert wrong == []
-            print(f"{happens.__name__}: {verdict.figures}")
-            if happens is stop:  # in the middle of a turn, or between two of them
+            if verdict.wrong and seen.stalled_ms():
+                raise needs.Late(f"the emulated Arduino had no time: {verdict.wrong}")
+            assert verdict.wrong == []
+            print(f"{happens}: {verdict.figures}")
+            if happens == "SIGSTOP":  # in the middle of a turn, or between two of them
                 record.process.send_signal(signal.SIGCONT)
                 needs.until(lambda: record.process.poll() is not None or record.waits_for_a_human(), 30)
                 record.process.send_signal(signal.SIGINT)
@@ -274,25 +253,6 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
             throttle()
             time.sleep(0.5)
             assert 0 < throttle() <= GATES.throttle_max_us  # nothing drives it again
-    if happens is interrupt and ENDING:  # lerobot-rollout takes a first Ctrl-C for the wish to end in order
-        assert status == 0
-    else:
-        assert status == -signal.SIGKILL if happens is kill else status != 0
-    assert happens is not take_over or "DriveFault" in record.text
-
-
-@pytest.mark.release  # ten seconds in which a busy machine must never be late by a tenth of one
-@needs.real_time
-def test_the_demos_policy_hits_balloons(demo_run, plugin, tmp_path):
-    """By a packed folder, two episodes, each after a gesture, which the stand-in's human has always just made."""
-    folder = Path(tempfile.mkdtemp(dir=tmp_path))  # of this attempt
-    packing = [sys.executable, "-m", "lerobot_robot_rover", demo_run / "policy_static.pt", folder / "packed"]
-    subprocess.run(packing, check=True, env={**os.environ, "PYTHONPATH": f"{plugin}{os.pathsep}{ROOT}"})
-    command, given = driving(folder, "world", num_episodes=2, episode_time_s=5)
-    with VirtualCar() as car:
-        given |= robot(car.port, folder, camera=car.camera, width=128, height=72)
-        with LeRobot(command, plugin, folder, policy__path=folder / "packed", **given) as record:
-            needs.until(record.over, START_S)
-            assert record.ended() == 0, record.text[-3000:]
-        report = car.report()
-    assert report.hits >= 1 and read_log(folder / "flight.log").drives == 2, report.outcomes
+    # lerobot-rollout takes a first Ctrl-C for the wish to end in order
+    assert (status == 0) == (happens == "SIGINT" and bool(ENDING))
+    assert happens != "human" or "DriveFault" in record.text

@@ -19,11 +19,9 @@ from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import STOPPED, Gates, Observation, judge
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
 from lerobot_robot_rover.line import FEATURES, named
-from lerobot_robot_rover.ride import HOLD_S, Ride
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive.flight_log import read_log
-from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError
 
 GO = {"steering": 0.2, "throttle": 0.15}
@@ -64,9 +62,6 @@ def connect(on):
     return on.robot
 
 
-# ---- without devices
-
-
 def test_lerobot_makes_it_of_its_config(tmp_path):
     rover = make_robot_from_config(RoverConfig(width=64, height=36, calibration_dir=tmp_path))
     assert isinstance(rover, Rover) and rover.is_calibrated and not rover.is_connected
@@ -80,11 +75,8 @@ def test_lerobot_makes_it_of_its_config(tmp_path):
 
 
 def test_what_cannot_be_opened_keeps_nothing_open(bench):
-    for options, error in (
-        ({"film": False}, CameraError),  # recorded pictures are no camera unless somebody says so
-        ({"camera": "/dev/none"}, CameraError),
-        ({"port": "/dev/none"}, LinkError),
-    ):
+    # Recorded pictures are no camera unless somebody says so.
+    for options, error in (({"film": False}, CameraError), ({"port": "/dev/none"}, LinkError)):
         with bench(**options) as on, pytest.raises(error):
             on.robot.connect()
         assert not on.robot.is_connected
@@ -97,9 +89,6 @@ def test_what_cannot_be_opened_keeps_nothing_open(bench):
         on.robot.connect()
 
 
-# ---- connected
-
-
 def test_an_observation_is_what_the_features_say(bench):
     with bench() as on:
         rover = connect(on)
@@ -108,7 +97,6 @@ def test_an_observation_is_what_the_features_say(bench):
         picture = before["cam_front"]
         assert [before[name] for name in FEATURES] == [0.0, 0.0] and set(before) == set(rover.observation_features)
         assert picture.shape == (48, 96, 3) and picture.dtype == np.uint8 and picture.flags.c_contiguous
-        assert not np.array_equal(rover.get_observation()["cam_front"], picture)  # each picture once
         until(lambda: rover.get_observation()["cam_front"].mean((0, 1))[2] > 60)  # RGB
         assert rover.get_observation()["cam_front"].mean((0, 1))[0] < 60
 
@@ -133,10 +121,8 @@ def test_an_action_that_must_not_drive_a_car(bench):
     with bench() as on:
         rover = connect(on)
         rover.get_observation()
-        for values in ((math.nan, 0.1), (1.5, 0.1), (0.0, -0.5), (None, 0.1), (10**400, 0.1)):
-            with pytest.raises(PolicyError):
-                rover.send_action(named(*values))
-        for action in ({"steering": 0.0}, {**GO, "gripper": 1.0}):
+        wrong = [named(*values) for values in ((math.nan, 0.1), (1.5, 0.1), (0.0, -0.5), (None, 0.1), (10**400, 0.1))]
+        for action in (*wrong, {"steering": 0.0}, {**GO, "gripper": 1.0}):
             with pytest.raises(PolicyError):
                 rover.send_action(action)
         assert on.board._state == "M" and not [e for e in on.board.pulses() if e.pin == "throttle"]
@@ -150,8 +136,7 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
         turn(rover, seconds=0.2)
         until(lambda: board._state == "S")
         assert board._reason == "n"  # by the host, before the Arduino had to
-        observation = rover.get_observation()
-        assert [observation[name] for name in FEATURES] == [0.0, 0.0]
+        rover.get_observation()
         assert board._state == "S"  # looking arms nothing
         turn(rover, seconds=0.2)  # this human has always just wiggled
         assert board._state == "A"
@@ -169,12 +154,10 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
     ("happens", "error"),
     [
         (lambda board, feed: board._enter("M", "h"), DriveFault),
-        (lambda board, feed: board._reset(), DriveFault),
         (lambda board, feed: feed.freeze(), DriveFault),
-        (lambda board, feed: feed.show(*jpegs()), DriveFault),
         (lambda board, feed: feed.close(), (DriveFault, CameraError)),
     ],
-    ids=["takeover", "reset", "frozen", "black", "unplugged"],
+    ids=["takeover", "frozen", "unplugged"],
 )
 def test_what_a_drive_detects_is_detected(bench, happens, error, patient):
     with bench() as on:
@@ -190,7 +173,7 @@ def test_what_a_drive_detects_is_detected(bench, happens, error, patient):
         assert on.board._state != "A"
 
 
-@pytest.mark.parametrize("when", ["before arming", "without a drive", "too old", "none"])
+@pytest.mark.parametrize("when", ["black", "too old", "none"])
 def test_a_picture_by_which_nobody_may_drive_arms_nothing(bench, when):
     with bench() as on:
         rover = connect(on)
@@ -207,14 +190,8 @@ def test_a_picture_by_which_nobody_may_drive_arms_nothing(bench, when):
             on.feed.show(*jpegs())
             until(lambda: rover._camera.latest().mean < 8)
             with pytest.raises(CameraError):
-                if when == "before arming":
-                    rover.send_action(GO)
-                for _ in range(10):
-                    rover.get_observation()
+                rover.send_action(GO)
         assert on.board._state == "M"
-
-
-# ---- and a human
 
 
 @pytest.mark.slow
@@ -251,33 +228,15 @@ def test_connecting_waits_for_the_gesture_and_says_what_is_missing(bench):
             log = getattr(rover, "_log", None)
             return bool(log) and any(words in event.text for event in log.recent)
 
-        def human():
-            until(lambda: said("switch the transmitter on"))
-            board.transmitter(*REST_US)
-            until(lambda: said("move the steering stick"))
-            assert not rover.is_connected
-            board.wiggle()
-
-        hand = threading.Thread(target=human)
-        hand.start()
-        rover.connect()
-        hand.join()
-        assert said("move the steering stick") and rover.is_connected
-        assert rover._link.latest().state is State.MANUAL
-
-
-# ---- how long an action holds
-
-
-def test_an_action_holds_for_a_tenth_of_a_second():
-    now = [100.0]
-    ride = Ride(None, None, Settings(), None, clock=lambda: now[0])  # type: ignore[arg-type]
-    ride.put(0.1, 0.1)
-    now[0] += HOLD_S - 0.001
-    assert ride._late() is None
-    now[0] += 0.002
-    assert ride._late()
-    assert HOLD_S + 1 / 50 < 0.15  # neutral goes out before the Arduino would stop by itself
+        connecting = threading.Thread(target=rover.connect)
+        connecting.start()
+        until(lambda: said("switch the transmitter on"))
+        board.transmitter(*REST_US)
+        until(lambda: said("move the steering stick"))
+        assert not rover.is_connected
+        board.wiggle()
+        connecting.join()
+        assert rover.is_connected and rover._link.latest().state is State.MANUAL
 
 
 @pytest.mark.emulated
@@ -295,37 +254,27 @@ def test_a_hung_loop_leaves_a_stopped_car(bench):
         events += board.pulses()
         on.robot.disconnect()
     seen = Observation(events, [], at_s, at_s + HUNG_S)
-    verdict = judge(STOPPED, seen, Gates.of_params())
-    if verdict.wrong and seen.stalled_ms():
-        raise needs.Late(f"the emulated Arduino had no time for {seen.stalled_ms():.0f} ms: {verdict.wrong}")
-    assert verdict.wrong == []
-
-
-# ---- lerobot-rollout, of LeRobot 0.6
-
-
-class DAggerStrategyConfig(SimpleNamespace):
-    """Known by its name."""
-
-
-class RolloutConfig(SimpleNamespace):
-    """Known by its name, and by that of the variable in which LeRobot's functions have it."""
-
-
-EPISODIC = SimpleNamespace(smooth_handover=True, reset_to_initial_position=True)
+    if (wrong := judge(STOPPED, seen, Gates.of_params()).wrong) and seen.stalled_ms():
+        raise needs.Late(f"the emulated Arduino had no time: {wrong}")
+    assert wrong == []
 
 
 @pytest.mark.parametrize(
     ("strategy", "multiplier", "teleop", "word"),
     [
-        (SimpleNamespace(), 3, None, "--interpolation_multiplier=1"),
-        (EPISODIC, 1, None, "--strategy.reset_to_initial_position=false"),
-        (EPISODIC, 1, "rover_transmitter", "--strategy.smooth_handover=false"),
-        (DAggerStrategyConfig(), 1, "rover_transmitter", "rover drive --record"),
+        ("Base", 3, None, "--interpolation_multiplier=1"),
+        ("Episodic", 1, None, "--strategy.reset_to_initial_position=false"),
+        ("Episodic", 1, "rover_transmitter", "--strategy.smooth_handover=false"),
+        ("DAggerStrategyConfig", 1, "rover_transmitter", "rover drive --record"),
     ],
 )
 def test_what_an_arm_does_is_refused_before_anything_is_opened(tmp_path, strategy, multiplier, teleop, word):
-    cfg = RolloutConfig(strategy=strategy, interpolation_multiplier=multiplier, teleop=teleop)
+    """LeRobot's classes are known by their names, and the config by its variable's."""
+    moves = {"smooth_handover": True, "reset_to_initial_position": True} if strategy == "Episodic" else {}
+    strategy = type(strategy, (), moves)()
+    cfg = type("RolloutConfig", (SimpleNamespace,), {})(
+        strategy=strategy, interpolation_multiplier=multiplier, teleop=teleop
+    )
     rover = Rover(RoverConfig(port="/dev/nothing", calibration_dir=tmp_path))
     with pytest.raises(ParamsError, match=word):
         rover.connect()

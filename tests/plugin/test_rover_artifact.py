@@ -41,16 +41,12 @@ def artifact(tmp_path_factory):
 
 
 def test_what_is_no_artifact(tmp_path):
-    for wrong in ({"n_action_steps": 0}, {"threads": 0}):
-        with pytest.raises(ParamsError):
-            RoverArtifactConfig(**wrong)
-    for name in ("", "none.pt"):
-        with pytest.raises(ParamsError):
-            make_policy(RoverArtifactConfig(artifact=name), ds_meta=dataset())
+    with pytest.raises(ParamsError):
+        RoverArtifactConfig(n_action_steps=0)
+    with pytest.raises(ParamsError):
+        make_policy(RoverArtifactConfig(artifact="none.pt"), ds_meta=dataset())
     path = tmp_path / "policy.pt"
     path.write_text("hello")
-    with pytest.raises(PolicyError):
-        make_policy(RoverArtifactConfig(artifact=str(path)), ds_meta=dataset())
     with pytest.raises(PolicyError):
         pack(path, tmp_path / "packed")
     assert not (tmp_path / "packed").exists()
@@ -99,49 +95,37 @@ def test_a_batch_is_a_plan_for_each(artifact):
     assert policy.select_action(batch).shape == (3, 2)
     with pytest.raises(PolicyError, match=r"observation.images.cam_front"):
         policy.predict_action_chunk({"observation.state": torch.zeros(1, 2)})
-    for ask in (lambda: policy.forward(batch), policy.get_optim_params):
-        with pytest.raises(PolicyError, match="not trained"):
-            ask()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("config", "meta", "word"),
-    [
-        ({"n_action_steps": 31}, {}, "30 at most"),
-        ({}, {"fps": 15}, "--dataset.fps=30"),
-        ({}, {"camera": "wrist"}, "--robot.camera_name=cam_front --dataset.video=true"),
-    ],
+    ("steps", "meta", "error"),
+    [(31, {}, ParamsError), (8, {"fps": 15}, PolicyError), (8, {"camera": "wrist"}, PolicyError)],
 )
-def test_what_it_cannot_be_run_with(artifact, config, meta, word):
-    with pytest.raises((ParamsError, PolicyError), match=word):
-        make_policy(RoverArtifactConfig(artifact=str(artifact), **config), ds_meta=dataset(**meta))
+def test_what_it_cannot_be_run_with(artifact, steps, meta, error):
+    with pytest.raises(error):
+        make_policy(RoverArtifactConfig(artifact=str(artifact), n_action_steps=steps), ds_meta=dataset(**meta))
 
 
 @pytest.mark.slow
 def test_a_packed_folder_is_a_pretrained_policy(artifact, tmp_path, monkeypatch):
     folder, moved = tmp_path / "packed", tmp_path / "elsewhere"
-    done = CliRunner().invoke(main, [str(artifact), str(folder), "--n-action-steps", "5"])
+    done = CliRunner().invoke(main, [str(artifact), str(folder)])
     assert done.exit_code == 0, done.output
-    again = CliRunner().invoke(main, [str(artifact), str(folder)])
-    assert again.exit_code == 1 and again.output.startswith("Error: ")
-    files = [artifact.name, "config.json", "policy_postprocessor.json", "policy_preprocessor.json"]
-    assert sorted(p.name for p in folder.iterdir()) == sorted(files)
+    assert CliRunner().invoke(main, [str(artifact), str(folder)]).exit_code == 1
     folder.rename(moved)
     monkeypatch.chdir(tmp_path)
     config = PreTrainedConfig.from_pretrained(moved)
     config.pretrained_path = moved  # as lerobot-record does
-    assert isinstance(config, RoverArtifactConfig) and config.n_action_steps == 5
+    assert isinstance(config, RoverArtifactConfig) and config.n_action_steps == 8
     assert config.input_features["observation.images.cam_front"].shape == (3, 48, 96)
     policy = make_policy(config, ds_meta=dataset())
     overrides = {"device_processor": {"device": "cpu"}, "rename_observations_processor": {"rename_map": {}}}
     before, after = make_pre_post_processors(
         config, pretrained_path=str(moved), dataset_stats={}, preprocessor_overrides=overrides
     )
-    observation = {
-        "observation.images.cam_front": np.zeros((36, 64, 3), np.uint8),
-        "observation.state": np.zeros(2, np.float32),
-    }
+    picture, state = np.zeros((36, 64, 3), np.uint8), np.zeros(2, np.float32)
+    observation = {"observation.images.cam_front": picture, "observation.state": state}
     action = predict_action(observation, policy, torch.device("cpu"), before, after, use_amp=False)
     np.testing.assert_allclose(action[0], [0.2, 0.15], atol=1e-6)
     with pytest.raises(ParamsError, match="not a folder"):

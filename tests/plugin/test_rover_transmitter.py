@@ -1,14 +1,14 @@
 """The transmitter as a teleoperator: what is measured is given, what is not is refused, and the port has one owner."""
 
 from dataclasses import replace
-from types import SimpleNamespace
+from functools import partial
 from weakref import WeakValueDictionary
 
 import pytest
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitterConfig, line, rover_transmitter
+from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitterConfig, line
 from lerobot_robot_rover.line import FEATURES, line_to, named, unnamed, wait_for_humans
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
@@ -77,52 +77,22 @@ def test_the_sticks_by_car_yml(transmitter):
     assert transmitter.get_action() == named(1.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    "lost",
-    [
-        status(None, 120),
-        status(1456, None),
-        None,
-        replace(status(1456, 120), receiver_steering_period_us=2 * 21316),
-    ],
-)
-def test_a_lost_pulse_is_no_zero(transmitter, lost):
+def test_a_lost_pulse_is_no_zero(transmitter):
     transmitter.connect()
-    Link.status = lost
-    with pytest.raises(LinkError, match="signal was lost"):
-        transmitter.get_action()
-
-
-def test_it_waits_for_a_signal_and_says_so_and_can_be_given_up(transmitter, monkeypatch, caplog):
-    Link.status, waits = status(None, None), []
-
-    def sleep(seconds):
-        waits.append(seconds)
-        if len(waits) == 1:
-            raise KeyboardInterrupt
-        if len(waits) == 4:
-            Link.status = status(1456, 120)
-
-    monkeypatch.setattr(rover_transmitter, "time", SimpleNamespace(sleep=sleep))
-    with pytest.raises(KeyboardInterrupt):
-        transmitter.connect()
-    assert not transmitter.is_connected and Link.opened == 0
-    transmitter.connect()
-    assert len(waits) == 4 and caplog.text.count("transmitter on") == 2
+    stretched = replace(status(1456, 120), receiver_steering_period_us=2 * 21316)
+    for Link.status in (status(None, 120), status(1456, None), None, stretched):
+        with pytest.raises(LinkError):
+            transmitter.get_action()
 
 
 def test_a_throttle_that_the_car_does_not_get_is_no_data(transmitter):
     transmitter.connect()
-    for at_s in (1.0, 1.4):
-        Link.status = status(1456, 170, at_s, pins=(1456, 120))
+    withheld = partial(status, 1456, 170, pins=(1456, 120))
+    for Link.status in (withheld(1.0), withheld(1.4), status(1456, 170, 1.45), withheld(1.6), withheld(2.0)):
+        transmitter.get_action()  # not for long, each time
+    Link.status = withheld(2.2)
+    with pytest.raises(LinkError):
         transmitter.get_action()
-    Link.status = status(1456, 170, 1.6, pins=(1456, 120))
-    with pytest.raises(LinkError, match="does not get"):
-        transmitter.get_action()
-    Link.status = status(1456, 170, 1.7)  # it gets it
-    transmitter.get_action()
-    Link.status = status(1456, 170, 2.0, pins=(1456, 120))  # for a moment: the stick has just moved
-    transmitter.get_action()
 
 
 def test_a_port_has_one_line_whichever_name_it_has(tmp_path):
@@ -131,16 +101,11 @@ def test_a_port_has_one_line_whichever_name_it_has(tmp_path):
     by_id.symlink_to(port)
     before = line_to(str(by_id))
     assert line_to(str(port)) is before is not line_to(str(tmp_path / "other"))
-    by_id.unlink()  # it was unplugged, and what was plugged in then has its number
-    assert line_to(str(port)) is not before
 
 
 def test_the_robot_and_the_policy_know_that_a_human_may_drive(tmp_path, transmitter):
     rover, waits = Rover(RoverConfig(port=PORT, calibration_dir=tmp_path)), []
     assert list(rover._line.transmitters) == [transmitter]
-    transmitter.connect()
-    transmitter.get_action()
-    assert rover._line.take_humans_action() and not rover._line.take_humans_action()
     wait_for_humans()
     rover._line.before_drive = lambda: waits.append(1)
     wait_for_humans()

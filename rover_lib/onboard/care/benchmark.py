@@ -34,9 +34,7 @@ LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
     """Return the peak resident memory, in MB, of a fresh process that loads one artifact and predicts three times.
 
-    The process is a fresh one because the calling process holds all compared policies, so that its own peak says
-    nothing about one of them. Returns None if the machine does not report it. Raises PolicyError if the artifact does
-    not load or predict there.
+    Returns None if the machine does not report it. Raises PolicyError if the artifact does not load or predict there.
     """
     return run_confined(_predict_alone, timeout_s=timeout_s, path=str(path), threads=threads or usable_cores())
 
@@ -51,11 +49,9 @@ def _predict_alone(path: str, threads: int) -> float | None:
 
 
 def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Time artifacts from anywhere, on the frames of the first one's parity vectors, as benchmark() does.
+    """Time artifacts from anywhere, by name, in a confined process, on the frames of the first one's parity vectors.
 
-    Nothing of them runs in this process. paths: by name. threads: of the engines. options: of BenchmarkOptions. Each
-    artifact's memory is measured too. What the firmware throttled is read once, at the end. Raises PolicyError for an
-    artifact that does not load.
+    options: of BenchmarkOptions. Each artifact's memory is measured too. Raises PolicyError for one that does not load.
     """
     metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
     metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
@@ -86,8 +82,7 @@ def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int
 def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     """Return the distribution of one policy's latencies, and the rates that follow from it.
 
-    throughput_fps: inferences per second without pauses (1000 / mean). control_rate_hz: the highest rate at which 95 %
-    of the inferences end within their period (1000 / p95).
+    control_rate_hz: the highest rate at which 95 % of the inferences end within their period (1000 / p95).
     """
     x = np.asarray(latencies_ms, float)
     mean_ms, p95_ms = float(x.mean()), float(np.percentile(x, 95))
@@ -111,10 +106,9 @@ class BenchmarkOptions:
     """How to time policies. Raises ParamsError for impossible values.
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
-    test: rounds until this time is over, with a time series. at_most_s: limits the time by doing fewer rounds, but at
-    least LEAST_ROUNDS. threads: of the engines; 0: all cores; None: leave them as they are. main: the policy whose
-    figures are at the top level (None: the first). reference: the policy that the speed of the others is compared with.
-    memory_alone: measure each artifact's memory in a process of its own, which takes seconds each.
+    test with a time series. at_most_s: limits the time, but not to less than LEAST_ROUNDS. threads: of the engines; 0:
+    all cores; None: as they are. main: whose figures are at the top level (None: the first's). reference: what the
+    others' speed is compared with. memory_alone: measure each artifact's memory in a process of its own.
     """
 
     warmup: int = 10
@@ -127,13 +121,8 @@ class BenchmarkOptions:
     memory_alone: bool = False
 
     def __post_init__(self) -> None:
-        rules = {
-            "warmup": whole(0, MOST),
-            "iterations": whole(1, MOST),
-            "threads": optional(whole(0, MOST)),
-            "duration_s": optional(number(0.001, MOST)),
-            "at_most_s": optional(number(0.001, MOST)),
-        }
+        rules = {"warmup": whole(0, MOST), "iterations": whole(1, MOST), "threads": optional(whole(0, MOST))}
+        rules |= dict.fromkeys(("duration_s", "at_most_s"), optional(number(0.001, MOST)))
         if broken := broken_rule(vars(self), rules):
             raise ParamsError(f"{broken[0]} of a benchmark must be {broken[1]}", found=broken[2])
 
@@ -163,22 +152,18 @@ def benchmark(
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
     policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path`, and `.threads` with
-    `set_threads` are used if it has them. frames: used in turn. progress: called like
-    tqdm.tqdm(iterable, desc=, total=).
+    `set_threads` are used if it has them. frames: used in turn.
 
-    cpu_pct is processor time as a share of all cores that this process may use: at the top level over the whole run,
-    and per artifact over its own inferences. temperature_c is the highest and clock_mhz the lowest reading.
-    peak_memory_mb is that of the artifact alone if it was measured; otherwise it is None for the artifact, and this
+    cpu_pct is processor time as a share of all cores that this process may use. temperature_c is the highest and
+    clock_mhz the lowest reading. peak_memory_mb is the artifact's alone if it was measured, else None, and this
     process's at the top level. Raises ParamsError without policies or frames, or if main or reference is not among the
-    policies; errors of a policy are passed on.
+    policies.
     """
     names = list(policies)
-    if not names or not len(frames):
-        raise ParamsError("nothing to benchmark", found=f"{len(names)} policies and {len(frames)} frames")
-    main, reference = options.main or names[0], options.reference
-    for name in (main, reference):
-        if name is not None and name not in policies:
-            raise ParamsError(f"no policy {name!r} to benchmark", found=names, remedy="name one of them")
+    main, reference = options.main or next(iter(names), None), options.reference
+    if not len(frames) or main not in names or reference not in (None, *names):
+        what = f"a benchmark needs frames and policies, {main} and {reference} among them"
+        raise ParamsError(what, found=f"{len(frames)} frames and {names}")
     host = host or Host()
     cores = usable_cores()
     threads_before = {name: policies[name].threads for name in names if hasattr(policies[name], "threads")}

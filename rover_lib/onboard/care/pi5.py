@@ -2,11 +2,9 @@
 
     predict_ms(Work(cycles_g=0.69, near_lines_g=0.03, far_lines_g=0.005), threads=3)
 
-The fit has three terms, and each has a meaning. What a core does itself: the cycles that the busiest thread's
-instructions take of a core that waits for nothing, and the lines of 64 bytes that it fetches into its first cache. What
-all cores share: the lines between them and the memory. The two overlap, so that the time is the root of the sum of
-their squares. The low and the high end are as far off as nine in ten architectures were from a fit that did not
-know them. docs/clock.md shows those.
+The fit has three terms: the cycles of the busiest thread, the lines of 64 bytes that it fetches into its first cache,
+and the lines between all cores and the memory, which overlap with the others. The low and the high end are as far off
+as nine in ten architectures were from a fit that did not know them. docs/clock.md shows those.
 """
 
 import json

@@ -9,9 +9,8 @@
     models/history.json         what was in use, the newest last; for rollback and prune
     models/.lock                held by whoever changes something
 
-The power may fail between any two system calls, and whatever was not synced is then lost. So all files of a release are
-synced before its folder gets its name, and the folder before `current` is renamed. Leftovers of an interrupted command
-(.new, .gone-... and .new-...) are removed by the next command. No decision depends on the clock.
+The power may fail between any two system calls. So all files of a release are synced before its folder gets its name,
+and the folder before `current` is renamed. Leftovers of an interrupted command are removed by the next one.
 """
 
 import contextlib
@@ -83,8 +82,7 @@ class Releases:
         if name == "current":
             return self.current_link / POLICY
         if not NAME.fullmatch(name):
-            what = "a release is named by 64 hexadecimal digits or 'current'"
-            raise RoverError(what, found=f"'{name}'", remedy="see status")
+            raise RoverError("a release has 64 hexadecimal digits, or is 'current'", found=name, remedy="see status")
         return self.releases / name / POLICY
 
     def wrong_with(self, name: str) -> str:
@@ -92,10 +90,7 @@ class Releases:
         return self._look_at(name)["wrong"]
 
     def all(self) -> list[dict[str, Any]]:
-        """Return all releases: the one in use, then those used before, the latest first, then those never used.
-
-        Of each: name, current (whether it is in use), mode, origin, sha256, megabytes and wrong, as by wrong_with().
-        """
+        """Return name, current, mode, origin, sha256, megabytes and wrong of each release: the last used first."""
         return [self._look_at(name) for name in self._by_use()]
 
     def _look_at(self, name: str) -> dict[str, Any]:
@@ -115,13 +110,12 @@ class Releases:
     def status(self) -> dict[str, Any]:
         """Return the present state: current, mode, since, healthy, trouble, releases, disk_free_mb.
 
-        since: when `current` was switched, by the clock at that time. healthy: whether the bytes of the release in use
-        are intact; if not, trouble says why. disk_free_mb: free space where the models are.
+        since: when `current` was switched. healthy: whether the bytes of the release in use are intact; if not, trouble
+        says why.
         """
         releases, current, since = self.all(), self.current, None
-        in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": "no model: deploy one"})
-        if current and "name" not in in_use:
-            in_use["wrong"] = f"current points to {current}, which is no release: deploy or roll back"
+        none = f"current points to {current}, not to a release" if current else "no model: deploy one"
+        in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": none})
         with contextlib.suppress(OSError):
             since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.current_link.lstat().st_mtime))
         nearest = next(p for p in (self.models, *self.models.absolute().parents) if p.exists())
@@ -162,8 +156,6 @@ class Releases:
         """
         source = Path(source)
         with self._lock():
-            if not source.is_file():
-                raise RoverError(f"{source}: not a file", remedy="stage takes an artifact")
             free_mb = shutil.disk_usage(self.models).free / 1e6
             if free_mb < (wanted_mb := (source.stat().st_size + SPARE_BYTES) / 1e6):
                 what = f"{self.models}: {free_mb:.0f} MB free, {wanted_mb:.0f} are needed"
@@ -173,8 +165,7 @@ class Releases:
             shutil.copyfile(source, new / POLICY)
             arrived = sha256_of(new / POLICY)
             if sha256 and arrived != sha256:
-                what = f"{source}: arrived damaged (sha256 {arrived[:12]}, not {sha256[:12]})"
-                raise RoverError(what, remedy="send it again")
+                raise RoverError(f"{source}: arrived damaged, not {sha256[:12]}", found=arrived, remedy="send it again")
             try:
                 artifact = inspect_artifact(new / POLICY, self.expected, allow)
             except RoverError as e:
@@ -300,10 +291,7 @@ class Releases:
             return []
 
     def _write_history(self, names: list[str]) -> None:
-        """Write the history, if there is room. A full disk must not prevent a rollback or pruning.
-
-        If there was no room, the next command adds what is missing.
-        """
+        """Write the history, if there is room: a full disk must not prevent a rollback. The next command mends it."""
         new = self.models / ".new-history"
         with contextlib.suppress(OSError):
             new.write_text(json.dumps(names[-HISTORY:], indent=1) + "\n")

@@ -1,7 +1,6 @@
 """Where a plan leads, drawn into the camera's picture: the car's geometry, on a flat floor.
 
-It assumes a car with two axles whose speed is proportional to the throttle, and a level camera that looks straight
-ahead. The drawing is only for people to look at: no command depends on it.
+It assumes a speed proportional to the throttle, and a level camera that looks straight ahead. No command depends on it.
 """
 
 import math
@@ -48,9 +47,8 @@ class CarShape:
         Raises ParamsError for values that no car can have, CarError as this_car().
         """
         car, section = car or this_car(), params()["view"]
-        measured: dict[str, Any] = {"wheelbase_m": car.wheelbase_m, "focal": car.focal_px / WIDTH_PX, "left": car.left}
         try:
-            return cls(**section, **measured)
+            return cls(**section, wheelbase_m=car.wheelbase_m, focal=car.focal_px / WIDTH_PX, left=car.left)
         except TypeError as error:  # a name too many or too few
             raise ParamsError(f"view: {error}", found=sorted(section), remedy="see params.yml") from None
 

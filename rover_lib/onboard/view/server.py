@@ -2,11 +2,10 @@
 
     asyncio.run(View(Address(), token).run(lambda url: print(url)))
 
-It listens in two places. Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the
-page over HTTP, and each page opens a WebSocket. Through it the page receives the newest message, and the next one only
-after the page has confirmed that it shows the previous one: so no messages queue up, and a slow page gets fewer. A page
-may send only "shown N" and "stop", and the view never sends a drive anything but a stop. In a simulation, a page may
-also ask for the next world or another policy.
+Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the page over HTTP, and each
+page opens a WebSocket. It receives the newest message, and the next one only after it has confirmed that it shows the
+previous one: so no messages queue up. A page may send only "shown N" and "stop", and the view never sends a drive
+anything but a stop. In a simulation, a page may also ask for the next world or another policy.
 
 Whoever has the token may watch the drive and stop it. It is in each request's URL and in no cookie, so that no other
 page in the same browser can use the view.
@@ -42,7 +41,6 @@ from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
-ACCEPT_AGAIN_S = 0.5
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
@@ -52,11 +50,7 @@ SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 @dataclass(frozen=True)
 class Address:
-    """Where browsers find the view.
-
-    port: 0 means any free one. interface: browsers reach the view only through this network interface, such as wlan0;
-    "" means only from this machine.
-    """
+    """Where browsers find the view. port: 0: any free one. interface: such as wlan0; "": only from this machine."""
 
     port: int = PORT
     interface: str = ""
@@ -72,18 +66,14 @@ class Address:
             wire.listen(64)
         except OSError as error:
             wire.close()
-            where = f"port {self.port}" + (f" of {self.interface}" if self.interface else "")
-            remedy = "choose another --web-port, or an --interface that `ip -brief address` lists"
-            raise RoverError(f"no page can be served at {where} ({error.strerror})", remedy=remedy) from None
+            what = f"no page can be served at port {self.port} {self.interface} ({error.strerror})"
+            raise RoverError(what, remedy="another --web-port, or an --interface of `ip -brief address`") from None
         return wire
 
 
 def read_token(path: Path) -> str:
-    """Read the token from a file. Raises RoverError if it cannot be read, or if the token could be guessed."""
-    try:
-        token = read_plain(path, 4096).decode(errors="replace").strip()
-    except OSError as error:
-        raise RoverError(f"{path}: the token cannot be read ({error.strerror})", remedy="provision the rover") from None
+    """Read the token from a file. Raises OSError, and RoverError if the token could be guessed."""
+    token = read_plain(path, 4096).decode(errors="replace").strip()
     if not re.fullmatch(r"[A-Za-z0-9_-]{16,128}", token, re.ASCII):
         raise RoverError(f"{path}: no token of 16 letters or more is in it", remedy="provision the rover")
     return token
@@ -93,9 +83,9 @@ class View:
     """The web server of the view.
 
     address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
-    drive_user: another user whose drives are accepted, besides this user's and root's. car: the car whose drives are
-    shown; None means this machine's. ask: takes what a simulation's page asks for; None for a car, whose page can only
-    stop it. Raises RoverError for an unknown user, and CarError and ParamsError like this_car() and CarShape.of().
+    drive_user: another user whose drives are accepted, besides this user's and root's. car: whose drives are shown;
+    None means this machine's. ask: takes what a simulation's page asks for; None for a car. Raises RoverError for an
+    unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
     def __init__(
@@ -170,7 +160,7 @@ class View:
     def show(self, head: dict[str, Any], picture: bytes) -> None:
         """Show this on the pages from now on. head: a message as in feed.py. picture: a JPEG, or empty for none."""
         self._number += 1
-        pins: list[Any] | None = head.get("pins")
+        pins = head.get("pins")
         pins = pins if pins and None not in pins else None
         plan = head.pop("plan", None)
         ribbon: list[tuple[float, ...]] = []
@@ -180,11 +170,8 @@ class View:
             ribbon = [tuple(p) for p in self._shape.ribbon(actions, 1 / plan["rate_hz"], width / height)]
         means = throttled_means((head.get("machine") or {}).get("throttled"))
         channels = self._pwm.steering, self._pwm.throttle
+        head |= {"n": self._number, "ribbon": ribbon, "left": self._shape.left, "pins": pins}
         head |= {
-            "n": self._number,
-            "ribbon": ribbon,
-            "left": self._shape.left,
-            "pins": pins,
             "pins_actions": pins and [c.action(us) or 0.0 for c, us in zip(channels, pins, strict=True)],
             "stopped": pins is not None and abs(pins[1] - self._pwm.throttle.neutral_us) <= ARDUINO_STEP_US,
             "throttled": ", ".join(means) if means else "",
@@ -208,10 +195,8 @@ class View:
     # ---- drives
 
     def _listen(self, place: Path) -> socket.socket:
-        if is_listened_at(place):
-            raise RoverError(f"{place}: another view listens there", remedy="end that one first")
-        if place.exists() and not place.is_socket():
-            raise RoverError(f"{place}: not a socket", remedy="name another with --feed")
+        if is_listened_at(place) or (place.exists() and not place.is_socket()):
+            raise RoverError(f"{place}: another view listens there, or a file lies there", remedy="give --feed")
         place.parent.mkdir(parents=True, exist_ok=True)
         place.unlink(missing_ok=True)  # left by a view that was killed
         wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
@@ -227,11 +212,7 @@ class View:
     async def _accept(self, wire: socket.socket) -> None:
         loop, tasks = asyncio.get_running_loop(), set()
         while True:
-            try:
-                drive, _ = await loop.sock_accept(wire)
-            except OSError:  # no file descriptor is free, perhaps because somebody keeps opening connections
-                await asyncio.sleep(ACCEPT_AGAIN_S)
-                continue
+            drive, _ = await loop.sock_accept(wire)
             _, uid, _ = struct.unpack("3i", drive.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             if uid not in self._users:
                 drive.close()
@@ -267,9 +248,7 @@ class View:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         if not hmac.compare_digest(request.query.get("token", "").encode(), self._token.encode()):
-            return web.Response(
-                status=403, text="this page needs its token: use the URL that `rover view` has printed\n"
-            )
+            return web.Response(status=403, text="this page needs its token: use the URL that `rover view` printed\n")
         return await handler(request)
 
     async def _give_page(self, request: web.Request) -> web.Response:
@@ -318,7 +297,7 @@ class View:
 class _Page:
     """One page. sent: number of the last message. showing: set while the page shows it. captured_s: of its picture.
 
-    delay_ms: time from the capture of the last picture that the page showed until it said so; None if unknown.
+    delay_ms: from the capture of its last picture until it said that it shows it.
     """
 
     def __init__(self) -> None:
@@ -350,10 +329,9 @@ def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
 
 async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:
     """Return the drive's next message, b"" at the end."""
-    try:
+    with contextlib.suppress(ConnectionResetError):  # it closed with a second stop unread; its last message is here
         return await loop.sock_recv(drive, MESSAGE_BYTES)
-    except ConnectionResetError:  # the drive closed without reading a second stop; its last message is still here
-        return await loop.sock_recv(drive, MESSAGE_BYTES)
+    return await loop.sock_recv(drive, MESSAGE_BYTES)
 
 
 async def _end(task: asyncio.Future) -> None:

@@ -27,12 +27,7 @@ class Machine:
     def __init__(self):
         self.now_s = self.cpu_s = 0.0
         self.log = []
-
-    def clock(self):
-        return self.now_s
-
-    def cpu_clock(self):
-        return self.cpu_s
+        self.clocks = Clocks(lambda: self.now_s, lambda: self.cpu_s)
 
     def policy(self, name, times_ms, **attributes):
         calls = iter(range(10**9))
@@ -46,10 +41,6 @@ class Machine:
 
         return SimpleNamespace(predict_chunk=predict_chunk, **attributes)
 
-    @property
-    def clocks(self):
-        return Clocks(self.clock, self.cpu_clock)
-
     def benchmark(self, policies, host, **options):
         return benchmark(policies, FRAMES, STATE, BenchmarkOptions(**options), host=host, clocks=self.clocks)
 
@@ -59,9 +50,6 @@ def machine():
     return Machine()
 
 
-# ---- arithmetic
-
-
 def test_floor_of_a_pi_5():
     found = {mode: round(floor_ms(15.02, mode)) for mode in ("static", "mixed", "fp16", "fp32")}
     assert found == {"static": 49, "mixed": 49, "fp16": 98, "fp32": 196}
@@ -69,9 +57,6 @@ def test_floor_of_a_pi_5():
     for gmac, mode in ((1, "int4"), (math.nan, "fp32")):
         with pytest.raises(ParamsError):
             floor_ms(gmac, mode)
-
-
-# ---- timing
 
 
 def test_interleaved_warmed_up_and_each_first_in_turn(machine, bare_host):
@@ -118,24 +103,19 @@ def test_soak_has_a_time_series(machine, pi_host):
     assert metrics["wall_s"] == pytest.approx(10)
     series = metrics["series"]
     assert len(series) == 9  # one about every second, after whole rounds of 0.4 s, and one for the rest
-    times_s = [p["t_s"] for p in series]
-    assert times_s == sorted(times_s)
-    assert times_s[-1] == pytest.approx(10)
+    assert series[-1]["t_s"] == pytest.approx(10)
     assert sum(p["artifacts"]["a"]["n"] for p in series) == 25
     assert series[0]["artifacts"]["b"]["latency_p50_ms"] == pytest.approx(300)
     assert series[0]["temperature_c"] == 61.35
-    assert series[0]["memory_mb"] == pytest.approx(409.6)
-    json.dumps(metrics, allow_nan=False)
 
 
-@pytest.mark.parametrize(("took_ms", "rounds"), [(90, 56), (1000, 20)])
-def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host, took_ms, rounds):
-    policy = {"a": machine.policy("a", [took_ms])}
-    assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
+def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host):
+    for took_ms, rounds in ((90, 56), (1000, 20)):
+        policy = {"a": machine.policy("a", [took_ms])}
+        assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
 
 
-@pytest.mark.parametrize("threads", [1, 0])
-def test_threads_are_set_and_restored(bare_host, threads):
+def test_threads_are_set_and_restored(bare_host):
     class Threaded:
         threads, seen = 7, ()
 
@@ -147,9 +127,9 @@ def test_threads_are_set_and_restored(bare_host, threads):
             if len(self.seen) == 2:
                 raise PolicyError("no")
 
-    policy, options = Threaded(), BenchmarkOptions(warmup=0, iterations=1, threads=threads)
+    policy, options = Threaded(), BenchmarkOptions(warmup=0, iterations=1, threads=0)
     metrics = benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
-    assert policy.seen == (metrics["threads"],) == (threads or metrics["cores"],)
+    assert policy.seen == (metrics["threads"],) == (metrics["cores"],)
     with pytest.raises(PolicyError):
         benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
     assert policy.threads == 7
@@ -164,22 +144,12 @@ def test_parameters_that_make_no_sense(machine, bare_host, bad):
     assert machine.log == []
 
 
-# ---- gates
-
-
 def test_gates_of_the_original():
-    """Each metric, and whether it keeps its gate: a range, a rate, less than a number, a text, not measured."""
-    expected = {
-        "latency_mean_ms": (41.0, False), "latency_p95_ms": (12.0, True), "throughput_fps": (25.0, True),
-        "control_rate_hz": (21.9, False), "size_mb": (66.4, True), "peak_memory_mb": (500.0, False),
-        "cpu_pct": (None, None), "temperature_c": (None, None), "throttled": ("0x50000", False),
-    }  # fmt: skip
-    rows = check_gates({name: value for name, (value, _) in expected.items()}, GATES)
-    names = {"model_size_mb": "size_mb", "memory_mb": "peak_memory_mb"}
-    assert [row["gate"] for row in rows] == list(GATES)
-    for row in rows:
-        assert row["passed"] is expected.get(names.get(row["gate"], row["gate"]), (None, None))[1]
-    assert rows[4] == {"gate": "model_size_mb", "limit": 100, "found": 66.4, "passed": True}
+    metrics = {"latency_mean_ms": 41.0, "latency_p95_ms": 12.0, "throughput_fps": 25.0, "control_rate_hz": 21.9}
+    metrics |= {"size_mb": 66.4, "peak_memory_mb": 500.0, "cpu_pct": None, "throttled": "0x50000"}
+    passed = {row["gate"]: row["passed"] for row in check_gates(metrics, GATES)}
+    assert list(passed) == list(GATES)
+    assert list(passed.values()) == [False, True, True, False, True, False, None, None, None, False]
     for limit in (None, True, [3, 2], [1, 2, 3], math.nan):
         with pytest.raises(ParamsError):
             check_gates({"cpu_pct": 1.0}, {"cpu_pct": limit})
