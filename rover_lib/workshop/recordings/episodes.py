@@ -11,14 +11,16 @@ action, a hole in time, and a change to or from nobody driving end the chunks be
 sample, because its state would be invented.
 """
 
+import csv
 import math
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import simplejpeg
@@ -27,7 +29,9 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.recording.episode import (
+    CONTROL_FIELDS,
     DATA,
+    DATA_BYTES,
     FRAME_FIELDS,
     NOBODY,
     OUTCOMES,
@@ -41,9 +45,10 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
-from rover_lib.workshop.untrusted import JSON_BYTES, parse_json, quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
-TABLES = ("control_data.csv", "frame_data.csv")  # the same as in DATA; nothing here reads them
+# What DATA has under these names, and where it is again with which columns.
+TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
@@ -95,7 +100,7 @@ def load_recordings(
         raise EpisodeError(what, found=found, remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
-        if (root / DATA).exists():
+        if any((root / name).exists() for name in (DATA, "control_data.csv")):
             root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
         else:
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
@@ -139,17 +144,14 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
-    path = folder / DATA
     try:
-        content = parse_json(read_plain(path, JSON_BYTES))
-        control_rows, frame_rows = content["control_samples"], content["frame_samples"]
-        metadata, label = content.get("metadata") or {}, content.get("action_label")
-        outcome = metadata.get("outcome")
-        if not isinstance(control_rows, list) or not isinstance(frame_rows, list):
-            raise TypeError("its samples are no lists")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
-        faults.add(path, "unreadable", f"not an episode's JSON: {quote(str(e))}")
+        path, content = _read_content(folder, faults)
+    except (OSError, ValueError, csv.Error) as e:
+        faults.add(folder, "unreadable", f"neither {DATA} nor its CSV files can be read: {quote(str(e))}")
         return None
+    control_rows, frame_rows = content["control_samples"], content["frame_samples"]
+    metadata, label = content.get("metadata"), content.get("action_label")
+    outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
     if outcome is not None and outcome not in OUTCOMES:
         faults.add(path, "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
         outcome = None
@@ -177,10 +179,37 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         frames=len(frame_rows),
         controls=len(control_rows),
         samples=samples,
-        files=tuple(p for name in (DATA, *TABLES) if (p := folder / name).is_file()),
+        files=tuple(p for name in (DATA, *(name for name, _ in TABLES.values())) if (p := folder / name).is_file()),
         outcome=outcome,
         formulas=formulas,
     )
+
+
+def _read_content(folder: Path, faults: Faults) -> tuple[Path, dict[str, Any]]:
+    """Return a file of an episode and its content: DATA's, or its rows in the CSV files if DATA has none.
+
+    Raises OSError, ValueError and csv.Error if neither can be read.
+    """
+    path = folder / DATA
+    try:
+        content = read_json(path)
+        if isinstance(content, dict) and all(content.get(key) and isinstance(content[key], list) for key in TABLES):
+            return path, content
+        faults.add(path, "broken_json", "no rows of controls and frames in it: its CSV files are read")
+    except (OSError, ValueError) as e:
+        faults.add(path, "broken_json", f"{quote(str(e))}: its CSV files are read")
+    return folder / "control_data.csv", {
+        key: _read_csv(folder / name, fields) for key, (name, fields) in TABLES.items()
+    }
+
+
+def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
+    lines = read_plain(path, DATA_BYTES).decode("utf-8-sig", errors="replace").splitlines()
+    # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
+    table = csv.DictReader(lines, restval="missing")
+    if missing := [name for name in fields if name not in (table.fieldnames or ())]:
+        raise ValueError(f"{path.name} has no column {missing[0]}")
+    return list(table)
 
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:

@@ -260,14 +260,40 @@ def test_serial_burst_that_the_clock_cannot_place_is_dropped(tmp_path):
     }
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"control_samples": {}, "frame_samples": 1}', "\udcff", "[" * 10_000_000])
-def test_a_folder_without_an_episodes_json_is_skipped(tmp_path, text):
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"control_samples": {}, "frame_samples": 1}', "[" * 10_000_000])
+def test_without_json_the_csvs_serve(tmp_path, text):
+    folder = record(tmp_path)
+    whole = load(tmp_path).samples
+    (folder / "episode_data.json").write_text(text)
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"broken_json": 1}
+    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
+    assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in whole]
+
+
+def test_faults_of_a_csv_are_counted_and_another_table_is_refused(tmp_path):
+    folder = record(tmp_path)
+    (folder / "episode_data.json").unlink()
+    lines = (folder / "control_data.csv").read_text().splitlines()
+    lines[3] = "1,2"
+    lines[6] = lines[6].replace("1000.", "nan1000.")
+    lines[9] = "99," + "nan," + ",".join(lines[9].split(",")[2:])
+    (folder / "control_data.csv").write_text("\n".join(lines))
+    assert kinds(load(tmp_path)) == {"broken_json": 1, "wrong_type": 2, "not_finite": 1}
+    (folder / "control_data.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(EpisodeError, match="no column arduino_timestamp"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", '{"control_samples": {}, "frame_samples": 1}', "\udcff"])
+def test_a_folder_without_json_and_csvs_is_skipped(tmp_path, text):
     record(tmp_path, "episode_20260101_000000")
     folder = record(tmp_path, "episode_20260102_000000")
     (folder / "episode_data.json").write_bytes(text.encode(errors="surrogateescape"))
+    (folder / "control_data.csv").unlink()
     recordings = load(tmp_path)
     assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
-    assert kinds(recordings) == {"unreadable": 1}
+    assert kinds(recordings) == {"broken_json": 1, "unreadable": 1}
     shutil.rmtree(tmp_path / "episode_20260101_000000")
     with pytest.raises(EpisodeError, match=r"no usable sample in 1 folder.*unreadable"):
         load(tmp_path)
