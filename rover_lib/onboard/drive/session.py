@@ -118,7 +118,7 @@ class Session:
         telemetry, attempt = None, partial(self.attempt, arming)
         if self.link and (self.service or self.terminal):
             show = partial(self._show_waiting, said)
-            checks = [self.camera.latest, self.planner.newest, self.link.latest, show]
+            checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]
             if self.service:
                 missing = partial(what_is_missing, self.link)
                 telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)

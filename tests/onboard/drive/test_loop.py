@@ -21,7 +21,7 @@ from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.watch import stop_on_signals
-from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError, RoverError
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, RoverError
 
 PERIOD = 1 / 30
 
