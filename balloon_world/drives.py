@@ -67,7 +67,7 @@ class TimedCar:
         self._coming: Plan | None = None
         self._think(ROUNDING)
 
-    def drive(self, settings: Settings, log: NoLog, watch: Watch | None = None) -> tuple[list[Order], str]:
+    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> tuple[list[Order], str]:
         """Drive by the car's own loop until the world ends or `stop` is set; return all orders and the outcome."""
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
         try:

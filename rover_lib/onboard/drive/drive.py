@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
+from typing import Any
 
 from rover_lib.onboard.artifact.manifest import Artifact, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
@@ -19,7 +20,7 @@ from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.drive.opening import DriveOptions, OtherCar, another_car, check_no_film, open_flight_log
+from rover_lib.onboard.drive.opening import DriveOptions, another_car, check_no_film, open_flight_log
 from rover_lib.onboard.drive.plan import Commanded, Settings
 from rover_lib.onboard.drive.service import Service
 from rover_lib.onboard.drive.session import Session
@@ -31,11 +32,11 @@ REST_S = 1.0  # between plans while the car is not driving
 
 
 def drive_car(
-    options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[OtherCar]] | None = None
+    options: DriveOptions, report: Report, car: Callable[[], AbstractContextManager[Any]] | None = None
 ) -> None:
     """Drive as the options say, in this process's main thread. Raises as loop.drive() does.
 
-    report: filled during the drive. car: opens a car that is driven instead of the one at the options' camera and port.
+    report: filled during the drive. car: opens another car, with a camera, a port and a summary() for the report.
     As a service, this drives each time that a human arms the car, until it is told to stop.
     """
     settings = Settings.of(params()["drive"], throttle_limit=options.throttle_limit)

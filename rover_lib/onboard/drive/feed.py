@@ -43,9 +43,9 @@ DRIVING, WAITING, TAKEN, ENDED = "driving", "waiting", "taken over", "ended"
 
 
 class Feed:
-    """A drive's end of the view. Only the loop's thread may use it. It raises nothing, and waits only in ended().
+    """A drive's end of the view, for the loop's thread. It raises nothing, and waits only in ended().
 
-    place: the socket at which the view listens. log: the view shows its newest events. title: the name of what drives.
+    place: the socket at which the view listens. title: the name of what drives.
     """
 
     def __init__(
@@ -62,7 +62,6 @@ class Feed:
         self._look_s = self._due_s = 0.0  # earliest times: look for a view, send
 
     def close(self) -> None:
-        """End the connection to the view."""
         if self._socket:
             self._socket.close()
             self._socket = None
@@ -143,13 +142,11 @@ class Feed:
         return {"pins": None, "who": "", "why": ""}
 
     def _send(self, phase: str, text: str, report: Report, camera: Camera, message: dict[str, Any]) -> bool:
-        """Send a message with the camera's newest picture; return whether it was sent."""
         try:
             shown, picture = self._picture(camera)
             events = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
             about = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
-            state = {"missed": report.missed, "machine": self._log.machine, "events": events}
-            line = about | state | message | shown
+            line = about | {"missed": report.missed, "machine": self._log.machine, "events": events} | message | shown
             return self._put(json.dumps(line).encode() + b"\n", picture)
         except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")

@@ -239,9 +239,7 @@ class _Loop:
 
     def _status(self, order: Order, telemetry: Telemetry | None) -> str:
         who = telemetry.why if telemetry else "dry run"
-        plan = ""
-        if order.age_s is not None and order.latency_s is not None:
-            plan = f", plan {order.age_s * 1e3:.0f} ms old, took {order.latency_s * 1e3:.0f}"
+        plan = "" if order.age_s is None else f", plan {order.age_s * 1e3:.0f} ms old"
         late = f"late {max(self.report.late_ms[-100:]):.1f} ms at most, {self.report.missed} missed"
         return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}"
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car.camera import path_of
@@ -17,16 +17,6 @@ from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.status_line import StatusLine
-
-
-class OtherCar(Protocol):
-    """A car to drive instead of the one at the options' camera and port, such as a simulated one."""
-
-    camera: str
-    port: str
-
-    def summary(self) -> dict[str, Any]:
-        """Return what happened to the car, for the drive's report."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class Pilot(Protocol):
 
 
 class Sight:
-    """Judges whether the car may drive by what the camera shows. For one thread at a time."""
+    """Judges whether the car may drive by what the camera shows."""
 
     def __init__(self, camera: Camera, settings: Settings):
         self._camera, self._settings = camera, settings

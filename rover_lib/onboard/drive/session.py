@@ -153,7 +153,7 @@ class Arming:
             self._room = room_for(options.record, options.record_mb)  # now, because it may take a while
         self._recorder: TakeoverRecorder | None = None
         self._armed: Telemetry | None = None
-        self._driving, self._recording = ExitStack(), ExitStack()
+        self._driving, self._opened = ExitStack(), ExitStack()  # the second contains the first
 
     def __enter__(self) -> "Arming":
         return self
@@ -162,13 +162,10 @@ class Arming:
         if self._recorder:
             self._recorder.flush()
         try:
-            self._driving.__exit__(*exc)
+            self._opened.__exit__(*exc)
         finally:
-            try:
-                self._recording.__exit__(*exc)
-            finally:
-                if self._recorder and (outcome := self._recorder.recorder.path or self._recorder.recorder.failure):
-                    self._session.log.event(f"recorded: {outcome}")
+            if self._recorder and (outcome := self._recorder.recorder.path or self._recorder.recorder.failure):
+                self._session.log.event(f"recorded: {outcome}")
 
     def arm(self) -> Telemetry | None:
         """Arm the car if the newest plan is fresh and the camera sees. Return the status that confirms it.
@@ -176,20 +173,21 @@ class Arming:
         If it raises RoverError, what it began is undone, and it may be called again.
         """
         session = self._session
-        with ExitStack() as recording, ExitStack() as driving:
+        with ExitStack() as opened:
             if session.link:
                 session.link.request(keep=True)
-            driving.enter_context(session.planner.without_rest())
             if folder := session.options.record:
-                recorder = recording.enter_context(session.make_recorder(folder, self._room))
+                recorder = opened.enter_context(session.make_recorder(folder, self._room))
                 self._recorder = TakeoverRecorder(recorder, session.mode)
+            driving = opened.enter_context(ExitStack())
+            driving.enter_context(session.planner.without_rest())
             driving.enter_context(session.boost(session.log))
             session.planner.renew(session.settings.fade_s)
             self._pilot.check_sight()
             if session.link:
                 limit = session.settings.throttle_limit
                 self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)
-            self._driving, self._recording = driving.pop_all(), recording.pop_all()
+            self._driving, self._opened = driving, opened.pop_all()
         return self._armed
 
     def record(self, *row: Any, **columns: Any) -> None:

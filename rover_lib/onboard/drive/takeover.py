@@ -123,20 +123,16 @@ class TakeoverRecorder:
                 elif rest_s is None:
                     rest_s = telemetry.host_s
             now_s, first = clock(), None
-            if self.recorder.failure is not None:
-                return ended("nothing more can be recorded")
-            if stop.is_set():
-                return ended("told to stop")
-            if why := over():
+            reasons = {
+                "nothing more can be recorded": self.recorder.failure is not None,
+                "told to stop": stop.is_set(),
+                "another program has armed the car": newest and newest.state is State.AUTONOMOUS,
+                f"the sticks have been at rest for {LET_GO_S:g} s": rest_s is not None and heard_s - rest_s >= LET_GO_S,
+                f"the transmitter has had no signal for {SILENT_S:g} s": now_s - signal_s > SILENT_S,
+                f"after {MOST_S:g} s": now_s - start_s >= MOST_S,
+            }
+            if why := over() or next((why for why, holds in reasons.items() if holds), None):
                 return ended(why)
-            if newest and newest.state is State.AUTONOMOUS:
-                return ended("another program has armed the car")
-            if rest_s is not None and heard_s - rest_s >= LET_GO_S:
-                return ended(f"the sticks have been at rest for {LET_GO_S:g} s")
-            if now_s - signal_s > SILENT_S:
-                return ended(f"the transmitter has had no signal for {SILENT_S:g} s")
-            if now_s - start_s >= MOST_S:
-                return ended(f"after {MOST_S:g} s")
             tick = max(tick + 1, int((now_s - start_s) * rate_hz))
             stop.wait(max(0.0, start_s + tick / rate_hz - clock()))
 

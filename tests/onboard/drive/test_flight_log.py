@@ -67,15 +67,6 @@ def test_what_goes_in_comes_out(path, pi_host):
     assert (flight.drive, flight.drives, flight.damaged, flight.events) == (0, 1, 0, [])
 
 
-def test_each_line_can_be_read_without_this_program(path):
-    with FlightLog(path, header=HEADER, **LIMITS) as log:
-        log.tick(tick(12345, latency_ms=1520.4))
-        log.event("camera unplugged", frame=812)
-    header, machine, row, event = map(json.loads, path.read_text().splitlines())
-    assert [r["kind"] for r in (header, machine, event)] == ["header", "machine", "event"]
-    assert dict(zip(header["columns"], row, strict=True))["latency_ms"] == 1520.4
-
-
 def test_events_have_their_time_and_go_to_logging_too(path, caplog):
     now = [100.0]
     with caplog.at_level("INFO", "rover"), FlightLog(path, header=HEADER, **LIMITS, clock=lambda: now[0]) as log:
@@ -97,15 +88,6 @@ def test_a_second_drive_into_one_log_is_refused_at_once(path):
         log.tick(tick(0))
     write(path, [tick(1)])  # and then it is free
     assert read_log(path).drives == 2
-
-
-def test_it_stays_locked_after_a_rotation(path, quick):
-    with FlightLog(path, header=HEADER, max_bytes=2000, keep=1) as log:
-        for k in range(100):
-            log.tick(tick(k))
-        until(lambda: path.with_name("flight.log.1").exists())
-        with pytest.raises(RoverError, match="another drive"), FlightLog(path, header=HEADER, **LIMITS):
-            pytest.fail("it was let in")
 
 
 def test_the_log_is_synced_with_what_it_has(path, monkeypatch, quick):
@@ -153,15 +135,12 @@ def test_drives_are_appended_and_chosen(path):
         assert (flight.drives, flight.drive, flight.ticks["frame"].tolist()) == (3, drive % 3, [frame])
     with pytest.raises(RoverError, match="no drive 3"):
         read_log(path, 3)
-
-
-def test_a_services_log_has_a_drive_for_each_arming(path):
-    with FlightLog(path, header=HEADER, **LIMITS) as log:
-        for k in range(3):
+    with FlightLog(path, header=HEADER, **LIMITS) as log:  # a service's log has a drive for each arming
+        for k in (3, 4):
             log.event("not armed: no transmitter")
             log.event(module.ARMED)
             log.tick(tick(k))
-    assert [read_log(path, k).ticks["frame"].tolist() for k in range(3)] == [[0], [1], [2]]
+    assert [read_log(path, k).ticks["frame"].tolist() for k in range(5)] == [[k] for k in range(5)]
 
 
 # ---- damage
