@@ -1,8 +1,7 @@
 """Run the balloon world as a virtual car: a process with a camera to read and a serial port, which runs in real time.
 
 It is driven by the same code as the real car, onboard's Camera and ServoLink. The pulses on the pins of its Arduino
-move it; that Arduino is the real firmware in simavr, or a stand-in. The process imports neither torch nor LeRobot, so
-that it starts in a second and needs little memory.
+move it; that Arduino is the real firmware in simavr, or a stand-in. The process imports neither torch nor LeRobot.
 """
 
 import contextlib
@@ -37,7 +36,6 @@ from rover_lib.onboard.errors import TrainingError
 HOLD_S = 1.0
 STANDSTILL_S = 0.5  # if the machine stopped for longer than this, the world stopped too for the time beyond it
 NOISE = 3  # the noise's grey levels, 0 to 2; with noise, two frames of a car that stands still are never the same
-SHIFTS = 256  # by how many pixels the noise may be shifted, in both directions, so that one shift rarely comes again
 PIPE_BYTES = 1 << 20  # room for a whole frame
 NICE = 5  # the code that drives the car goes first; the camera may be late
 PRIORITY = 1  # of real-time scheduling, below that of the loop that drives the car
@@ -59,8 +57,8 @@ class FramePipe:
             os.mkfifo(self.path)
 
     @property
-    def read(self) -> bool:
-        """Whether somebody has it open for reading."""
+    def ready(self) -> bool:
+        """Whether somebody has it open for reading and has taken everything that was written."""
         if self._fd < 0:
             try:
                 self._fd = os.open(self.path, os.O_WRONLY | os.O_NONBLOCK)
@@ -74,18 +72,11 @@ class FramePipe:
         if any(events & select.POLLERR for _, events in poller.poll(0)):
             self.close()  # the reader has left; the next one starts with a new frame
             return False
-        return True
-
-    @property
-    def empty(self) -> bool:
-        """Whether the reader has taken everything that was written."""
-        if self._fd < 0:
-            return True
         return struct.unpack("i", fcntl.ioctl(self._fd, termios.FIONREAD, bytes(4)))[0] == 0
 
     def write(self, jpeg: bytes) -> bool:
-        """Write a frame of at most 1 MiB if a reader is there and has taken the previous one; return whether it did."""
-        if not self.read or not self.empty:
+        """Write a frame of at most 1 MiB if the reader is ready; return whether it was."""
+        if not self.ready:
             return False
         try:
             return os.write(self._fd, jpeg) == len(jpeg)
@@ -109,8 +100,8 @@ def jpeg_of(picture: bytes | np.ndarray) -> bytes:
 class CameraFeed:
     """A simulated camera: a thread that writes pictures into a FIFO at a fixed rate.
 
-    path: of the FIFO, which is made if it does not exist. pictures: JPEGs, or frames (h, w, 3) uint8 BGR. They are
-    shown in turn, then again from the first. written: how many frames so far.
+    path: of the FIFO, which is made if it does not exist. pictures: JPEGs, or frames (h, w, 3) uint8 BGR, shown in
+    turn, then again from the first. written: how many frames so far.
     """
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
@@ -128,7 +119,7 @@ class CameraFeed:
         self.close()
 
     def show(self, *pictures: bytes | np.ndarray) -> None:
-        """Show these pictures from the next frame on, and end freeze() and pause(). Without any, nothing is written."""
+        """Show these pictures from the next frame on, and end freeze() and pause()."""
         self._pictures = tuple(jpeg_of(picture) for picture in pictures)
         self._frozen = self._paused = False
 
@@ -141,7 +132,7 @@ class CameraFeed:
         self._paused = True
 
     def close(self) -> None:
-        """Unplug the camera: the reader comes to the end of the file. A new feed on the same path plugs it in again."""
+        """Unplug the camera; a new feed on the same path plugs it in again."""
         self._closing.set()
         self._thread.join()
         self._pipe.close()
@@ -158,23 +149,21 @@ class CameraFeed:
 
 
 class CarReport(NamedTuple):
-    """What a virtual car has done so far.
+    """What a virtual car has done.
 
-    trials, hits: how many worlds have ended, and how many of them with a hit. outcomes: (seed, outcome) of those
-    worlds, 'hit', 'left' or 'timeout'. frames: how many were written to the camera; dropped: how many were not, because
-    the reader was too slow; late: how many were left out, because this machine was too slow. seed, held, speed_mps: the
-    present world's seed, whether the car is held, and its speed.
+    outcomes: [seed, 'hit', 'left' or 'timeout'] of each world that has ended. late: how many pictures were left out,
+    because this machine was too slow. seed, held, speed_mps: of the present world, whether the car is held, its speed.
     """
 
-    hits: int
-    trials: int
-    outcomes: list[tuple[int, str]]
-    frames: int
-    dropped: int
+    outcomes: list[list[Any]]
     late: int
     seed: int
     held: bool
     speed_mps: float
+
+    @property
+    def hits(self) -> int:
+        return sum(outcome == "hit" for _, outcome in self.outcomes)
 
 
 class VirtualCar:
@@ -182,19 +171,16 @@ class VirtualCar:
 
     camera: the path of a FIFO of MJPEG, for a Camera. port: of its Arduino, for a ServoLink. pid: of the process.
 
-    The first world begins when the pins first ask for motion. A world ends when the car hits the balloon, passes it or
-    leaves the arena ('left'), or after 8 s. Then the car stands in the next world and is held there for hold_s, so that
-    it is let go with a plan for what it sees there. The process ends when this process ends, at most a frame later.
+    The first world begins when the pins first ask for motion. After each world the car stands in the next one and is
+    held there for hold_s, so that it is let go with a plan for what it sees. The process ends when this one does.
     """
 
     def __init__(self, *, seed: int = 10_000, board: str = STAND_IN, hold_s: float = HOLD_S):
         """Start the process.
 
         board: 'module:function' that makes the car's Arduino in that process, a context manager with a port and
-        pulses() as StandIn has. Raises TrainingError for a negative seed, or if the process does not start.
+        pulses() as StandIn has. Raises TrainingError if the process does not start, as with a negative seed.
         """
-        if seed < 0:
-            raise TrainingError("a car needs a seed from 0", found=seed)
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
         self._talking, self._answers = threading.Lock(), b""
@@ -215,25 +201,16 @@ class VirtualCar:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def check(self) -> None:
-        """Raise TrainingError if the process has ended. Costs almost nothing."""
-        self._process.check()
-
     def report(self) -> CarReport:
-        """Ask the process what the car has done so far, which takes up to a frame's time.
-
-        Raises TrainingError if the process has ended or hangs.
-        """
+        """Ask the process what the car has done, for up to a frame's time. Raises TrainingError if it has ended."""
         with self._talking:
             self._process.send_line("report")
-            found = self._answer(ANSWER_S)
-        outcomes = [(seed, outcome) for seed, outcome in found.pop("outcomes")]
-        return CarReport(outcomes=outcomes, **found)
+            return CarReport(**self._answer(ANSWER_S))
 
     def summary(self) -> dict[str, Any]:
         """Return what the report of a drive says about this car: hits, trials and camera_late. Raises as report()."""
         report = self.report()
-        return {"hits": report.hits, "trials": report.trials, "camera_late": report.late}
+        return {"hits": report.hits, "trials": len(report.outcomes), "camera_late": report.late}
 
     @staticmethod
     def shown(artifact: Path) -> Any:
@@ -251,8 +228,7 @@ class VirtualCar:
         deadline = time.monotonic() + within_s
         while b"\n" not in self._answers:
             if time.monotonic() > deadline:
-                remedy = "is it too busy here?"
-                raise TrainingError("the virtual car did not answer", found=f"{within_s:g} s", remedy=remedy)
+                raise TrainingError("the virtual car did not answer", remedy="is this machine too busy?")
             self._answers += self._process.read(0.1)
         line, _, self._answers = self._answers.partition(b"\n")
         return json.loads(line)
@@ -269,7 +245,7 @@ class _Car:
         self._action = dict(zip(("steering", "throttle"), NEUTRAL, strict=True))
         self._held_ticks = math.inf  # until the pins first ask for motion
         self.world = World(seed)
-        self.hits, self.outcomes = 0, list[tuple[int, str]]()
+        self.outcomes: list[list[Any]] = []
 
     def tick(self) -> None:
         """Drive for a frame's time by the newest pulses; the car stands where a reset has ended them."""
@@ -279,44 +255,25 @@ class _Car:
             elif event.kind == "pulse":
                 # By the nominal period: the first pulse after a reset has none, and a servo only measures the pulse.
                 self._action[event.pin] = self._pwm.channel(event.pin).action(event.pulse_us) or 0.0
-                if (
-                    self._held_ticks == math.inf
-                    and event.pin == "throttle"
-                    and self._pwm.throttle.moves(event.pulse_us)
-                ):
+                waits = self._held_ticks == math.inf and event.pin == "throttle"
+                if waits and self._pwm.throttle.moves(event.pulse_us):
                     self._held_ticks = 0
         if self._held_ticks > 0:
             self._held_ticks -= 1
             return
         self.world.step(self._action["steering"], self._action["throttle"])
         if self.world.done:
-            self.hits += self.world.hit
-            self.outcomes.append((self.world.seed, str(self.world.outcome)))
+            self.outcomes.append([self.world.seed, self.world.outcome])
             self.world, self._held_ticks = World(self.world.seed + 1), self._hold_ticks
 
-    def report(self, **counts: int) -> str:
-        """Return a CarReport as JSON. counts: of the camera's frames."""
-        speed_mps, held, trials = self.world.state.speed_mps, self._held_ticks > 0, len(self.outcomes)
-        done = {"hits": self.hits, "trials": trials, "outcomes": self.outcomes, "seed": self.world.seed}
-        return json.dumps({**done, **counts, "held": held, "speed_mps": speed_mps})
-
-
-class _Sensor:
-    """The noise of a camera's sensor. Each frame gets a crop of one larger picture of noise, which is cheap."""
-
-    def __init__(self) -> None:
-        self._rng = np.random.default_rng()
-        self._noise = self._rng.integers(0, NOISE, (FRAME_HEIGHT + SHIFTS, FRAME_WIDTH + SHIFTS, 3), np.uint8)
-
-    def see(self, frame: np.ndarray) -> np.ndarray:
-        row, column = self._rng.integers(0, SHIFTS, 2)
-        return cv2.add(frame, self._noise[row : row + FRAME_HEIGHT, column : column + FRAME_WIDTH])
+    def report(self, late: int) -> CarReport:
+        speed_mps = self.world.state.speed_mps
+        return CarReport(self.outcomes, late, self.world.seed, self._held_ticks > 0, speed_mps)
 
 
 def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
     """Move the car and write frames at absolute deadlines, until the parent closes standard input or has ended."""
-    frames = dropped = late = 0
-    sensor, due = _Sensor(), time.monotonic()
+    late, rng, due = 0, np.random.default_rng(), time.monotonic()
     # Standard input alone does not tell that the parent has ended: another child of it may hold the other end open.
     while os.getppid() == parent:
         while select.select([0], [], [], max(0.0, due - time.monotonic()))[0]:
@@ -324,14 +281,11 @@ def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
             if not asked:
                 return
             for _ in range(asked.count(b"\n")):
-                print(car.report(frames=frames, dropped=dropped, late=late), flush=True)
+                print(json.dumps(car.report(late)._asdict()), flush=True)
         car.tick()
-        if pipe.read:
-            # Do not draw what nobody would see.
-            if pipe.empty and pipe.write(jpeg_of(sensor.see(car.world.render()))):
-                frames += 1
-            else:
-                dropped += 1
+        if pipe.ready:  # what nobody would see is not drawn
+            noise = rng.integers(0, NOISE, (FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
+            pipe.write(jpeg_of(cv2.add(car.world.render(), noise)))
         due = max(due + 1 / RATE_HZ, time.monotonic() - STANDSTILL_S)
         while due < time.monotonic():
             car.tick()

@@ -44,13 +44,7 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended yet."""
         return self.process.poll() is None
-
-    def check(self) -> None:
-        """Raise the error of ended() if the process is not running. Costs almost nothing."""
-        if not self.running:
-            raise self.ended()
 
     def wait(self, within_s: float) -> int | None:
         """Wait for the end; return the exit code, or None if the process has not ended within that time."""
@@ -93,16 +87,12 @@ class Child:
         size = os.fstat(self._errors.fileno()).st_size
         return os.pread(self._errors.fileno(), size, 0).decode(errors="replace").splitlines()
 
-    def last_words(self) -> str:
-        """Return the last of these lines, joined to one."""
-        return last_words("\n".join(self.errors()))
-
     def ended(self) -> RoverError:
         """Return the error that says how the process ended. Waits up to 5 s for that, if it is just about to."""
         if self._errors.closed:
             return self._error(f"{self.name} was closed", remedy="make a new one")
-        code = self.wait(STOP_S)
-        return self._error(f"{self.name} has ended (exit status {code}): {self.last_words()}", remedy="start a new one")
+        code, words = self.wait(STOP_S), last_words("\n".join(self.errors()))
+        return self._error(f"{self.name} has ended (exit status {code}): {words}", remedy="start a new one")
 
     def close(self) -> None:
         """End the process, with SIGKILL if it does not end within 5 s. Raises nothing, and may be called again."""

@@ -11,6 +11,15 @@ from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
 
 
+def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str, Any]:
+    """Execute a notebook for a run, and return the stage that it has left."""
+    from rover_lib.onboard.stage import read_stage
+    from rover_lib.workshop.run.run import execute
+
+    execute(notebook, run_dir, **given)
+    return read_stage(run_dir / f"{stage}.json", stage)
+
+
 @click.group(short_help="The balloon world: record, train, drive.")
 def world() -> None:
     """The balloon world: record an expert, train a policy, drive it."""
@@ -53,11 +62,8 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     Leaves drive.json and the executed notebook 07 in RUN_DIR, and says whether the gate of params.yml holds.
     """
     from balloon_world.latency import table
-    from rover_lib.onboard.stage import read_stage
-    from rover_lib.workshop.run.run import execute
 
-    execute("07_drive", run_dir, worlds=worlds)
-    content = read_stage(run_dir / "drive.json", "drive")
+    content = executed("07_drive", run_dir, "drive", worlds=worlds)
     click.echo(json.dumps(content, indent=2) if as_json else table(content))
 
 
@@ -73,23 +79,22 @@ def world_latency(run_dir: Path, worlds: int, as_json: bool) -> None:
     help="Worlds to drive in; 0 for a real car's policy.",
 )
 @AS_JSON
-def students(teacher_run: Path, student_runs: tuple[Path, ...], as_json: bool, **options: Any) -> None:
+def students(
+    teacher_run: Path, student_runs: tuple[Path, ...], episodes: Path | None, worlds: int, as_json: bool
+) -> None:
     """Judge the students that `rover distill` left in STUDENT_RUNS beside the teacher in TEACHER_RUN.
 
     All policies drive through the same worlds: left alone, and pushed with plans that are as late as was computed for
     the policy. Leaves students.json and the executed notebook 08 in TEACHER_RUN, and says which student may take its
     teacher's place. If it is ended at any moment, the same command continues where it was.
     """
-    from balloon_world.students import judge_students, sentences, table
-    from rover_lib.workshop.run.run import execute
+    from balloon_world.students import table
 
-    content = judge_students(teacher_run, student_runs, progress=terminal_bar(), **options)
-    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": options["worlds"]}
-    episodes = str(options["episodes"].resolve()) if options["episodes"] else ""
-    execute("08_distill", teacher_run, **given, episodes=episodes)
-    if as_json:
-        return click.echo(json.dumps(content, indent=2))
-    click.echo("\n".join([str(table(content["metrics"])), "", *sentences(content["metrics"])]))
+    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": worlds}
+    content = executed(
+        "08_distill", teacher_run, "students", **given, episodes=str(episodes.resolve()) if episodes else ""
+    )
+    click.echo(json.dumps(content, indent=2) if as_json else table(content["metrics"]))
 
 
 @world.command(short_help="Drive, correct, learn: does it drive better?")
@@ -114,12 +119,9 @@ def learn(run_dir: Path, out: Path | None, worlds: int, as_json: bool, **options
     it was; with more --worlds, it drives only in those that are missing.
     """
     from balloon_world.learn import Experiment, run_experiment, table
-    from rover_lib.workshop.run.run import execute
 
     run_dir = run_dir.resolve()
     experiment = Experiment(worlds=worlds, other_worlds=max(1, worlds // 2), **options)
-    content = run_experiment(run_dir, out or run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal_bar())
-    execute("09_learn", run_dir)
-    if as_json:
-        return click.echo(json.dumps(content, indent=2))
-    click.echo("\n".join([str(table(content)), "", *content["metrics"]["said"]]))
+    run_experiment(run_dir, out or run_dir.with_name(f"{run_dir.name}-learn"), experiment, terminal_bar())
+    content = executed("09_learn", run_dir, "learn")
+    click.echo(json.dumps(content, indent=2) if as_json else table(content))

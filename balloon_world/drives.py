@@ -14,14 +14,13 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from balloon_world.trial import Trajectory, wilson_interval
-from balloon_world.world import RATE_HZ, CarState, World
+from balloon_world.trial import Driven, Trajectory, wilson_interval
+from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
@@ -31,7 +30,6 @@ from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import plain
 from rover_lib.workshop.progress import Progress, silent
 
-LATENCY_MOST_S = 5.0
 ROUNDING = 1e-6  # how far times may be rounded, in ticks
 SEED = 10_000  # of the first world that judges a policy
 
@@ -53,9 +51,9 @@ class NoLog:
 
 
 class TimedCar:
-    """A world, and the loop's camera, planner, clock and sleep in it. Only sleep() moves the time on.
+    """A world, and the loop's camera, planner, clock and sleep in it: only sleep() moves the time on.
 
-    Frames come at the ticks. The car is held until the first plan is there, like the car of `rover drive --world`.
+    The car is held until the first plan is there, like the car of `rover drive --world`.
     """
 
     wanted_hz = RATE_HZ
@@ -63,10 +61,10 @@ class TimedCar:
     def __init__(self, world: World, policy: Any, latency_s: float):
         self.world, self.policy, self.stop = world, policy, threading.Event()
         self.command: Order | None = None
-        self.plans: list[tuple[Plan, CarState]] = []
+        self.plans: list[Plan] = []
         self._latency_s, self._commanded = latency_s, Commanded()
         self._tick, self._looked_at = 0, -1  # the present tick, and the tick of the last frame that was planned from
-        self._coming: tuple[Plan, CarState] | None = None
+        self._coming: Plan | None = None
         self._think(ROUNDING)
 
     def drive(self, settings: Settings, log: NoLog, watch: Watch | None = None) -> tuple[list[Order], str]:
@@ -99,10 +97,10 @@ class TimedCar:
 
     @property
     def asking_s(self) -> float:
-        return self.clock() - (self._coming[0].ready_s - self._latency_s) if self._coming else 0.0
+        return self.clock() - (self._coming.ready_s - self._latency_s) if self._coming else 0.0
 
     def newest(self) -> Plan | None:
-        return self.plans[-1][0] if self.plans else None
+        return self.plans[-1] if self.plans else None
 
     def wait(self, timeout_s: float) -> Plan | None:
         while not self.plans:
@@ -114,18 +112,16 @@ class TimedCar:
         now_s = self.clock()
         while True:
             if self._coming:
-                plan = self._coming[0]
-                if plan.ready_s * RATE_HZ > until_tick:
+                if self._coming.ready_s * RATE_HZ > until_tick:
                     return
                 self.plans.append(self._coming)
-                now_s, self._coming = max(now_s, plan.ready_s), None
+                now_s, self._coming = max(now_s, self._coming.ready_s), None
             if self._looked_at == self._tick:
                 return  # the planner waits for another frame
             self._looked_at = self._tick
             state = self._commanded.state(self.clock(), self.policy.rate_hz)
             actions = self.policy.predict_unclipped(self.world.render(), state)
-            plan = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
-            self._coming = plan, self.world.state
+            self._coming = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
 
 
 class WorldPilot(PolicyPilot):
@@ -145,34 +141,19 @@ class WorldPilot(PolicyPilot):
             self._car.stop.set()  # the drive ends after this tick
 
 
-@dataclass(frozen=True)
-class Driven:
-    """A drive through a world.
-
-    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by, or 'taken over'. trajectory: one
-    point per tick. orders: what was commanded at each tick. plans: each with the car's state when its frame was taken.
-    """
-
-    outcome: str
-    duration_s: float
-    trajectory: Trajectory
-    orders: list[Order]
-    plans: list[tuple[Plan, CarState]]
-
-
 def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, watch: Watch | None = None) -> Driven:
     """Drive through a world until it has ended.
 
     policy: an artifact's Policy, or anything else with `rate_hz` and `predict_unclipped`. latency_s: from taking the
-    newest frame to having its plan; with 0 the plan is there within the same tick. watch: called with every order when
-    it is sent, before the car moves by it; if it returns true, somebody takes over and the drive ends after that tick.
-    Raises PolicyError for a plan that no car may be driven by, and TrainingError for a latency that cannot be.
+    newest frame to having its plan; with 0 the plan is there within the same tick. watch: called with every order
+    before the car moves by it; if it returns true, somebody takes over and the drive ends after that tick.
+    Raises PolicyError for a plan that no car may be driven by, and TrainingError for a latency below 0.
     """
-    if not 0 <= latency_s <= LATENCY_MOST_S:
-        raise TrainingError(f"a latency must be 0 to {LATENCY_MOST_S:g} s", found=latency_s)
+    if latency_s < 0:
+        raise TrainingError("a latency must be at least 0 s", found=latency_s)
     car = TimedCar(world, policy, latency_s)
     orders, outcome = car.drive(settings, NoLog(), watch)
-    return Driven(outcome, world.state.time_s, Trajectory.of(world), orders, car.plans)
+    return Driven(outcome, world.state.time_s, Trajectory.of(world), orders)
 
 
 # --- many drives ------------------------------------------------------------------------------------------------------
@@ -201,7 +182,7 @@ def everywhere(artifact: Path, asked: Sequence[K], do: Callable[[Policy, K], V])
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Read the rows of a file. A line that is torn, because a process was killed, is left out."""
+    """Read the rows of a file, less what a process that was killed has left of one."""
     rows = []
     for line in path.read_text().splitlines() if path.is_file() else ():
         with suppress(ValueError):
@@ -224,10 +205,9 @@ def drive_missing(
     progress: Progress = silent,
     desc: str = "driving",
 ) -> dict[tuple[str, int], dict[str, Any]]:
-    """Return a row for each (how, seed) that is asked for.
+    """Return a row for each (how, seed) that is asked for. one: makes the drive, and returns what its row says of it.
 
-    Rows that are in the file are not driven again, and each new one is there as soon as its drive has ended. one: makes
-    the drive, and returns what its row says of it.
+    Rows that are in the file are not driven again, and each new one is there as soon as its drive has ended.
     """
     kept = {(row["how"], row["seed"]): row for row in read_rows(path)}
     missing = [each for each in asked if each not in kept]
@@ -248,17 +228,12 @@ def count_hits(outcomes: Mapping[int, str], key: str = "wilson") -> dict[str, An
 
 
 def sign_test(only_one: int, only_other: int) -> float:
-    """Return p: how likely chance alone divides the worlds that only one of two policies hits at least as unevenly.
-
-    This is the exact two-sided sign test on discordant pairs (McNemar's exact test); p is 1 if there are none.
-    """
+    """Return the exact two-sided sign test's p of worlds that only one of two policies hits (McNemar's exact test)."""
     n, fewer = only_one + only_other, min(only_one, only_other)
     return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
 
 
 def pair_worlds(missed: Sequence[int], others_missed: Sequence[int]) -> tuple[int, int, float]:
-    """Compare two policies in the same worlds: how many only the one hit, how many only the other, and the sign test's
-    p. missed: the seeds that each did not hit.
-    """
+    """Return how many worlds only the one policy hit, how many only the other, and the sign test's p. missed: seeds."""
     only, only_other = len({*others_missed} - {*missed}), len({*missed} - {*others_missed})
     return only, only_other, sign_test(only, only_other)

@@ -34,10 +34,9 @@ def measure_latencies(
 ) -> dict[str, Any]:
     """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
 
-    It drives at each of latencies_ms with and without compensation, other settings being those of params.yml's section
-    `drive`; at each of pushed_latencies_ms the same way, with `pushes` pushes in each world; and at the first latency
-    with LeRobot's temporal ensembling.
-    A drive.json that was made of the same policy and parameters is read, not made again.
+    It drives at each of latencies_ms with and without compensation; at each of pushed_latencies_ms the same way, with
+    `pushes` pushes in each world; and at the first latency with LeRobot's temporal ensembling. A drive.json that was
+    made of the same policy and parameters is read, not made again.
     Raises TrainingError if there is no policy, no world or no latency.
     """
     run_dir, p = Path(run_dir), params()
@@ -47,15 +46,8 @@ def measure_latencies(
     if not latencies_ms or worlds < 1:
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     limit = p["gates"]["hits_lost_at_150_ms"]
-    given = {
-        "worlds": worlds,
-        "seed": SEED,
-        "latencies_ms": latencies_ms,
-        "pushes": pushes,
-        "pushed_latencies_ms": pushed_latencies_ms,
-        "drive": p["drive"],
-        "hits_lost_at_150_ms": limit,
-    }
+    given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
+    given |= {"pushed_latencies_ms": pushed_latencies_ms, "hits_lost_at_150_ms": limit}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     if there := find_stage(path, "drive", params=given, inputs=inputs):
         return there
@@ -65,21 +57,17 @@ def measure_latencies(
         if ms:  # a plan that takes no time leaves nothing to compensate
             hows.append((ms, count, replace(settings, compensate=False)))
     hows.append((latencies_ms[0], 0, replace(settings, ensemble=ENSEMBLE)))
-    drives = drive_all(artifact, hows, worlds, progress)
     first: dict[int, list[Driven]] = {}  # for each number of pushes, the drives at its first latency, compensated
     rows = []
-    for how, driven in zip(hows, drives, strict=True):
+    for how, driven in zip(hows, _drive_all(artifact, hows, worlds, progress), strict=True):
         base = first.setdefault(how[1], driven)
         aside_cm = [1e2 * beside_path(d, b) for d, b in zip(driven, base, strict=True)]
         rows.append(_row(how, driven) | {f"aside_p{q}_cm": float(np.percentile(aside_cm, q)) for q in (50, 90)})
-    metrics = {
-        "rows": rows,
-        "gates": gates(rows, limit),
-    }
+    metrics = {"rows": rows, "gates": gates(rows, limit)}
     return write_stage(path, "drive", params=given, metrics=metrics, inputs=inputs)
 
 
-def drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progress = silent) -> list[list[Driven]]:
+def _drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progress) -> list[list[Driven]]:
     """Drive through the same worlds in each way; return the drives of each."""
 
     def one(policy: Any, asked: tuple[int, int]) -> Driven:
@@ -94,25 +82,17 @@ def drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progre
 def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
     """Return a row of drive.json, less how far the car was beside its path."""
     latency_ms, pushes, settings = how
-    ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
+    row: dict[str, Any] = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
+    row |= {"compensate": settings.compensate, "ensemble": settings.ensemble}
     outcomes = [d.outcome for d in driven]
+    row |= count_hits(dict(enumerate(outcomes)), "hits_wilson")
+    del row["missed"]
+    row |= {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
+    ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
+    for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
+        row[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
     times_s = [d.duration_s for d in driven if d.outcome == "hit"]
-    counted = count_hits(dict(enumerate(outcomes)), "hits_wilson")
-    del counted["missed"]
-    ages = {
-        f"plan_age_{name}_ms": round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
-        for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100))
-    }
-    return {
-        "latency_ms": round(float(latency_ms), 3),
-        "pushes": pushes,
-        "compensate": settings.compensate,
-        "ensemble": settings.ensemble,
-        **counted,
-        **{outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")},
-        **ages,
-        "time_to_hit_p50_s": float(np.median(times_s)) if times_s else None,
-    }
+    return row | {"time_to_hit_p50_s": float(np.median(times_s)) if times_s else None}
 
 
 def beside_path(drive: Driven, other: Driven) -> float:
@@ -122,10 +102,7 @@ def beside_path(drive: Driven, other: Driven) -> float:
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:
-    """Judge what params.yml promises for late plans: how many hits are lost at 150 ms, compensated, compared with 0 ms.
-
-    rows: of drive.json.
-    """
+    """Judge how many hits are lost at 150 ms, compensated, compared with 0 ms. rows: of drive.json."""
     hits = {r["latency_ms"]: r["hits"] for r in rows if r["compensate"] and not r["pushes"] and r["ensemble"] is None}
     lost = hits[0.0] - hits[JUDGED_MS] if {0.0, JUDGED_MS} <= set(hits) else None
     return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
@@ -142,7 +119,6 @@ def table(content: Mapping[str, Any]) -> Table:
         hits = f"{r['hits']} of {r['trials']}"
         rows.append((", ".join(how), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
     verdict = {True: "pass", False: "FAIL", None: "not measured"}
-    notes = [
-        f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}" for g in content["metrics"]["gates"]
-    ]
+    gates = content["metrics"]["gates"]
+    notes = [f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}" for g in gates]
     return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows, notes=notes)

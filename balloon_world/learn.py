@@ -13,21 +13,10 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import product
 from pathlib import Path
 from typing import Any
 
-from balloon_world.drives import (
-    SEED,
-    Driven,
-    Watch,
-    append_row,
-    count_hits,
-    drive_in,
-    drive_missing,
-    pair_worlds,
-    read_rows,
-)
+from balloon_world.drives import SEED, append_row, count_hits, drive_in, drive_missing, pair_worlds, read_rows
 from balloon_world.record import WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
@@ -38,7 +27,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
-from rover_lib.onboard.stage import find_stage, plain, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import find_stage, plain, sha256_of, write_stage
 from rover_lib.workshop.cache import car_in_key, key_of
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.notebook_table import Table
@@ -55,55 +44,46 @@ FIRST_DEMONSTRATED = 3_000_000
 FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # invented, so that a seed's recording always has the same bytes
 BETWEEN_DRIVES = timedelta(seconds=30)
 GATED_WORLDS = 40
+OFF, REACTS_S = 0.25, 0.4  # a share of full steering; when the human takes over
 CHANCE = 0.05  # a difference counts if its sign test's p is below this
 HALF_A_TICK_S = 0.5 / RATE_HZ
 JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
 HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
-NOTHING = "Nothing is here yet: `rover world learn runs/demo` drives, corrects and learns."
 DRIVES_FILE = "drives.jsonl"
 
 
-@dataclass(frozen=True)
-class Human:
-    """Somebody beside the track, who takes over once the car has steered differently from how they would for some time.
+def human_beside(world: World) -> Callable[[Order], bool]:
+    """Return a function to call with each tick's order in that world, which returns true when the human takes over.
 
-    off: by how much it must differ, as a share of full steering. for_s: for how long without a break, which includes
-    the time that they need to react.
+    That is once the car has steered by OFF differently from how they would for REACTS_S without a break.
     """
+    ticks = 0
 
-    off: float = 0.25
-    for_s: float = 0.4
+    def takes_over(order: Order) -> bool:
+        nonlocal ticks
+        ticks = ticks + 1 if abs(expert(world)[0] - order.steering) > OFF else 0
+        return ticks >= REACTS_S * RATE_HZ
 
-    def watching(self, world: World) -> Callable[[Order], bool]:
-        """Return a function to call with each tick's order in that world; it returns true when the human takes over."""
-        ticks = 0
-
-        def takes_over(order: Order) -> bool:
-            nonlocal ticks
-            ticks = ticks + 1 if abs(expert(world)[0] - order.steering) > self.off else 0
-            return ticks >= self.for_s * RATE_HZ
-
-        return takes_over
+    return takes_over
 
 
 def drive_corrected(policy: Policy, folder: Path, index: int, world: World, experiment: "Experiment") -> dict[str, Any]:
     """Record drive number `index`: the policy drives until the human would take over, then the expert, to the end.
 
-    Returns {"outcome": of the whole drive, "taken_over_s": None if nobody had to, "human_s": for how long they drove}.
+    Returns {"outcome", "taken_over_s": None if nobody had to, "human_s": for how long they drove}.
     """
-    takes_over = experiment.human.watching(world)
+    takes_over = human_beside(world)
     with WorldEpisode(folder, _start(index), world) as episode:
 
         def watch(order: Order) -> bool:
             episode.tick(order.steering, order.throttle, driver=POLICY)
             return takes_over(order)
 
-        driven = experiment.drive(policy, world, watch)
-        taken_over_s = world.state.time_s if driven.outcome == "taken over" else None
-        if taken_over_s is None:
-            return {"outcome": driven.outcome, "taken_over_s": None, "human_s": 0.0}
+        if (outcome := experiment.drive(policy, world, watch)) != "taken over":
+            return {"outcome": outcome, "taken_over_s": None, "human_s": 0.0}
+        taken_over_s = world.state.time_s
         while not world.done:
             world.step(*episode.tick(*expert(world), driver=HUMAN))
         human_s = world.state.time_s - taken_over_s
@@ -123,10 +103,8 @@ class Experiment:
     """How much is driven, learned and judged.
 
     rounds, drives: the number of rounds, and of drives in each. worlds: how many judge a policy that is pushed;
-    other_worlds: how many judge it left alone, and how many with decoys. The first of all these are notebook 07's.
-    pushes, decoys: in a world; of the worlds to learn in, all have the pushes and every second one the decoys too.
-    samples: how many frames of each round, and of the first recordings, are learned from at most. steps: of learning;
-    the recipe's if None.
+    other_worlds: left alone, and with decoys. pushes, decoys: in a world; every second world to learn in has decoys.
+    samples: frames of each round, and of the first recordings, at most. steps: of learning; the recipe's if None.
     """
 
     rounds: int = 3
@@ -136,12 +114,11 @@ class Experiment:
     latency_ms: float = 300.0
     pushes: int = 4
     decoys: int = 1
-    human: Human = Human()
     samples: int = 700
     steps: int | None = None
 
-    def drive(self, policy: Policy, world: World, watch: Watch | None = None) -> Driven:
-        return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch)
+    def drive(self, policy: Policy, world: World, watch: Callable[[Order], bool] | None = None) -> str:
+        return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch).outcome
 
     def learned_in(self, number: int, seed: int) -> World:
         """Return the world of a round's drive by its number."""
@@ -154,16 +131,14 @@ class Experiment:
 
 
 def run_experiment(
-    run_dir: Path | str, out_dir: Path | str, experiment: Experiment | None = None, progress: Progress = silent
+    run_dir: Path | str, out_dir: Path | str, experiment: Experiment, progress: Progress = silent
 ) -> dict[str, Any]:
     """Run both arms, round by round; write and return learn.json in the run's folder, stage 'learn'.
 
-    run_dir: has best_model.pth, episodes/ and policy_static.pt, as `make demo` leaves them. out_dir: keeps what is
-    recorded, learned and driven on the way, by experiment; after an end at any moment, the same call goes on from
-    there. A learn.json that was made from the same files and parameters is read, not made again.
-    Raises TrainingError if the run lacks a file.
+    run_dir: as `make demo` leaves it. out_dir: keeps what is recorded, learned and driven on the way, by experiment;
+    after an end at any moment, the same call goes on from there. A learn.json that was made from the same files and
+    parameters is read, not made again. Raises TrainingError if the run lacks a file.
     """
-    experiment = experiment or Experiment()
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
     path = run_dir / "learn.json"
     for name in (CHECKPOINT, EPISODES, ARTIFACT):
@@ -178,23 +153,18 @@ def run_experiment(
     lab = _Lab(experiment, run_dir, out_dir / key_of({"params": learned, "inputs": inputs}), progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
     rows = lab.judge(rounds)
-    content = {"rounds": rounds, "policies": rows, "pairs": _pairs(rows)}
-    metrics = content | {"gates": gates(rows), "said": sentences(content)}
+    metrics = {"rounds": rounds, "policies": rows, "gates": gates(rows)}
     return write_stage(path, "learn", params=given, metrics=metrics, inputs=inputs)
 
 
-def read_experiment(run_dir: Path | str) -> dict[str, Any] | None:
-    """Read what `run_experiment` left in a run's folder; None if there is nothing."""
-    path = Path(run_dir) / "learn.json"
-    return read_stage(path, "learn") if path.is_file() else None
-
-
+@dataclass(frozen=True)
 class _Lab:
     """An experiment in its folder: <arm>-<round>/ has episodes and drives.jsonl, learned/<arm>-<round>/ a policy."""
 
-    def __init__(self, experiment: Experiment, run_dir: Path, folder: Path, progress: Progress):
-        self.experiment, self.run_dir = experiment, run_dir
-        self.folder, self.progress = folder, progress
+    experiment: Experiment
+    run_dir: Path
+    folder: Path
+    progress: Progress
 
     def _learned(self, arm: str, number: int) -> Path:
         return self.folder / "learned" / _name(arm, number) / ARTIFACT
@@ -205,20 +175,15 @@ class _Lab:
         drives = self._drive(before, number)
         human_s = sum(d["human_s"] for d in drives)
         if not human_s and number == 1:
-            what, remedy = "nobody had to take over: nothing to learn from", "drive more, later, or with more pushes"
-            raise TrainingError(what, found=f"{len(drives)} drives", remedy=remedy)
+            raise TrainingError("nobody had to take over", found=f"{len(drives)} drives", remedy="drive more")
         self._demonstrate(number, human_s)
         for arm in ARMS:
             if not self._learned(arm, number).is_file():
                 recorded = [self.folder / _name(arm, n) for n in range(1, number + 1)]
                 self._learn(arm, number, [folder for folder in recorded if any(folder.glob("episode_*"))])
-        return {
-            "round": number,
-            "human_s": human_s,
-            "takeovers": sum(d["taken_over_s"] is not None for d in drives),
-            "drives": len(drives),
-            "missed": sum(d["outcome"] != "hit" for d in drives),
-        }
+        counts = {"takeovers": sum(d["taken_over_s"] is not None for d in drives), "drives": len(drives)}
+        counts["missed"] = sum(d["outcome"] != "hit" for d in drives)
+        return {"round": number, "human_s": human_s, **counts}
 
     def _learn(self, arm: str, number: int, recorded: Sequence[Path]) -> None:
         """Train the first checkpoint further on these recordings too, and make the artifact."""
@@ -231,7 +196,7 @@ class _Lab:
         make_artifact(learned, target, pipeline.Recipe.of(params()), progress=self.progress)
 
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
-        """Return a round's drives with a human beside the track, and first record those that are missing."""
+        """Record a round's missing drives with a human beside the track, and return the rows of all."""
         folder, first = self.folder / _name(CORRECTED, number), 1000 * number
         _remove_unfinished(folder)
 
@@ -258,17 +223,13 @@ class _Lab:
             left_s -= done[seed]
 
     def judge(self, rounds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Drive every policy through the worlds that judge, and return the rows of learn.json.
-
-        A policy's file keeps its drives, so that only those that are missing are driven.
-        """
-
+        """Drive every policy through the worlds that judge, as far as missing, and return the rows of learn.json."""
         experiment = self.experiment
 
         def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
             how, seed = asked
             world = World(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
-            return {"outcome": experiment.drive(policy, world).outcome}
+            return {"outcome": experiment.drive(policy, world)}
 
         counts = {how: experiment.worlds if how == PUSHED else experiment.other_worlds for how in HOW}
         asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
@@ -308,72 +269,36 @@ def _start(index: int) -> datetime:
 # --- the results ------------------------------------------------------------------------------------------------------
 
 
-def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare each learned policy with the first, and each corrected one with the demonstrated one of its round."""
-    pairs, by_name = [], {row["name"]: row for row in rows}
-    for row in rows[1:]:
-        others = [BEFORE] if row["arm"] == DEMONSTRATED else [BEFORE, _name(DEMONSTRATED, row["round"])]
-        for other, how in product(others, HOW):
-            only, only_other, p = pair_worlds(row[how]["missed"], by_name[other][how]["missed"])
-            hits = {"only_hits": only, "only_other_hits": only_other, "sign_test_p": p}
-            pairs.append({"name": row["name"], "other": other, "how": how, **hits})
-    return pairs
-
-
 def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Judge the last round by what was promised: hits in notebook 07's 40 worlds, and a sign test in all worlds.
-
-    rows: of learn.json. Hits are judged only if all of those 40 worlds were driven.
-    """
+    """Judge the last round by hits in notebook 07's 40 worlds, if all were driven, and by a sign test in all worlds."""
     last, other = ([row for row in rows if row["arm"] == arm][-1] for arm in ARMS)
     hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
     lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]
     _, _, p = pair_worlds(last[PUSHED]["missed"], other[PUSHED]["missed"])
     by_chance = p if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
+    least = params()["gates"]["corrected_hits"]
     return [
-        gate(f"hits of {GATED_WORLDS} when pushed, corrected", hits[PUSHED], ">=", params()["gates"]["corrected_hits"]),
+        gate(f"hits of {GATED_WORLDS} when pushed, corrected", hits[PUSHED], ">=", least),
         gate(f"hits of {GATED_WORLDS} lost when left alone", lost, "<=", 0),
         gate("chance that demonstrations do as well when pushed, by a sign test", by_chance, "<=", CHANCE),
     ]
 
 
-def sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Say in plain English what the experiment showed, whatever it was. metrics: of learn.json."""
-    rows = {row["name"]: row for row in metrics["policies"]}
-    last = max(row["round"] for row in rows.values())
-    name = _name(CORRECTED, last)
-    lines = [f"{last} rounds cost {rows[name]['human_s']:.0f} human seconds, as many for the other arm."]
-    for pair in (pair for pair in metrics["pairs"] if pair["name"] == name):
-        how, other = pair["how"], pair["other"]
-        own, others = rows[name][how], rows[other][how]["hits"]
-        told = "better" if own["hits"] > others else "worse"
-        told = told if pair["sign_test_p"] < CHANCE else "neither better nor worse, within chance,"
-        lines.append(
-            f"{HOW[how].capitalize()}, the corrected policy is {told} than {other}: {own['hits']} of {own['trials']} "
-            f"worlds, not {others}; {pair['only_hits']} only it hit, {pair['only_other_hits']} only the other "
-            f"(sign test, p = {pair['sign_test_p']:.2g})."
-        )
-    return lines
-
-
-def table(content: Mapping[str, Any] | None) -> Table:
-    """Show the policies of learn.json as a table; None gives an empty one with a sentence that says what to do."""
+def table(content: Mapping[str, Any]) -> Table:
+    """Show the policies of learn.json as a table."""
     rows = []
-    for row in content["metrics"]["policies"] if content else ():
+    for row in content["metrics"]["policies"]:
         counted = [row[how] for how in HOW]
         hits = [f"{c['hits']} of {c['trials']} ({c['wilson_low']:.0%} to {c['wilson_high']:.0%})" for c in counted]
         name = row["name"] if row["arm"] == BEFORE else f"{row['arm']}, round {row['round']}"
         rows.append((name, f"{row['human_s']:.0f}", *hits))
-    return Table(
-        ("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval" if content else NOTHING]
-    )
+    return Table(("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval"])
 
 
-def rounds_table(content: Mapping[str, Any] | None) -> Table:
-    """Show what each round cost as a table; None gives an empty one with a sentence that says what to do."""
+def rounds_table(content: Mapping[str, Any]) -> Table:
+    """Show what each round cost as a table."""
     rows = []
-    for r in content["metrics"]["rounds"] if content else ():
+    for r in content["metrics"]["rounds"]:
         takeovers = f"{r['takeovers']} of {r['drives']}"
         rows.append((str(r["round"]), takeovers, f"{r['human_s']:.1f}", str(r["missed"])))
-    header = ("round", "drives with a takeover", "human s", "missed all the same")
-    return Table(header, rows, notes=() if content else (NOTHING,))
+    return Table(("round", "drives with a takeover", "human s", "missed all the same"), rows)

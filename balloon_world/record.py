@@ -39,21 +39,21 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
 
     out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is.
     Returns out_dir. On one machine the same count and seed give the same bytes.
-    Raises TrainingError for a count below 1, a negative seed, or an out_dir with something else in it.
+    Raises TrainingError for a negative seed, or an out_dir with something else in it.
     """
     out_dir = Path(out_dir)
-    if count < 1 or seed < 0:
-        raise TrainingError("a recording needs at least 1 episode and a seed from 0", found=f"{count} and {seed}")
     made_of = {"count": count, "seed": seed, "shoves": SHOVES, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
     made_of["car"] = this_car().description()
     key = key_of(made_of, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         if _marker_of(out_dir) == key:
             return out_dir
-        remedy = "name another folder, or move it away first"
-        raise TrainingError(f"{out_dir}: exists and is not this recording", remedy=remedy)
-    with build_folder(out_dir) as new:
-        _record_all(new, count, seed, key, progress)
+        raise TrainingError(f"{out_dir}: exists and is not this recording", remedy="name another folder")
+    # OpenCV releases the interpreter's lock while it draws and compresses, so threads help.
+    with build_folder(out_dir) as new, ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
+        drives = pool.map(lambda index: record_drive(new, index, seed), range(count))
+        hits = sum(progress(drives, desc="recording", total=count))
+        (new / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
         if out_dir.exists():
             out_dir.rmdir()  # empty, and the recording takes its place whole
     return out_dir
@@ -64,14 +64,6 @@ def _marker_of(folder: Path) -> str | None:
         return json.loads((folder / MARKER).read_text()).get("key")
     except (OSError, ValueError, AttributeError):
         return None
-
-
-def _record_all(folder: Path, count: int, seed: int, key: str, progress: Progress) -> None:
-    # OpenCV releases the interpreter's lock while it draws and compresses, so threads help.
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        drives = pool.map(lambda index: record_drive(folder, index, seed), range(count))
-        hits = sum(progress(drives, desc="recording", total=count))
-    (folder / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
 
 
 def record_drive(folder: Path, index: int, seed: int) -> bool:
@@ -99,12 +91,9 @@ class WorldEpisode:
         car = this_car()
         self._world, self._pwm, self._start_s = world, car.pwm, start.timestamp()
         self._periods = [_round_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
-        self.writer = EpisodeWriter(
-            folder / episode_name(start),
-            About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=SIMULATED, car=car),
-            resolution=(FRAME_WIDTH, FRAME_HEIGHT),
-            jpeg_quality=JPEG_QUALITY,
-        )
+        about = About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=SIMULATED, car=car)
+        size = FRAME_WIDTH, FRAME_HEIGHT
+        self.writer = EpisodeWriter(folder / episode_name(start), about, resolution=size, jpeg_quality=JPEG_QUALITY)
         self.writer.metadata["steering_positive"] = car.positive
 
     def __enter__(self) -> "WorldEpisode":

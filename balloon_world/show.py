@@ -2,8 +2,7 @@
 
     open_view(..., shown=Simulation("runs/demo/policy_static.pt"))
 
-The car's own loop drives, on a virtual clock, as in `drives`. On a busy machine the simulation's time goes slower, and
-the page says so. A real car would have to be stopped there.
+The car's own loop drives, on a virtual clock, as in `drives`, which goes slower on a busy machine.
 """
 
 import asyncio
@@ -19,11 +18,9 @@ import cv2
 
 from balloon_world.drives import NoLog, TimedCar
 from balloon_world.world import RATE_HZ, World
-from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
-from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.load import Policy, load_policy
+from rover_lib.onboard.policy.load import load_policy
 
 if TYPE_CHECKING:
     from rover_lib.onboard.view.server import View
@@ -32,11 +29,8 @@ PLAN_S = 0.1  # what a plan takes, in the simulation's time: about what a Pi may
 PICTURE_S = 1 / 15  # between two pictures, by the clock
 HOLD_S = 1.5  # between two worlds
 PACE_S = 2.0  # the pace is that of the last seconds
-# Threads wait for each other by spinning. Beside other busy programs, two needed 400 ms of processor for a plan of the
-# demo's that one computes in 4. The first number is what counts: XNNPACK's pool keeps it for as long as a process runs.
-THREADS = 1
+THREADS = 1  # more wait for each other by spinning: beside busy programs two took 400 ms for a plan of 4
 SLOW = 0.9  # of the clock; the page speaks of a slower pace
-MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
 
 Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
@@ -45,22 +39,14 @@ Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and
 class Simulation:
     """Drives an artifact through balloon worlds, for a view; what was chosen on its page arrives by `ask`.
 
-    artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. seed: of the
-    first world. Raises what load_policy() raises.
+    seed: of the first world. Raises what load_policy() raises.
     """
 
     def __init__(self, artifact: Path | str, seed: int = 10_000):
-        artifact = Path(artifact)
-        suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
-        beside = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
-        self._paths = {MODES[mode]: path for mode, path in beside.items() if path.is_file()}
-        if artifact not in self._paths.values():
-            self._paths = {artifact.name: artifact}
-        self._wanted = next(name for name, path in self._paths.items() if path == artifact)
-        self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
-        self.car = self._policies[self._wanted].car
-        self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
-        self._seed, self._artifact = seed, artifact
+        self.name = Path(artifact).name
+        self.policy = load_policy(artifact, threads=THREADS)
+        self.car = self.policy.car
+        self._hits, self._worlds, self._seed = 0, 0, seed
         cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
         self._driving: PacedCar | None = None
@@ -87,44 +73,38 @@ class Simulation:
             self.ask("stop")
 
     def ask(self, what: str) -> None:
-        """Do what the page asks for: "stop", "next", or "drive <name>" of another mode. Anything else is ignored."""
-        name = what.removeprefix("drive ")
-        if what != "stop" and what != "next" and name not in self._paths:
+        """Do what the page asks for: "stop", "next", or "drive <name>", the same world anew. Else nothing."""
+        if what not in ("stop", "next", f"drive {self.name}"):
             return
         self._held = what == "stop"
-        if name in self._paths:
-            self._wanted = name
         if self._driving:
-            self._seed += what == "next" and not self._driving.world.done  # another policy gets the same world
+            self._seed += what == "next" and not self._driving.world.done
             self._driving.stop.set()
         if what != "stop":
             self._next.set()
 
     def run(self, post: Post, worlds: int | None = None) -> None:
-        """Drive through `worlds` worlds, None: until the view has ended. post: takes each picture."""
+        """Drive through `worlds` worlds; None: until the view has ended."""
         settings, driven = Settings.of(params()["drive"]), 0
         while not self._closing.is_set() and driven != worlds:
-            name = self._wanted
-            if name not in self._policies:
-                self._policies[name] = load_policy(self._paths[name], threads=THREADS)
             world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
-            car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
+            car = self._driving = PacedCar(world, self.policy, lambda car: post(*self._seen(car)))
             self._next.clear()
             _, outcome = car.drive(settings, car.log)
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                self._results[name][0] += car.world.hit
-                self._results[name][1] += 1
+                self._hits += car.world.hit
+                self._worlds += 1
                 self._seed += 1
             self._wait(car, outcome, post)
 
     def _wait(self, car: "PacedCar", outcome: str, post: Post) -> None:
-        """Show how a drive ended, until the next one is asked for; unless somebody stopped it, for a moment only."""
+        """Show how a drive ended, for a moment; if somebody stopped it, until the next one is asked for."""
         end_s = time.monotonic() + HOLD_S
         while not self._closing.is_set() and (self._held or time.monotonic() < end_s):
             head, picture = self._seen(car)
             text = "stopped here; nobody drives" if self._held else SAID[outcome]
-            neutral = self.car.pwm.pulses(*NEUTRAL)
+            neutral = self.car.pwm.neutral()
             pins = [neutral.steering_us, neutral.throttle_us]
             post(head | {"phase": "ended", "text": text, "tick": None, "pins": pins, "who": "S"}, picture)
             if self._next.wait(0.3):
@@ -135,13 +115,11 @@ class Simulation:
         world, row, plan = car.world, car.log.row, car.newest()
         frame, pace, slow = world.render(), car.pace(), ""
         if pace < SLOW:
-            slow = (
-                f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
-            )
+            slow = f"busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
         head: dict[str, Any] = {
-            "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
+            "phase": "driving", "text": slow, "title": f"{self.name}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
-            "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
+            "missed": 0, "tick": row and row._asdict(),
             "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
             "captured_s": time.monotonic(), "size": [frame.shape[1], frame.shape[0]],
         }  # fmt: skip
@@ -150,8 +128,8 @@ class Simulation:
             head["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": plan.actions.tolist()}
         head["world"] = {
             "seed": world.seed,
-            "results": self._results,
-            "drives": self._wanted,
+            "results": {self.name: [self._hits, self._worlds]},
+            "drives": self.name,
             "pace": round(pace, 2),
             "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
             "balloon": [world.balloon.x_m, world.balloon.y_m],

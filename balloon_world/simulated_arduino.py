@@ -30,9 +30,8 @@ class PinEvent(NamedTuple):
 
     kind: 'pulse'; 'cut': a reset ended a pulse; 'line': a whole line of the host has arrived; 'reset': from now on the
     pins float; 'open': somebody opened the port; 'stall': this machine had no time for the Arduino, for pulse_us;
-    'lost': events were not read in time, and pulse_us is their number. pin: 'steering', 'throttle' or ''.
-    monotonic_s: time.monotonic() when the pin rose, or when the event happened. period_us: the time since the pin rose
-    before that, 0 for the first pulse after a reset; from a StandIn always the nominal period.
+    'lost': pulse_us events were not read in time. pin: 'steering', 'throttle' or ''. monotonic_s: time.monotonic() when
+    the pin rose, or when the event happened. period_us: since the pin rose before; from a StandIn the nominal one.
     """
 
     monotonic_s: float
@@ -52,13 +51,11 @@ class StandIn:
 
     It is not the firmware and proves nothing about it. Like the firmware, it resets when its port is opened, unless DTR
     was left up; it starts in manual, with a transmitter at rest; it drives only when armed and within the throttle's
-    cap; and 150 ms after the last command it goes to neutral until it is armed again. It trusts its host: it checks no
-    CRC, range or age of a command. No human can take over, but one has always just wiggled the stick when the host
-    wants to arm.
+    cap; and 150 ms after the last command it goes to neutral until it is armed again. It checks no CRC, range or age of
+    a command. No human takes over, but one has always just wiggled the stick when the host wants to arm.
     """
 
-    def __init__(self, boot_s: float = BOOT_S):
-        self._boot_s = boot_s
+    def __init__(self) -> None:
         self._master, slave = pty.openpty()
         tty.setraw(slave)
         attributes = termios.tcgetattr(slave)
@@ -81,7 +78,7 @@ class StandIn:
         self.close()
 
     def pulses(self) -> list[PinEvent]:
-        """Return what changed on the pins since the last call; at most 10,000 events are kept."""
+        """Return the 10,000 newest events on the pins since the last call."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def close(self) -> None:
@@ -99,7 +96,7 @@ class StandIn:
         self._rest = b""  # of a line that has not ended
         self._started = time.monotonic()
         self._commanded = self._status_due = 0.0
-        self._event("reset")
+        self._events.append(PinEvent(time.monotonic(), "reset", "", 0.0, 0.0))
         self._take_car(DEFAULT_NUMBERS)
 
     def _run(self) -> None:
@@ -117,10 +114,8 @@ class StandIn:
                     dtr = not termios.tcgetattr(self._master)[2] & termios.HUPCL
                 time.sleep(0.005)
                 continue
-            if not was_open:
-                self._event("open")
-                if not dtr:
-                    self._start()
+            if not was_open and not dtr:
+                self._start()
             *lines, self._rest = (self._rest + self._read()).split(b"\n")
             for line in lines:
                 with contextlib.suppress(ValueError):  # of a damaged line
@@ -131,10 +126,10 @@ class StandIn:
     def _start(self) -> None:
         """Reset, and say hello when the boot loader has ended, which swallows what comes meanwhile."""
         self._reset()
-        self._closing.wait(self._boot_s)
+        self._closing.wait(BOOT_S)
         self._read()
         self._started = time.monotonic()
-        self._send(b"\n")  # ends a line that the reset cut
+        os.write(self._master, b"\n")  # ends a line that the reset cut
         self._hello("e")
 
     def _read(self) -> bytes:
@@ -144,11 +139,8 @@ class StandIn:
             return b""
 
     def _say(self, *words: object) -> None:
-        self._send(frame(" ".join(map(str, words))))
-
-    def _send(self, line: bytes) -> None:
         with contextlib.suppress(OSError):  # what nobody reads is lost, as on a wire
-            os.write(self._master, line)
+            os.write(self._master, frame(" ".join(map(str, words))))
 
     def _hello(self, reset: str = "-") -> None:
         self._say("<H", PROTOCOL_VERSION, FIRMWARE_VERSION, self._boot, self._sequence, reset, self._car_id)
@@ -206,8 +198,6 @@ class StandIn:
     def _set_pins(self, *pulses: int) -> None:
         for i, pin in enumerate(("steering", "throttle")):
             if not self._pins or pulses[i] != self._pins[i]:
-                self._event("pulse", pin, pulses[i], self._periods_us[i])
+                event = PinEvent(time.monotonic(), "pulse", pin, float(pulses[i]), float(self._periods_us[i]))
+                self._events.append(event)
         self._pins = pulses
-
-    def _event(self, kind: str, pin: str = "", pulse_us: float = 0.0, period_us: float = 0.0) -> None:
-        self._events.append(PinEvent(time.monotonic(), kind, pin, float(pulse_us), float(period_us)))

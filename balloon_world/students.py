@@ -2,9 +2,9 @@
 
     content = judge_students("runs/full", ["runs/fast", "runs/faster"])
 
-All results concern the artifact that would drive the car, a run's policy_static.pt. Every drive and plan stays in the
-cache, keyed by the artifact's content. So a process that was ended goes on where it was, and a further student costs
-only its own drives and plans. A rule holds the rows to limits from params.yml, and recommends a student or the teacher.
+All results concern the artifact that would drive the car, a run's policy_static.pt. Every drive stays in the cache,
+keyed by the artifact's content, so a process that was ended goes on where it was. A rule holds the rows to limits from
+params.yml, and recommends a student or the teacher.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from balloon_world import drives, trial, world
-from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere, pair_worlds
+from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere
 from balloon_world.trial import run_trials
 from balloon_world.world import World
 from rover_learn.distill import errors_of
@@ -26,9 +26,8 @@ from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy import preprocess
 from rover_lib.onboard.policy.load import Policy
-from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.cache import cache_root, car_in_key, key_of
 from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, worst
@@ -43,52 +42,35 @@ TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
 HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
 COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
-ESTIMATED = (
-    "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates: the teacher's instructions are not counted."
-)
+ESTIMATED = "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates: the teacher is not counted."
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A run's static artifact.
-
-    shape: its row of distill.json. counts: its instructions from arm.json, None if they were not counted.
-    """
+    """A run's static artifact. row: how its row of students.json begins; computed_ms: low and high end on a Pi 5."""
 
     name: str
     artifact: Path
     manifest: dict[str, Any]
-    shape: dict[str, Any]
-    counts: dict[str, Any] | None
+    row: dict[str, Any]
 
     @classmethod
-    def read(cls, folder: Path, name: str, shape: dict[str, Any]) -> "_Run":
-        """Read a run's folder. Raises TrainingError if it has no artifact."""
-        artifact, counts = folder / ARTIFACT, None
-        if not artifact.is_file():
-            raise TrainingError(f"{artifact}: not there", remedy="'rover run' makes it")
+    def read(cls, folder: Path, name: str, shape: Mapping[str, Any]) -> "_Run":
+        """Read a run's folder. shape: its row of distill.json."""
+        artifact, counts = folder / ARTIFACT, dict[str, Any]()
+        manifest = read_manifest(artifact)
         if (folder / "arm.json").is_file():
             arm = read_stage(folder / "arm.json", "arm")
-            row = arm["metrics"]["artifacts"].get(artifact.stem, {})
-            counts = row if arm["inputs"].get(ARTIFACT) == sha256_of(artifact) and "cycles_g" in row else None
-        return cls(name, artifact, read_manifest(artifact), shape, counts)
-
-    def row(self) -> dict[str, Any]:
-        """How its row of students.json begins. computed_ms: the low and the high end of the latency on a Pi 5."""
-        (camera,) = self.manifest["cameras"]
-        span = predict_ms(Work.of(self.counts)) if self.counts else None
-        return {
-            "name": self.name,
-            "height": camera["height"],
-            "width": camera["width"],
-            **{key: self.shape[key] for key in ("decoder_layers", "feedforward")},
-            "backbone_channels": self.shape.get("backbone_channels"),  # older students have all channels
-            "gmac": self.manifest["gmac"],
-            **{key: self.counts and self.counts[key] for key in ("instructions_g", "simd_g")},
-            "size_mb": self.artifact.stat().st_size / 1e6,
-            "computed_ms": span and [span.low, span.high],
-        }
+            if arm["inputs"].get(ARTIFACT) == sha256_of(artifact):
+                counts = arm["metrics"]["artifacts"].get(artifact.stem, {})
+        (camera,) = manifest["cameras"]
+        row = {"name": name, "height": camera["height"], "width": camera["width"]}
+        row |= {key: shape.get(key) for key in ("decoder_layers", "feedforward", "backbone_channels")}
+        row |= {"gmac": manifest["gmac"], "size_mb": artifact.stat().st_size / 1e6}
+        row |= {key: counts.get(key) for key in ("instructions_g", "simd_g")}
+        span = predict_ms(Work.of(counts)) if "cycles_g" in counts else None
+        return cls(name, artifact, manifest, row | {"computed_ms": span and [span.low, span.high]})
 
 
 def judge_students(
@@ -104,34 +86,23 @@ def judge_students(
 
     students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
-    `run_trials`, and pushed at the latency computed for it. With 0 nobody drives, as there is no world for a real
-    car's policy. held_out_frames: how many to judge with at most.
-    Raises TrainingError for runs that do not belong together or lack a file, and whatever reading them raises.
+    `run_trials`, and pushed at the latency computed for it; 0 for a real car's policy, which has no world.
+    Raises TrainingError for runs that do not belong together, StageError and ArtifactError for a missing file.
     """
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
-    if (folder / "load.json").is_file():  # the recordings that the teacher's run loaded, or others read the same way
-        source = Source.loaded(read_stage(folder / "load.json", "load")["params"], episodes)
-    elif episodes:
-        source = Source.of(episodes)
-    else:
-        raise TrainingError(f"{folder}: says nothing of its recordings", remedy="give --episodes")
+    source = Source.loaded(read_stage(folder / "load.json", "load")["params"], episodes)
     recordings = load_recordings(source, runs[0].manifest["chunk"], p["calibration"]["sync_s"], progress)
     parts = split(recordings, p["calibration"]["held_out_share"], p["calibration"]["seed"])
     samples = pick_evenly(parts.held_out, held_out_frames)
-    if not (reference := folder / "policy_fp32.pt").is_file():
-        raise TrainingError(f"{reference}: the teacher as it was trained is not there", remedy="'rover run' makes it")
-    taught = _plans(reference, f"{TEACHER} in float", samples, progress)
-    counted = runs[0].counts is not None
+    taught = _plans(folder / "policy_fp32.pt", f"{TEACHER} in float", samples, progress)
+    counted = runs[0].row["computed_ms"] is not None
     rows = []
     for run in runs:
         plans = _plans(run.artifact, run.name, samples, progress)
-        row = run.row() | errors_of(plans, taught, samples, recordings.action_range())
-        pushed_ms = (row["computed_ms"] or (None, None))[1] if counted else estimate_ms(run.manifest["gmac"])
+        pushed_ms = (run.row["computed_ms"] or (None, None))[1] if counted else estimate_ms(run.manifest["gmac"])
+        row = run.row | errors_of(plans, taught, samples, recordings.action_range())
         rows.append(row | _drives(run, worlds, pushed_ms, progress))
-    notes = [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE]
-    if missing := [run.name for run in runs if run.counts is None]:
-        notes.append(f"Not counted, or another artifact was: {', '.join(missing)}. `make count` counts.")
     metrics = {
         "students": rows,
         "recommendation": recommendation(rows, p["students"]),
@@ -140,7 +111,7 @@ def judge_students(
         "judged_frames": len(samples),
         "held_out_episodes": parts.episodes["held_out"],
         "warnings": not_judged(recordings.action_range()),
-        "notes": notes,
+        "notes": [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE],
     }
     how = {"worlds": worlds, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
     how["students"] = [run.name for run in runs[1:]]
@@ -155,8 +126,6 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
         raise TrainingError(f"students must have names of their own, and none is '{TEACHER}'", found=names)
     runs: list[_Run] = []
     for student in students:
-        if not (student / "distill.json").is_file():
-            raise TrainingError(f"{student}: no distill.json in it", remedy="'rover distill' makes a student")
         taught = read_stage(student / "distill.json", "distill")
         of_teacher, own = taught["metrics"]["students"]
         runs = runs or [_Run.read(folder, TEACHER, of_teacher)]
@@ -169,20 +138,14 @@ def _runs(folder: Path, students: Sequence[Path]) -> list[_Run]:
 
 
 def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progress) -> np.ndarray:
-    """Return what an artifact plans for the samples, (n, C, A) float32, from the cache if it is there."""
-    frames = [(str(s.frame_path), s.frame_path.stat().st_size, s.frame_name, s.state.tolist()) for s in samples]
-    planned_by = {"artifact": content_hash(artifact), "torch": torch.__version__, **car_in_key()}
-    path = cache_root() / f"plans-{key_of(planned_by | {'frames': frames}, preprocess)}.npy"
-    if not path.exists():
+    """Return what an artifact plans for the samples, (n, C, A) float32."""
 
-        def one(policy: Policy, i: int) -> np.ndarray:
-            return policy.predict_chunk(samples[i].frame_bgr(), samples[i].state)
+    def one(policy: Policy, i: int) -> np.ndarray:
+        return policy.predict_chunk(samples[i].frame_bgr(), samples[i].state)
 
-        every = everywhere(artifact, range(len(samples)), one)
-        planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
-        with atomic_path(path) as temporary:
-            np.save(temporary, np.stack([planned[i] for i in range(len(samples))]))
-    return np.load(path)
+    every = everywhere(artifact, range(len(samples)), one)
+    planned = dict(progress(every, desc=f"judging {name}", total=len(samples)))
+    return np.stack([planned[i] for i in range(len(samples))])
 
 
 # --- in worlds --------------------------------------------------------------------------------------------------------
@@ -197,15 +160,12 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
         return {"outcome": drive_once(policy, asked[1], late_ms[asked[0]], Settings.of(how))}
 
     driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
-    key = key_of(
-        driven_by | {"drive": how, "pushes": PUSHES, "late": pushed_ms}, world, trial, drives, loop, pilot, plan
-    )
+    driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms}
+    path = cache_root() / f"drives-{key_of(driven_by, world, trial, drives, loop, pilot, plan)}.jsonl"
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
-    kinds = [kind for kind in HOW if worlds and not (kind and pushed_ms is None)]
+    kinds = [kind for kind in HOW if not (kind and pushed_ms is None)]
     asked = [(kind, seed) for kind in kinds for seed in range(SEED, SEED + worlds)]
-    found = drive_missing(
-        run.artifact, asked, one, cache_root() / f"drives-{key}.jsonl", progress, f"driving {run.name}"
-    )
+    found = drive_missing(run.artifact, asked, one, path, progress, f"driving {run.name}")
     for kind in HOW:
         outcomes = {seed: each["outcome"] for (of, seed), each in found.items() if of == kind}
         keys = "hits", "trials", "hits_wilson_low", "hits_wilson_high", "missed"
@@ -231,9 +191,8 @@ def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping
     """
     rows = []
     for kind, how in HOW.items() if teacher["trials"] else ():
-        lost = None
-        if row[f"{kind}trials"] and teacher[f"{kind}trials"]:
-            lost = 100 * (teacher[f"{kind}hits"] - row[f"{kind}hits"]) / teacher[f"{kind}trials"]
+        hits, trials = (teacher[f"{kind}{what}"] for what in ("hits", "trials"))
+        lost = 100 * (hits - row[f"{kind}hits"]) / trials if trials and row[f"{kind}trials"] else None
         rows.append(gate(f"{row['name']} worlds lost, {how}, %", lost, "<=", limits[f"{kind}worlds_lost_pct"]))
     keys = [key for key in row if key.startswith("recorded_") and None not in (row[key], teacher[key])]
     above = worst(row[key] - teacher[key] for key in keys)
@@ -241,10 +200,9 @@ def gates_of(row: Mapping[str, Any], teacher: Mapping[str, Any], limits: Mapping
 
 
 def recommendation(rows: Sequence[Mapping[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
-    """Choose the fastest student that passes every gate, or the teacher if none does.
+    """Choose the student with fewest instructions (multiply-accumulates, if any is not counted) of those that pass.
 
-    rows: of students.json, the teacher first. Fastest is what has fewest instructions if all are counted, else fewest
-    multiply-accumulates. Returns {"name", "fastest_by", "gates": of all students}.
+    rows: of students.json, the teacher first; it is chosen if none passes. Returns {"name", "fastest_by", "gates"}.
     """
     teacher, *students = rows
     gates = {row["name"]: gates_of(row, teacher, limits) for row in students}
@@ -263,15 +221,16 @@ def table(metrics: Mapping[str, Any]) -> Table:
         counted = "-" if row["instructions_g"] is None else f"{row['instructions_g']:.3g}"
         span = "not counted" if row["computed_ms"] is None else "{:.3g} to {:.3g}".format(*row["computed_ms"])
         pushed = _hits(row, "pushed_") + (f" at {row['pushed_latency_ms']:.0f} ms" if row["pushed_trials"] else "")
-        errors = (
-            " / ".join(format_pct(row[f"{to}_{action}_pct"]).strip().removesuffix(" %") for action in actions)
-            for to in ("teacher", "recorded")
-        )
+        errors = []
+        for to in ("teacher", "recorded"):
+            each = [format_pct(row[f"{to}_{action}_pct"]).strip().removesuffix(" %") for action in actions]
+            errors.append(" / ".join(each))
         work = (f"{row['size_mb']:.1f}", f"{row['gmac']:.3g}", counted, span)
         rows.append((f"{row['name']}: {shape_of(row)}", *work, _hits(row, ""), pushed, *errors))
     what = f"errors in {' / '.join(actions)}, of the static INT8 artifact, % of the recorded range"
     header = ("", "MB", "GMAC", "10^9 instructions", "ms, computed", "left alone", "pushed")
-    notes = (what, *metrics["notes"], *metrics["warnings"])
+    chosen = f"recommended by the limits of params.yml: {metrics['recommendation']['name']}"
+    notes = (chosen, what, *metrics["notes"], *metrics["warnings"])
     return Table((*header, "to the teacher, %", "to the recordings, %"), rows, notes=notes)
 
 
@@ -283,24 +242,3 @@ def shape_of(row: Mapping[str, Any]) -> str:
 
 def _hits(row: Mapping[str, Any], kind: str) -> str:
     return f"{row[f'{kind}hits']} of {row[f'{kind}trials']}" if row[f"{kind}trials"] else "-"
-
-
-def sentences(metrics: Mapping[str, Any]) -> list[str]:
-    """Say the recommendation in plain English, a sentence to a line. metrics: of students.json."""
-    teacher, *students = metrics["students"]
-    verdict = metrics["recommendation"]
-    chosen = next((row for row in students if row["name"] == verdict["name"]), None)
-    if chosen is None:
-        lines = ["No student keeps to the limits of params.yml: stay with the teacher."]
-    else:
-        by = {"instructions_g": "fewest instructions", "gmac": "fewest multiply-accumulates"}[verdict["fastest_by"]]
-        lines = [f"Recommended: {chosen['name']} ({shape_of(chosen)}), which has the {by} of those within the limits."]
-    for row in students:
-        for kind, how in HOW.items():
-            if row[f"{kind}trials"] and teacher[f"{kind}trials"]:
-                only, only_teacher, p = pair_worlds(row[f"{kind}missed"], teacher[f"{kind}missed"])
-                lines.append(
-                    f"{row['name']}, {how}: {_hits(row, kind)} worlds, its teacher {_hits(teacher, kind)}; {only} only "
-                    f"the student hit, {only_teacher} only the teacher (sign test, p = {p:.2g})."
-                )
-    return lines if teacher["trials"] else [*lines, NOBODY_DROVE]

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from balloon_world.world import World
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.progress import Progress, silent
 
@@ -31,24 +32,23 @@ class Trajectory:
     @classmethod
     def of(cls, world: World) -> "Trajectory":
         """Return everything that was driven in a world so far."""
-        track = world.trajectory
-        return cls(
-            np.array([s.x_m for s in track]),
-            np.array([s.y_m for s in track]),
-            np.array([s.steering_command for s in track]),
-            np.array([s.throttle_command for s in track]),
-            (world.balloon.x_m, world.balloon.y_m),
-        )
+        track = np.array([(s.x_m, s.y_m, s.steering_command, s.throttle_command) for s in world.trajectory])
+        x_m, y_m, steering, throttle = track.T
+        return cls(x_m, y_m, steering, throttle, (world.balloon.x_m, world.balloon.y_m))
 
 
 @dataclass(frozen=True)
-class WorldResult:
-    """The drive in one world. outcome: 'hit', 'left' or 'timeout'."""
+class Driven:
+    """A drive through a world.
 
-    seed: int
+    outcome: 'hit', 'left', 'timeout', and for `drives.drive_in` 'stopped' if a plan became too old to drive by, or
+    'taken over'. trajectory: one point per tick. orders: what was commanded at each tick, for `drive_in` alone.
+    """
+
     outcome: str
     duration_s: float
     trajectory: Trajectory
+    orders: Sequence[Order] = ()
 
     @property
     def hit(self) -> bool:
@@ -62,17 +62,12 @@ class TrialReport:
     hits: int
     trials: int
     wilson: tuple[float, float]
-    per_world: list[WorldResult]
+    per_world: list[Driven]
     frames: list[tuple[np.ndarray, np.ndarray]]
 
 
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z).
-
-    Raises TrainingError unless 0 <= hits <= trials and there is at least one trial.
-    """
-    if not 0 <= hits <= trials or trials < 1:
-        raise TrainingError("an interval needs 0 <= hits <= trials and a trial", found=f"{hits} of {trials}")
+    """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z)."""
     share = hits / trials
     centre = share + z * z / (2 * trials)
     half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
@@ -90,22 +85,19 @@ def run_trials(
 ) -> TrialReport:
     """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
 
-    policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`.
-    replan_every: how many actions of each chunk are driven before the policy sees the next frame. Its state is the
-    action commanded before, neutral at the start. keep_frames: how many (frame_bgr, state) pairs to keep at most; they
-    are spread evenly over all that the policy was shown.
-    Raises TrainingError for parameters outside their ranges, a plan of a wrong shape, or actions that are not finite.
+    policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`. replan_every: how many actions of
+    each chunk are driven before the policy sees the next frame; its state is the action commanded before, neutral at
+    the start. keep_frames: at most so many (frame_bgr, state) pairs are kept, spread evenly over all.
+    Raises TrainingError for parameters outside their ranges, and plans of a wrong shape or that are not finite.
     """
-    if worlds < 1 or seed < 0 or keep_frames < 0:
-        raise TrainingError("trials need at least 1 world and a seed from 0", found=f"{worlds} and {seed}")
-    if not 1 <= replan_every <= policy.chunk:
-        raise TrainingError(f"replan_every must be 1 to {policy.chunk}, the policy's chunk", found=replan_every)
-    results: list[WorldResult] = []
+    if worlds < 1 or not 1 <= replan_every <= policy.chunk:
+        what = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
+        raise TrainingError(what, found=f"{worlds} and {replan_every}")
+    results: list[Driven] = []
     seen: list[tuple[np.ndarray, np.ndarray]] = []
     stride, shown = 1, 0  # the stride doubles whenever too many are kept: memory is bounded, and all drives are there
-    # A policy of recordings that were made when the default car turned left drives a car that does.
     car = getattr(policy, "car", None)
-    left = car.left if isinstance(car, Car) else None
+    left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
         result, pairs = _drive(policy, World(world_seed, left=left), replan_every)
         results.append(result)
@@ -120,16 +112,13 @@ def run_trials(
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
-    """Do `run_trials` for several policies at once, on a thread for each core.
-
-    Worlds and results are the same as one by one.
-    """
+    """Do `run_trials` for several policies at once, on a thread for each core, with the same results."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         running = {name: pool.submit(run_trials, policy, worlds, **options) for name, policy in policies.items()}
         return {name: trial.result() for name, trial in running.items()}
 
 
-def _drive(policy: Any, world: World, replan_every: int) -> tuple[WorldResult, list[tuple[np.ndarray, np.ndarray]]]:
+def _drive(policy: Any, world: World, replan_every: int) -> tuple[Driven, list[tuple[np.ndarray, np.ndarray]]]:
     state: np.ndarray = np.zeros(2, np.float32)
     pairs = []
     while not world.done:
@@ -144,4 +133,4 @@ def _drive(policy: Any, world: World, replan_every: int) -> tuple[WorldResult, l
             state = np.array([steering, throttle], np.float32)
             if world.done:
                 break
-    return WorldResult(world.seed, str(world.outcome), world.state.time_s, Trajectory.of(world)), pairs
+    return Driven(str(world.outcome), world.state.time_s, Trajectory.of(world)), pairs

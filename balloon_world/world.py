@@ -1,10 +1,9 @@
 """Simulate a balloon world: how a small car moves in it and what its front camera sees. The seed determines everything.
 
-A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Floor,
-wall, light and the objects that are not red balloons differ from seed to seed. Lengths are in metres, angles in
-radians (positive to the left). Actions are the policy's: steering in [-1, 1], throttle in [0, 1], or in [-1, 1] if the
-car has a reverse gear. Positive steering turns to the car's positive side, the recorded car's right. That side, the
-wheelbase and the field of view come from car.yml.
+A car stands on a floor, a red balloon floats some metres ahead, and the task is to drive into it. Lengths are in
+metres, angles in radians (positive to the left). Actions are the policy's: steering in [-1, 1], throttle in [0, 1], or
+in [-1, 1] if the car has a reverse gear. Positive steering turns to the car's positive side, the recorded car's right.
+That side, the wheelbase and the field of view come from car.yml.
 """
 
 import math
@@ -102,30 +101,22 @@ class Shove:
 class World:
     """One drive to one balloon.
 
-    seed: determines everything that is random. shoves: how many pushes the car gets on its way. decoys: how many
-    red things stand about that are no balloons; without them nothing but the balloon is red. left: 1 if positive
-    steering turns left, -1 if right; None: as this machine's car.
-    Frames and motion depend only on these and on the actions given.
+    seed: determines everything that is random. shoves: how many pushes the car gets on its way. decoys: how many red
+    things stand about that are not balloons; else only the balloon is red. left: 1 if positive steering turns left, -1
+    if right; None: as this machine's car.
     """
 
     def __init__(self, seed: int, shoves: int = 0, decoys: int = 0, left: int | None = None):
-        if min(seed, shoves, decoys) < 0:
-            found = f"{seed}, {shoves} and {decoys}"
-            raise TrainingError("a world's seed, shoves and decoys must not be negative", found=found)
+        if seed < 0:
+            raise TrainingError("a world's seed must not be negative", found=seed)
         self.seed = seed
         self.left = left or _CAR.left
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
         distance, bearing = rng.uniform(1.8, 4.0), rng.uniform(-0.5, 0.5)
         red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
-        self.balloon = Thing(
-            "balloon",
-            distance * math.cos(bearing),
-            distance * math.sin(bearing),
-            BALLOON_RADIUS_M,
-            BALLOON_HEIGHT_M,
-            red,
-        )
+        x, y = distance * math.cos(bearing), distance * math.sin(bearing)
+        self.balloon = Thing("balloon", x, y, BALLOON_RADIUS_M, BALLOON_HEIGHT_M, red)
         self.distractors = tuple(_distractors(rng, self.balloon))
         self.distractors += tuple(_decoys(np.random.default_rng([seed, 20_253]), self.balloon, decoys))
         self.trajectory = [self.state]
@@ -150,8 +141,9 @@ class World:
         """Drive for dt seconds. Raises TrainingError for an action outside its range, or if the drive has ended."""
         (_, least), _ = _CAR.limits
         if not (-1 <= steering <= 1 and least <= throttle <= 1):
-            found = f"({steering}, {throttle})"
-            raise TrainingError(f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=found)
+            raise TrainingError(
+                f"steering must be in [-1, 1] and throttle in [{least:g}, 1]", found=(steering, throttle)
+            )
         if self.done:
             raise TrainingError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state
@@ -186,7 +178,7 @@ class World:
             self.outcome = "timeout"
 
     def balloon_seen(self) -> tuple[float, float]:
-        """Return the balloon's distance in metres and bearing in radians (positive to the left) from the camera."""
+        """Return the balloon's distance in metres and its bearing in radians from the camera."""
         ahead, left = self._local(self.balloon.x_m, self.balloon.y_m)
         return math.hypot(ahead, left), math.atan2(left, ahead)
 
@@ -229,10 +221,7 @@ class World:
 
 
 def expert(world: World) -> tuple[float, float]:
-    """Return what a good driver does now: (steering, throttle).
-
-    The driver steers towards the balloon, starts gently, and slows down in a turn and near the balloon.
-    """
+    """Return what a good driver does now: (steering, throttle)."""
     distance, bearing = world.balloon_seen()
     steering = world.left * float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
     in_turn = 1 - 0.55 * min(1.0, abs(bearing) / 0.5)
@@ -314,10 +303,7 @@ def _floor(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _wall(rng: np.random.Generator) -> np.ndarray:
-    """Return the panorama above the horizon, (125, w + 640, 3) uint8, whose first 640 columns are repeated at its end.
-
-    w: the columns of a whole turn, 2 pi focal lengths.
-    """
+    """Return the panorama above the horizon, (125, w + 640, 3) uint8: a turn of w columns, and its first 640 again."""
     width = round(2 * math.pi * FOCAL_PX)
     top, bottom = (rng.uniform(90, 220) + rng.uniform(-25, 25, 3) for _ in range(2))
     ramp = np.linspace(0, 1, HORIZON_ROW)[:, None, None]

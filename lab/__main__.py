@@ -47,10 +47,7 @@ def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> N
 @click.argument("artifact", type=ARTIFACT, required=False)
 @click.pass_context
 def doctor(ctx: click.Context, artifact: Path | None) -> None:
-    """Do `rover doctor` and its ritual with the transmitter, with the real firmware on an emulated Arduino.
-
-    The camera is the balloon world's, and a script holds the transmitter. Exit code 1 if anything fails.
-    """
+    """Do `rover doctor` and its ritual with the transmitter, on an emulated Arduino. Exit code 1 if anything fails."""
     from lab.arduino.rehearsal import rehearse
 
     failed = False
@@ -66,8 +63,8 @@ def doctor(ctx: click.Context, artifact: Path | None) -> None:
 def arm(run_dir: Path, peers: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
-    The result is a count, never a time. Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates
-    of lab/params.yml hold. Needs Debian 12 with qemu-user and gcc, which it installs if you are root.
+    Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of lab/params.yml hold. Needs Debian
+    12 with qemu-user and gcc, which it installs if you are root.
     """
     from lab.a76.count_run import count_run
     from lab.a76.report import table
@@ -91,9 +88,9 @@ def arm(run_dir: Path, peers: bool) -> None:
 def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], car_file: Path | None) -> None:
     """Break what can break while the car drives, and see whether it stops.
 
-    Most of it in virtual time, with the real firmware compiled for this machine; twelve faults of the default car in
-    real time, on the pins of an emulated Arduino, which takes some minutes. The rows are written to OUTPUT as JSON, if
-    it is given. The exit code is 1 if anything is not as expected. Needs gcc and simavr, see docs/first_hour.md.
+    Most of it in virtual time; twelve faults of the default car in real time, on the pins of an emulated Arduino, which
+    takes some minutes. The rows are written to OUTPUT as JSON. The exit code is 1 if anything is not as expected. Needs
+    gcc and simavr, see docs/first_hour.md.
     """
     from lab.driving.faults import run_faults
     from rover_lib.onboard.car.car import Car, read_car
@@ -131,9 +128,8 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
 def drive_randomly(ctx: click.Context, output: Path | None, drives: int, first: int, jobs: int | None) -> None:
     """Drive with random faults in virtual time, and check each drive against invariants: what must never happen.
 
-    All drives take some minutes. Prints how many states they visited and, for each drive that breaks an invariant, its
-    seed and a short story that breaks the same one; also to OUTPUT as JSON, if it is given. The exit code is 1 if a
-    drive breaks an invariant. Needs gcc.
+    Prints, and writes to OUTPUT as JSON, how many states they visited and, for each drive that breaks an invariant, its
+    seed and story. The exit code is 1 if one does. Needs gcc.
     """
     from lab.driving.random_drives import random_drives
     from rover_lib.onboard.stage import write_stage
@@ -152,8 +148,7 @@ def drive_randomly(ctx: click.Context, output: Path | None, drives: int, first: 
 def pi(ctx: click.Context, output: Path, demo: Path) -> None:
     """Provision an emulated Pi in a container, deploy to it, drive it and roll back, by the playbooks.
 
-    Needs root and Debian 12 or 13. Writes OUTPUT as JSON, and what the playbooks printed beside it. The exit code is 1
-    if anything is not as expected.
+    Needs root and Debian 12 or 13. Writes OUTPUT as JSON, and what the playbooks printed beside it.
     """
     from lab.pi.deployment import deploy_and_drive
 

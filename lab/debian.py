@@ -37,26 +37,17 @@ def install_packages(packages: Sequence[str], what: str) -> None:
 def fetch_packages(folder: Path, packages: Sequence[str]) -> list[Path]:
     """Fetch arm64 packages and their dependencies as .deb files into a scratch folder; return their paths.
 
-    Nothing on this machine is changed: apt uses its sources and keys, but its own lists, cache and status in the
-    folder. packages: names, or apt's patterns. Raises RoverError if they cannot be had.
+    apt uses this machine's sources and keys, but lists, cache and status in the folder. packages: names, or apt's
+    patterns. Raises RoverError if they cannot be had.
     """
     for subfolder in ("lists/partial", "archives/partial"):
         (folder / subfolder).mkdir(parents=True)
     (folder / "status").touch()  # says that nothing is installed, so that apt fetches all dependencies
-    options = {
-        "APT::Architecture": "arm64",
-        "APT::Architectures": "arm64",
-        "Dir::State": folder,
-        "Dir::State::lists": folder / "lists",
-        "Dir::State::status": folder / "status",
-        "Dir::Cache": folder,
-        "Dir::Cache::archives": folder / "archives",
-        "Dir::Cache::pkgcache": "",
-        "Dir::Cache::srcpkgcache": "",
-        "Dir::Log": folder,
-        "APT::Sandbox::User": "root",
-        "Debug::NoLocking": "true",
-    }
+    options: dict[str, object] = {f"Dir::{name}": folder for name in ("State", "Cache", "Log")}
+    options |= {"Dir::State::lists": folder / "lists", "Dir::State::status": folder / "status"}
+    options |= {"Dir::Cache::archives": folder / "archives", "Dir::Cache::pkgcache": "", "Dir::Cache::srcpkgcache": ""}
+    options |= {"APT::Architecture": "arm64", "APT::Architectures": "arm64", "APT::Sandbox::User": "root"}
+    options |= {"Debug::NoLocking": "true"}
     apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
     run(*apt, "update", error=RoverError, remedy=NO_DEBIAN)
     download = ["install", "--yes", "--download-only", "--no-install-recommends", *packages]

@@ -12,7 +12,8 @@ from typing import Any
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive.arming import arm_capped
-from rover_lib.onboard.drive.loop import Hooks, Log, Report, Until, drive
+from rover_lib.onboard.drive.flight_log import FlightLog
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, Sight
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.watch import SWITCH_S, HealthWatch
@@ -29,7 +30,9 @@ Clock = Callable[[], float]
 class Ride:
     """One drive, from arming to neutral: begin(), then put() at least every HOLD_S, then end()."""
 
-    def __init__(self, camera: Camera, link: ServoLink, settings: Settings, log: Log, clock: Clock = time.monotonic):
+    def __init__(
+        self, camera: Camera, link: ServoLink, settings: Settings, log: FlightLog, clock: Clock = time.monotonic
+    ):
         self._camera, self._link, self._settings, self._log, self._clock = camera, link, settings, log, clock
         self._sight = Sight(camera, settings)
         self._action = (0.0, 0.0)

@@ -48,16 +48,16 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
         raise RoverError(f"{recordings}: --throttle is for donkeycar tubs", remedy="leave it out")
     else:
         check_kind(recordings, "recordings")
-    _print_export(write(source, out, progress=terminal_bar(), **options), out, "exported", as_json)
+    _print_export(write(source, out, progress=terminal_bar(), **options), out, as_json)
 
 
-def _print_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -> None:
-    from rover_exchange.export_dataset import CAR, DRIVEN_BY, OUTCOMES, REPORT
+def _print_export(report: dict[str, Any], out: Path, as_json: bool) -> None:
+    from rover_exchange.export_dataset import CAR, DRIVEN_BY, REPORT
     from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 
-    for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, OUTCOMES):
+    for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY, "outcomes"):
         del report[name]  # too long to print; the file has them
-    show({done: report | {"report": str(out / REPORT)}}, as_json)
+    show({"exported": report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
         click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
 
@@ -68,10 +68,8 @@ def _print_export(report: dict[str, Any], out: Path, done: str, as_json: bool) -
 def view(file: Path | None, **options: Any) -> None:
     """Show a drive in a browser: its picture, its plan, what the pins do. The page can stop the car and nothing else.
 
-    Without FILE it shows the `rover drive` of this machine, which may come and go. If FILE is an artifact, it drives
-    through the balloon world.
-
-    Whoever has the page's URL may look and stop; without --interface, only from this machine.
+    Without FILE it shows the `rover drive` of this machine; an artifact drives through the balloon world. Whoever has
+    the page's URL may look and stop; without --interface, only from this machine.
     """
     if file is None:
         return open_view(**options, opened=open_browser)
@@ -107,8 +105,7 @@ def log(
 ) -> None:
     """Summarize the flight log FILE of `rover drive`, and draw it.
 
-    The summary has missed ticks, jitter, ages and latencies of plans, who drove, temperature and events. Older parts
-    of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation, the summary does not.
+    Older parts of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation.
 
     --video makes a film of the drive instead: its pictures with the planned path, the commands and the servo pulses.
     It needs the pictures that `rover drive --record` has kept. --mcap writes the log, with the pictures if there are

@@ -1,14 +1,8 @@
 """Export our recordings as a LeRobotDataset v3, for `lerobot-train` and LeRobot's own tools.
 
-    report = export_dataset("episodes", "my_dataset")
-
-A row of that format is a picture, the state before it and the action at it, at a fixed rate. What our reader repairs is
-repaired in the dataset. Where a frame must be left out (a damaged picture, a hole in time, no measured pulse, nobody
-who drove), the episode ends and another begins. The report counts each of these, and stays in the dataset's folder.
-
-If a policy drove in one of the recordings, each frame says in `intervention` whether a human had taken over from it, as
-`lerobot-rollout` writes it. If every recording was labelled, the last frame of each episode says how its drive ended,
-in LeRobot's `next.success`, `next.reward` and `next.done`.
+What our reader repairs is repaired in the dataset. Where a frame must be left out, the episode ends and another begins.
+If a policy drove in one of the recordings, `intervention` says where a human had taken over, as in `lerobot-rollout`.
+If every recording was labelled, the last frame of an episode has LeRobot's `next.success`, `next.reward`, `next.done`.
 """
 
 import json
@@ -29,33 +23,14 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
 from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.lerobot_dataset import (
-    ACTION,
-    BACKEND,
-    CAR,
-    DRIVEN_BY,
-    INTERVENTION,
-    OUTCOMES,
-    REPORT,
-    STATE,
-    SUCCESS,
-)
-from rover_lib.workshop.recordings.samples import (
-    ACTION_NAMES,
-    CAMERA,
-    LEAST_RATED,
-    Episode,
-    Recordings,
-    Sample,
-    car_of,
-    frame_rate_hz,
-    is_another_rate,
-)
+from rover_lib.workshop.recordings.lerobot_dataset import ACTION, BACKEND, CAR, DRIVEN_BY, INTERVENTION, REPORT, STATE
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, CAMERA, LEAST_RATED, Episode, Recordings, Sample
 from rover_lib.workshop.recordings.turning import measure_sides
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
-REWARD, DONE = "next.reward", "next.done"
+SUCCESS, REWARD, DONE = "next.success", "next.reward", "next.done"
 SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
 SHORTEST = 2  # rows in the shortest episode: a single row has no spread to normalise by
 
@@ -68,15 +43,12 @@ def export_dataset(
     size: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Write all usable samples to `out`, a new folder, and return what was written and left out.
+    """Write all usable samples to `out`, a new folder, once it is complete, and return what was written and left out.
 
-    episodes: the recordings, or the folder that has them. video: True writes AV1, LeRobot's default, which is far
-    smaller but loses detail; False writes PNG inside parquet, which loses nothing. size: (height, width) to which the
-    pictures are resized, as a rover resizes what its camera gives; None keeps the recorded size. The folder appears
-    only when it is complete.
-
-    Raises EpisodeError for recordings that cannot be used, that are of several cars, rates or (without `size`) picture
-    sizes, for a size that no artifact takes, and if `out` exists; RoverError while another process makes `out`.
+    episodes: the recordings, or their folder. video: True writes AV1, which loses detail; False PNG inside parquet.
+    size: (height, width) to which the pictures are resized; None keeps the recorded size. Raises EpisodeError for
+    recordings that cannot be used, of several cars, rates or (without `size`) picture sizes, a size that no artifact
+    takes, and an existing `out`; RoverError while another process makes `out`.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -91,7 +63,7 @@ def export_dataset(
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = usual_rate_hz(recordings)
-    car = car_of(recordings.samples)
+    car = recorded_as.car_of(recordings.samples)
     with build_folder(out) as new:
         made = new / "dataset"  # LeRobot makes its folder itself
         report = _write(recordings, made, rate_hz, video, size, progress) | {CAR: car.description()}
@@ -106,14 +78,14 @@ def usual_rate_hz(recordings: Recordings) -> int:
     """Return the frames per second of all episodes. Raises EpisodeError if they differ: a dataset has only one rate."""
     longest = max(len(e.samples) for e in recordings.episodes)
     long = [e for e in recordings.episodes if len(e.samples) >= min(longest, LEAST_RATED)]
-    rates = {e.id: found for e in long if (found := frame_rate_hz(e.samples)) is not None}
+    rates = {e.id: found for e in long if (found := recorded_as.frame_rate_hz(e.samples)) is not None}
     if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
     usual_hz = float(np.median(list(rates.values())))
-    if odd := {name: found for name, found in rates.items() if is_another_rate(found, usual_hz)}:
+    if odd := {name: found for name, found in rates.items() if recorded_as.is_another_rate(found, usual_hz)}:
         what = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
-        name, rate_hz = next(iter(odd.items()))
-        raise EpisodeError(what, found=f"{rate_hz:.1f} in {name}", remedy="export those of each rate by themselves")
+        name, odd_hz = next(iter(odd.items()))
+        raise EpisodeError(what, found=f"{odd_hz:.1f} in {name}", remedy="export those of each rate by themselves")
     return max(round(usual_hz), 1)
 
 
@@ -122,9 +94,8 @@ def _parts(
 ) -> Iterator[list[tuple[Sample, np.ndarray]]]:
     """Yield the parts of an episode that have no hole, as samples with their RGB frames; a part may be empty.
 
-    A hole is where a frame is missing, where nobody drove, and where a picture cannot be decoded. A part also ends
-    where a sample's chunk does not reach into the next frame. left_out: counts what is no part's. Raises EpisodeError
-    for a picture of another size than `recorded` if there is no `size`, (height, width), to which all are resized.
+    A part also ends where a sample's chunk does not reach into the next frame. left_out: counts what is no part's.
+    Raises EpisodeError for a picture of another size than `recorded` if there is no `size`, (height, width).
     """
     rows: list[tuple[Sample, np.ndarray]] = []
     for sample in episode.samples:
@@ -202,15 +173,12 @@ def _write(
         "faults_while_reading": [asdict(fault) for fault in recordings.faults],
         "episodes_are": [f"{episode.id} from frame {first}" for episode, first, _ in written],
         DRIVEN_BY: [POLICY if episode.by_policy else HUMAN for episode, _, _ in written],
-        OUTCOMES: [episode.outcome for episode, _, _ in written],
+        "outcomes": [episode.outcome for episode, _, _ in written],
     }
 
 
 def _features(shape: tuple[int, ...], video: bool, by_policy: bool, labelled: bool) -> dict[str, Any]:
-    """Return the dataset's columns, as LeRobot's own commands declare them.
-
-    by_policy: whether a policy drove in some recording. labelled: whether the outcome of every recording is known.
-    """
+    """Return the dataset's columns, as LeRobot's own commands declare them."""
     picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
     yes_or_no = {"dtype": "bool", "shape": (1,), "names": None}

@@ -44,11 +44,10 @@ FORMATS = {
 
 
 def write_film(path: Path, flight: Flight, episode: Path | None = None, progress: Progress = silent) -> int:
-    """Write a film of a drive at its own pace, and return how many pictures it has.
+    """Write a film of a drive, .mp4 or .webp, at its own pace, and return how many pictures it has.
 
-    path: .mp4 or .webp. episode: the one recorded with the drive; None takes the one that the log names. Raises
-    RoverError for another kind of file, or if every picture of the drive is damaged; RoverError and EpisodeError as
-    moments_of.
+    episode: None takes the one that the log names. Raises RoverError for another kind of file, or if every picture is
+    damaged; RoverError and EpisodeError as moments_of.
     """
     if path.suffix not in FORMATS:
         raise RoverError(f"{path}: a film ends in {' or '.join(FORMATS)}", found=path.suffix or "no ending")
@@ -72,10 +71,7 @@ def write_film(path: Path, flight: Flight, episode: Path | None = None, progress
 
 
 def _pictures(flight: Flight, moments: list[Moment], form: Format, progress: Progress) -> Iterator[np.ndarray]:
-    """Yield a picture for each time step of the film, (h, w, 3) uint8 RGB with even sides, all of one size.
-
-    A step whose picture is damaged or gone is left out.
-    """
+    """Yield (h, w, 3) uint8 RGB, even sides, all of one size, for each time step whose picture is whole."""
     times_s, step_s = np.array([m.t_s for m in moments]), (flight.period_ms or PERIOD_MS) / 1000
     height: int | None = None
     for at_s in progress(np.arange(times_s[0], times_s[-1] + 1e-9, 1 / form.rate_hz), desc="drawing"):

@@ -1,7 +1,4 @@
-"""Draw a flight log: what was commanded, what the pins did, how old the plans were, how late the loop was.
-
-flight_figure(read_log("flight.log")).savefig("flight.log.png")
-"""
+"""Draw a flight log: what was commanded, what the pins did, how old the plans were, how late the loop was."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,11 +1,7 @@
 """Write a flight log as MCAP, the file format of Foxglove and Rerun: `rover log FILE --mcap out.mcap`.
 
-    counts = write_mcap(Path("out.mcap"), read_log("flight.log"))
-
-Every message is JSON, and its schema is in the file. A message's time is what the system's clock showed when it
-happened. If an episode was recorded with the drive, the file also has its pictures and controls, by the same clock; the
-controls continue after a takeover, when the log's ticks do not. A picture is Foxglove's CompressedImage, an event its
-Log.
+Every message is JSON, with its schema, at the time that the system's clock showed. If an episode was recorded with the
+drive, the file has its pictures and controls too, which continue after a takeover.
 """
 
 import base64
@@ -46,9 +42,8 @@ Message = tuple[int, str, dict[str, Any] | Path]  # nanoseconds by the system's 
 def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[str, int]:
     """Write a drive as MCAP, in order of time, and return how many messages each topic has, without the empty ones.
 
-    episode: the one that was recorded with the drive; None takes the one that the log names, if it is there. A picture
-    that is damaged is left out. Raises RoverError if the log does not say when it began, and EpisodeError if the
-    episode's list of pictures cannot be read.
+    episode: None takes the one that the log names, if it is there. Raises RoverError if the log does not say when it
+    began, and EpisodeError if the episode's list of pictures cannot be read.
     """
     from mcap.writer import Writer  # imported here, so that only this export needs it
 

@@ -1,10 +1,7 @@
 """Find the pictures of a recorded drive, and put beside each what the flight log says of its moment.
 
-    for moment in moments_of(read_log("flight.log")):
-        moment.frame, moment.tick["throttle"]
-
-The flight log has no pictures. They come from the episode that was recorded with the drive (`rover drive --record`),
-which the log names. It has no plans either, only what became of them: a moment has the commands of the next second.
+The pictures come from the episode that the log names (`rover drive --record`). The log has no plans, only what became
+of them: a moment has the commands of the next second.
 """
 
 import csv
@@ -28,11 +25,10 @@ LATE_S = 0.1  # a picture may be this much later than the last tick
 
 @dataclass(frozen=True)
 class Moment:
-    """One picture of a drive.
+    """One picture of a drive, t_s seconds after it began.
 
-    t_s: seconds since the drive began. frame: the picture's file. tick: the tick before it, by the names of Tick; None
-    where nothing was measured. ahead: (n, 2), [steering, throttle] of the ticks of the next second. missed: how many
-    ticks had been missed. event: the newest, as text; empty before the first.
+    frame: its file. tick: the tick before it, by the names of Tick; None where nothing was measured. ahead: (n, 2),
+    [steering, throttle] of the next second. missed: ticks until then. event: the newest, as text, or "".
     """
 
     t_s: float
@@ -46,8 +42,8 @@ class Moment:
 def moments_of(flight: Flight, episode: Path | None = None) -> list[Moment]:
     """Return a moment for each picture of a drive, at least one, in order of time.
 
-    episode: the one recorded with the drive; None takes the one that the log names. Raises RoverError if nothing was
-    driven or the log's header is damaged, and EpisodeError if there are no pictures of this drive.
+    episode: None takes the one that the log names. Raises RoverError if nothing was driven or the log's header is
+    damaged, and EpisodeError if there are no pictures of this drive.
     """
     ticks = flight.ticks
     t_s, period_ms = ticks["t_s"], flight.period_ms or PERIOD_MS
@@ -97,10 +93,9 @@ def began_s(flight: Flight) -> float:
 
 
 def pictures_of(episode: Path) -> list[tuple[float, Path]]:
-    """Return when each picture of an episode was taken, in seconds by the system's clock, and its file, in that order.
+    """Return when each picture was taken, in seconds by the system's clock, and its file inside the episode, by time.
 
-    A file outside the episode's folder, and a picture without a finite time, are left out. Raises EpisodeError if the
-    list of pictures cannot be read.
+    Raises EpisodeError if the list of pictures cannot be read.
     """
     try:
         lines = read_plain(episode / "frame_data.csv", DATA_BYTES).decode("utf-8-sig").splitlines()

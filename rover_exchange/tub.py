@@ -1,15 +1,9 @@
 """Read a donkeycar tub as recordings, for `rover export-dataset`, which writes them as a LeRobotDataset.
 
-    recordings = read_tub("data/tub_1", this_car())
-
-A tub of donkeycar 4 on is manifest.json, catalogs with a line of JSON for each picture, and images/; donkeycar converts
-older ones. Its angle is positive to the right; the car says to which side our steering is, and whether it drives
-backwards: if not, negative throttle is "stopped". Some cars drive forward by negative throttle; that a tub is of such a
-one must be said.
-
-Records that the manifest calls deleted, or at which a pilot drove, are left out. An episode ends where records are
-missing, where another session begins, and at a hole in time. Only a session's first record has a state that is known
-without another one, neutral; the first record of any other episode gives the next one its state, and is left out.
+A tub of donkeycar 4 on is manifest.json, catalogs with a line of JSON for each picture, and images/. Its angle is
+positive to the right; negative throttle is "stopped" for a car that does not drive backwards. Records that the manifest
+calls deleted, or at which a pilot drove, are left out. An episode ends where records are missing, where another session
+begins, and at a hole in time; its first record gives the next one its state, but only a session's is a sample.
 """
 
 import json
@@ -61,8 +55,8 @@ class _Record:
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
     """Read all usable records as samples of two actions.
 
-    throttle: "as-recorded" or "negated", None if the tub does not need it. Raises EpisodeError for what is no tub or
-    has no record, and for one in which three in four throttles are negative, if `throttle` is None.
+    throttle: "as-recorded", "negated" or None. Raises EpisodeError for what is no tub or has no record, and if
+    `throttle` is None and three in four throttles are negative.
     """
     tub = Path(tub)
     faults = Faults(tub)

@@ -2,11 +2,10 @@
 
     found = verdict(judged)
 
-The error of an episode is the mean of its actions' errors. Whole episodes are compared and not single frames, because
-the frames of one drive are alike. A policy is *better* if its error fell significantly on the new held-out episodes,
-and did not rise significantly on the old ones. Significant means that chance would produce a change of this size, up or
-down, in less than 5 of 100 cases. It is computed by Fisher's randomisation test: if only chance were at work, each
-episode's difference could equally well have had the other sign. The test needs at least six episodes of a kind.
+Whole episodes are compared and not single frames, because the frames of one drive are alike. A policy is *better* if
+its error fell significantly on the new held-out episodes, and did not rise significantly on the old ones. That is
+computed by Fisher's randomisation test: if only chance were at work, each episode's difference could equally well have
+had the other sign. The test needs at least six episodes of a kind.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,10 +60,7 @@ class Judged:
 
 
 def chance_of(changes: Sequence[float]) -> float:
-    """The two-sided p-value: how often changes with random signs have a mean at least as far from 0.
-
-    If signs are drawn at random, the actual ones count as one more draw, so that the result is never 0.
-    """
+    """The two-sided p-value: how often changes with random signs have a mean at least as far from 0."""
     found = np.asarray(changes, float)
     if len(found) <= EXACT:
         signs = np.array(list(product((-1.0, 1.0), repeat=len(found))))

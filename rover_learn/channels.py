@@ -1,15 +1,13 @@
 """A backbone with fewer channels inside its blocks, in LeRobot's shape: those left out are zeros in the file.
 
-    weights, notes = without_channels(weights, config, 0.5, pictures, rng)
+    weights = without_channels(weights, config, 0.5, pictures, rng)
 
-A basic block's first convolution gives channels that its second one alone reads; no residual sum sees them. One after
-the other is kept that those before it explain least, and the second convolution is refitted to what all of them gave.
-LeRobot runs such a file as any other. Our policies are built without channels that are always zero
-(`act.fold_block`), and training keeps them so: where a filter and its reader are zero both, neither gets a gradient.
+A basic block's first convolution gives channels that its second one alone reads. One after the other is kept that those
+before it explain least, and the second convolution is refitted to what all of them gave. Our policies are built without
+channels that are always zero (`act.fold_block`), and training keeps them so: they get no gradient.
 """
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,13 +32,11 @@ def kept_of(channels: int, share: float) -> int:
 @torch.no_grad()
 def without_channels(
     weights: dict[str, Tensor], config: ActConfig, share: float, pictures: Iterable[Tensor], rng: np.random.Generator
-) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+) -> dict[str, Tensor]:
     """The same policy with that share of each block's inner channels; the others are zeros.
 
-    weights: by LeRobot's names without the leading `model.`, of a backbone of basic blocks. share: above 0, at most 1.
-    pictures: (B, height, width, 3) uint8 RGB each, of the policy's size. rng: chooses where in the pictures.
-    Returns the weights, float32, and of each block that lost channels {"block", "channels", "of", "error_pct",
-    "error_refit_pct"}: how far its second convolution is off on the pictures, see `refit.refit_layer`.
+    weights: by LeRobot's names without `model.`, of a backbone of basic blocks. share: above 0, at most 1. pictures:
+    (B, height, width, 3) uint8 RGB each, of the policy's size. rng: chooses where in the pictures. Returns float32.
     """
     made = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
     names = backbone_blocks(config.backbone)
@@ -53,21 +49,17 @@ def without_channels(
         for patches in F.unfold(x, 3, padding=1).transpose(1, 2):  # (B, places, channels * TAPS)
             yield patches[rng.permutation(len(patches))[:PATCHES]]
 
-    notes = []
-    for name, gram in grams_of(
-        readers, some_patches, lambda: [policy.features(shown).shape for shown in pictures]
-    ).items():
+    grams = grams_of(readers, some_patches, lambda: [policy.features(shown).shape for shown in pictures])
+    for name, gram in grams.items():
         kept = _choose(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
-        errors = _leave_out(made, name, kept, gram)
-        notes.append({"block": name, "channels": len(kept), "of": widths[name], **errors})
-    return made, notes
+        _leave_out(made, name, kept, gram)
+    return made
 
 
 def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:
     """(count,) channels, in order: the next is always the one that those before it explain least, times its reader.
 
-    That is a Cholesky decomposition with pivots. What a channel means alone, by its size or by its gradient, says
-    nothing of what the others could say for it.
+    That is a Cholesky decomposition with pivots.
     """
     channels = reader.shape[1]
     centres = torch.cat([torch.arange(channels) * TAPS + CENTRE, torch.tensor([len(gram) - 1])])
@@ -83,13 +75,13 @@ def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:
     return torch.tensor(chosen[:count]).sort().values
 
 
-def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor) -> dict[str, float]:
+def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor) -> None:
     """Zero a block's other channels and refit their reader, in place; its batch norm takes the constant."""
     reader = weights[f"{name}.conv2.weight"]
     outputs, channels = reader.shape[:2]
     whole = torch.cat([reader.double().flatten(1), torch.zeros(outputs, 1, dtype=torch.float64)], 1).T
     inputs = (kept[:, None] * TAPS + torch.arange(TAPS)).flatten()
-    refit, errors = refit_layer(whole, gram, inputs)
+    refit = refit_layer(whole, gram, inputs)
     gone = torch.ones(channels, dtype=torch.bool)
     gone[kept] = False
     for part in ("conv1.weight", "bn1.weight", "bn1.bias"):
@@ -97,4 +89,3 @@ def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor
     reader.zero_()
     reader[:, kept] = refit[:-1].T.reshape(outputs, len(kept), 3, 3).float()
     weights[f"{name}.bn2.bias"] += norm_gain(Weights(weights).at(f"{name}.bn2")) * refit[-1].float()
-    return errors

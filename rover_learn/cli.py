@@ -68,7 +68,7 @@ def distill(
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
-    distill.json in the run's folder. If it is ended at any moment, the same command continues where it was.
+    distill.json in the run's folder. Run it again to resume.
     """
     from rover_learn.distill import DistillRecipe, phases_of, summary
     from rover_learn.distill import distill as teach
@@ -101,8 +101,7 @@ def finetune(
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
     imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
-    folder, and says on which held-out episodes it came closer to the human. If it is ended at any moment, the same
-    command continues where it was.
+    folder, and says on which held-out episodes it came closer to the human. Run it again to resume.
     """
     from rover_learn.acceptance import summary
     from rover_learn.finetune import FinetuneRecipe
@@ -122,8 +121,7 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
     """Make all runs that the file SHEET asks for; `rover inspect` of the sweep's folder compares them.
 
     SHEET names checkpoints, recordings, students to teach and settings to vary. Every combination is a run with its own
-    folder inside the sweep's. Finished runs are not made again: after Ctrl-C, a power cut or a new line in SHEET, the
-    same command continues. Runs that fail are named at the end and do not harm the others.
+    folder inside the sweep's. Run it again to resume. Runs that fail are named at the end.
     """
     from rover_learn import sweep as sweeping
 
@@ -157,10 +155,9 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
     """Train LeRobot's ACT on the recordings in EPISODES and write the checkpoint OUTPUT, as a trainer's .pth.
 
     `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: it is trained at a
-    quarter of its pixels and then carried to 640x360. The rate of its plans is that of the recordings. It is held
-    against a part of the recordings that it does not learn from, and keeps its best weights; the held-out part is
-    left for `rover run`. If it is ended at any moment (Ctrl-C, a power cut), the same command continues where it was.
-    For that it keeps up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover, until it is done.
+    quarter of its pixels and then carried to 640x360. The rate of its plans is that of the recordings, whose held-out
+    part is left for `rover run`. Run it again to resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or
+    ~/.cache/rover.
     """
     from rover_learn.train import train as train_policy
 

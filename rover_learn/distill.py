@@ -81,10 +81,9 @@ def distill(
 ) -> Path:
     """Teach a student of that shape what the checkpoint plans on these recordings. Returns the run's folder.
 
-    recipe: params.yml's if None. device: 'cpu', 'cuda' or None for the best there is.
-    Ended at any moment and started again with the same arguments, it goes on and gives the same student. The folder
-    appears only when it is complete. Raises TrainingError for a student, a device or recordings that cannot be, and for
-    a run that is there; CheckpointError, EpisodeError; RoverError while another process makes it.
+    recipe: params.yml's if None. device: 'cpu', 'cuda' or None for the best there is. Ended at any moment and started
+    again with the same arguments, it goes on and gives the same student. The folder appears only when it is complete.
+    Raises TrainingError for a student, a device or recordings that cannot be, and for a run that is there.
     """
     folder, where = free_folder(runs_dir, name), training_device(device, TrainingError)
     recipe = recipe or DistillRecipe.of()
@@ -93,10 +92,15 @@ def distill(
     config = student_config(teacher, shape)
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     if share is None and config == replace(teacher.config, vae_layers=0):
-        remedy = "give it a smaller picture, fewer layers or channels"
-        raise TrainingError("this student would be its teacher", remedy=remedy)
-    given: dict[str, Any] = {"recipe": recipe, "opened": opened, "share": share}
-    return Distillation(origin=teacher, config=config, device=where, progress=progress, **given).make(folder)
+        raise TrainingError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
+    work: dict[str, Any] = {
+        "origin": teacher,
+        "config": config,
+        "recipe": recipe,
+        "device": where,
+        "progress": progress,
+    }
+    return Distillation(opened=opened, share=share, **work).make(folder)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,20 +136,18 @@ class Distillation(Work):
             backbone = self._train_backbone(lessons, saved)
             losses = dict(saved.losses)
         with Resumable(own, self.progress) as saved:
-            weights, notes = self._start(lessons, backbone)
+            weights = self._start(lessons, backbone)
             policy = BatchedPolicy(self.config, weights).to(self.device)
             if self.share is not None:
                 lessons = lessons.apart(own)
                 lessons.see(saved, policy, self.rng("tokens"))
             policy.thaw()
             self.train_policy(saved, policy, Pool([(lessons, False)]), self.loss, seen="tokens", slower=SLOWER)
-        return Learned(policy.weights(), losses | saved.losses, own, notes)
+        return Learned(policy.weights(), losses | saved.losses, own)
 
     def _train_backbone(self, lessons: Lessons, saved: Resumable) -> dict[str, Tensor]:
         """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens, unless
-        it is to lose channels.
-
-        Returns its weights by LeRobot's names. At the teacher's own size it is the teacher's, as it is.
+        it is to lose channels. Returns its weights; at the teacher's own size they are the teacher's.
         """
         teacher = self.origin.at_size(*self.config.image_sizes[0])
         policy = BatchedPolicy(teacher.config, teacher.weights).to(self.device)
@@ -161,54 +163,49 @@ class Distillation(Work):
             lessons.see(saved, policy, self.rng("tokens"))
         return {name: value for name, value in policy.weights().items() if name.startswith("backbone.")}
 
-    def _start(self, lessons: Lessons, backbone: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """The student before its transformer learns, and what was noted of what it does without, by part."""
+    def _start(self, lessons: Lessons, backbone: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The student before its transformer learns."""
         rows = pick_evenly(range(len(lessons)), self.recipe.unit_frames)
         states = torch.from_numpy(lessons.data.states)
         inputs = ((states[i][None], torch.from_numpy(lessons.frames[np.array([i])][0])) for i in rows)
         seeing = replace(self.origin, weights=self.origin.weights | backbone)
-        weights, narrowed = initial_weights(seeing, self.config, inputs)
-        thinner: list[dict[str, Any]] = []
+        weights = initial_weights(seeing, self.config, inputs)
         if self.share is not None:
             pictures = self.progress(lessons.each_once(), desc="channels", total=lessons.blocks)
             shown = (torch.from_numpy(block) for block in pictures)
-            weights, thinner = without_channels(weights, self.config, self.share, shown, self.rng("channels"))
-        return weights, {"backbone": thinner, "feed_forward": narrowed}
+            weights = without_channels(weights, self.config, self.share, shown, self.rng("channels"))
+        return weights
 
     def leave(self, new: Path, name: str, learned: Learned) -> None:
         """Judge the student, and write its files, its artifact and distill.json."""
         teacher, parts, recordings = self.origin, self.opened.parts, self.opened.recordings
         held_out, choosing = (pick_evenly(each, self.recipe.judged_frames) for each in (parts.held_out, parts.choosing))
-        policies = (
-            ("teacher", BatchedPolicy(teacher.config, teacher.weights), teacher.weights, None),
-            (name, own := BatchedPolicy(self.config, learned.weights), learned.weights, self.share),
-        )
+        of_teacher = "teacher", teacher.config, teacher.weights, None
         every, students = [], []
-        for named, policy, weights, share in policies:
-            config = policy.config
+        for named, config, weights, share in (of_teacher, (name, self.config, learned.weights, self.share)):
+            policy = BatchedPolicy(config, weights).to(self.device)
             row = {"name": named, **dict(zip(("height", "width"), config.image_sizes[0], strict=True))}
             row |= {"decoder_layers": config.decoder_layers, "feedforward": config.feedforward}
             row |= {"backbone_channels": share, "gmac": gmac(config, weights)}
-            every.append(plans_of(policy.to(self.device), held_out, self.progress))
+            every.append(plans_of(policy, held_out, self.progress))
             students.append(row | errors_of(every[-1], every[0], held_out, self.action_range()))
-        chosen, driven = plans_of(own, choosing, self.progress), ~np.stack([s.is_pad for s in choosing])
+        chosen, driven = plans_of(policy, choosing, self.progress), ~np.stack([s.is_pad for s in choosing])
         loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
         hashes = self.write_policy(new, name, learned.weights, loss, recordings.root.name)
         self._quantize(new)
+        metrics: dict[str, Any] = {
+            "students": students,
+            "losses": learned.losses,
+            "files_sha256": hashes,
+            "note": NOBODY_DROVE,
+        }
+        metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
+        metrics["warnings"] = not_judged(self.action_range())
         write_stage(
             new / "distill.json",
             "distill",
-            params=self.described(),
-            metrics={
-                "students": students,
-                "losses": learned.losses,
-                **learned.notes,
-                "judged_frames": len(held_out),
-                "held_out_episodes": parts.episodes["held_out"],
-                "warnings": not_judged(self.action_range()),
-                "note": NOBODY_DROVE,
-                "files_sha256": hashes,
-            },
+            params=self.described,
+            metrics=metrics,
             inputs={teacher.path.name: teacher.sha256} | recordings.hashes(),
         )
 

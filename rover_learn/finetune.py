@@ -4,10 +4,7 @@
 
 The policy learns what humans did, and nothing else. If a policy drove in an episode too, the human's frames in it are
 corrections: they show what to do in places that only that policy reaches, so they are drawn more often. Frames that a
-policy or nobody drove are not imitated, and a plan ends where its human let go. The second before a takeover is not
-imitated either: the human answers what the policy has done by then, so a plan that begins earlier would have to make
-the same mistake first. Published methods do the same: HG-DAgger learns from the human's states alone, and Sirius gives
-no weight to the moments before an intervention.
+policy or nobody drove are not imitated, and a plan ends where its human let go, as in HG-DAgger and Sirius.
 
 It learns in phases, as a student does (see `distill`): first the transformer on what its backbone sees, then everything
 together at a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
@@ -39,7 +36,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, pick_evenly
-from rover_lib.workshop.run.session import check_sizes, training_device
+from rover_lib.workshop.run.session import training_device
 
 SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = KINDS = ("demonstrations", "new_demonstrations", "corrections")
@@ -73,28 +70,24 @@ def finetune(
 
     episodes: folders of recordings. The first has the old ones, which the checkpoint was trained on; the others have
     the new ones. An episode in which a policy drove is new in whichever folder it is. recipe: None takes that of
-    params.yml. device: 'cpu', 'cuda', or None for the best that there is.
-
-    If it is ended at any moment and started again with the same arguments, it goes on and gives the same policy. The
-    folder appears only when it is complete. Raises TrainingError for a name, a device or recordings that cannot be
-    used; CheckpointError, EpisodeError; RoverError while another process makes a run of that name.
+    params.yml. device: 'cpu', 'cuda', or None for the best that there is. It resumes as `distill` does.
+    Raises TrainingError for a name, a device or recordings that cannot be used; CheckpointError, EpisodeError.
     """
     folder, where = free_folder(runs_dir, name), training_device(device, TrainingError)
     recipe = recipe or FinetuneRecipe.of()
     parent, read = _open(checkpoint, [Source.of(each) for each in episodes], progress)
     material = _part_episodes(read, recipe)
-    given: dict[str, Any] = {"recipe": recipe, "material": material, "device": where, "progress": progress}
-    return Finetuning(origin=parent, config=parent.config, **given).make(folder)
+    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress}
+    return Finetuning(origin=parent, config=parent.config, material=material, **given).make(folder)
 
 
 # --- what is learned from ---------------------------------------------------------------------------------------------
 
 
 def human_samples(episode: Episode) -> tuple[Sample, ...]:
-    """Return an episode's samples that a human drove. Their chunks are padded from where that human stopped driving.
+    """Return an episode's samples that a human drove, their chunks padded from where that human stopped driving.
 
-    If somebody else drove in the episode too, a frame without a sample, such as one whose picture is damaged, also ends
-    a chunk, because nobody knows who drove there.
+    If somebody else drove too, a frame without a sample, such as a damaged picture, also ends a chunk.
     """
     if all(s.driver == HUMAN for s in episode.samples):
         return episode.samples
@@ -112,19 +105,14 @@ def human_samples(episode: Episode) -> tuple[Sample, ...]:
 class _Material:
     """What the policy learns from, and what judges it.
 
-    taught: (kind, a human's frames) of each of the recordings, thinned. The kinds are DEMONSTRATIONS (old), ADDITIONS
-    (new demonstrations) and CORRECTIONS. held_out: (episode's name, OLD or NEW, a human's frames) of those that judge.
-    left_out: how many frames are not imitated, because a policy or nobody drove.
+    taught: (kind, a human's frames) of each of the recordings, thinned. held_out: (episode's name, OLD or NEW, a
+    human's frames) of those that judge. left_out: how many frames a policy or nobody drove.
     """
 
     recordings: tuple[Recordings, ...]
     taught: tuple[tuple[str, tuple[Sample, ...]], ...]
     held_out: tuple[tuple[str, str, tuple[Sample, ...]], ...]
     left_out: int
-
-    def count(self, kind: str) -> int:
-        """Count the frames of this kind."""
-        return sum(len(samples) for each, samples in self.taught if each == kind)
 
 
 def _open(
@@ -136,7 +124,6 @@ def _open(
         raise TrainingError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
     parent = load_checkpoint(checkpoint)
     refuse_no_car(parent)
-    check_sizes(parent)
     places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
@@ -272,21 +259,16 @@ class Finetuning(Work):
         errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
         hashes = self.write_policy(new, name, learned.weights, loss, material.recordings[-1].root.name)
-        write_stage(
-            new / "finetune.json",
-            "finetune",
-            params=self.described(),
-            metrics={
-                "learned_from": {kind: material.count(kind) for kind in KINDS} | {"not_imitated": material.left_out},
-                "held_out": [each.row() for each in judged],
-                "verdict": verdict(judged),
-                "losses": learned.losses,
-                "warnings": not_judged(self.action_range()),
-                "files_sha256": hashes,
-            },
-            inputs={self.origin.path.name: self.origin.sha256}
-            | {f"{r.root.name}/{file}": digest for r in material.recordings for file, digest in r.hashes().items()},
-        )
+        counts = dict.fromkeys(KINDS, 0) | {"not_imitated": material.left_out}
+        for kind, samples in material.taught:
+            counts[kind] += len(samples)
+        metrics = {"learned_from": counts, "losses": learned.losses, "files_sha256": hashes}
+        metrics |= {"held_out": [each.row() for each in judged], "verdict": verdict(judged)}
+        metrics["warnings"] = not_judged(self.action_range())
+        inputs = {self.origin.path.name: self.origin.sha256}
+        for r in material.recordings:
+            inputs |= {f"{r.root.name}/{file}": digest for file, digest in r.hashes().items()}
+        write_stage(new / "finetune.json", "finetune", params=self.described, metrics=metrics, inputs=inputs)
 
 
 def _weights(recipe: FinetuneRecipe, kind: str, lessons: Lessons, units: np.ndarray) -> np.ndarray:

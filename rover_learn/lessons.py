@@ -5,8 +5,7 @@
     frames = lessons.pictures(rows, views)
 
 Every sample is there twice, as it is and mirrored with its steering negated, and the teacher plans on both. Half of the
-states in motion are replaced by another sample's, and the teacher plans with those, because a plan answers a picture
-and a state.
+states in motion are replaced by another sample's.
 
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
@@ -127,10 +126,9 @@ def in_another_light(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray
 class Lessons:
     """n samples, each seen in two views: a file has a row for each sample, or the row 2 * sample + view.
 
-    data: the recorded samples. asked: (2 n, 2) float32, the states with which the teacher plans. frames: a row for each
-    sample, (height, width, 3) uint8 RGB at the student's size, not mirrored. maps: for each view, (D, h, w) float16,
-    the teacher's feature map pooled to the student's grid. plans: for each view, (C, A) float32, the teacher's. tokens:
-    for each view, (D, h, w) float16, the student's own feature map; empty until `see`.
+    asked: (2 n, 2) float32, the states with which the teacher plans. frames: for each sample, (height, width, 3) uint8
+    RGB at the student's size, not mirrored. maps: for each view, (D, h, w) float16, the teacher's feature map pooled to
+    the student's grid. plans: for each view, (C, A) float32, the teacher's. tokens: as maps, the student's own.
     """
 
     data: Frames
@@ -144,10 +142,7 @@ class Lessons:
     def open(
         cls, folder: Path, samples: tuple[Sample, ...], config: ActConfig, teacher: Checkpoint, rng: np.random.Generator
     ) -> "Lessons":
-        """Open the lessons in a folder, which must be used with these arguments only.
-
-        config: the student's. rng: draws the states.
-        """
+        """Open the lessons in a folder of these arguments. config: the student's. rng: draws the states."""
         (size,) = config.image_sizes
         data = Frames.of(samples, size)
         seen = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
@@ -258,10 +253,9 @@ class Batch:
         return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
 
     def states(self) -> Tensor:
-        """The states, (B, 2), with which the teacher planned.
+        """The states, (B, 2), with which the teacher planned; of new recordings, with a random share of the steering.
 
-        New recordings keep the side of their steering and a random share of its size: if nothing to steer to is in
-        sight, only the state says on which side it was, and the human steered more than the policy will.
+        If nothing to steer to is in sight, only the state says on which side it was.
         """
         each = []
         for p in self.parts:
@@ -290,10 +284,9 @@ class Batch:
 
 
 class Pool:
-    """All lessons of a training, from which batches are drawn.
+    """All lessons of a training, each with whether it was recorded after the teacher was trained.
 
-    lessons: each with whether it was recorded after the teacher was trained. weights: how often each sample is drawn,
-    (n of all lessons,); None: all alike.
+    weights: how often each sample is drawn, (n of all lessons,); None: all alike.
     """
 
     def __init__(self, lessons: Sequence[tuple[Lessons, bool]], weights: np.ndarray | None = None):

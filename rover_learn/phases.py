@@ -1,15 +1,11 @@
-"""What the trainings share: recipes that are data, the phases, and what a student or a finetuned policy leaves.
-
-recipe = DistillRecipe.of(steps=200)
-work.train_policy(saved, policy, pool, loss, seen="maps", slower=10)
-folder = work.make("runs", "fast")
-"""
+"""What the trainings share: recipes that are data, the phases, and what a student or a finetuned policy leaves."""
 
 import functools
 import shutil
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, asdict, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -67,9 +63,7 @@ class Recipe:
         known = {each.name: each for each in fields(cls)}
         needed = {name for name, each in known.items() if each.default is MISSING}
         if wrong := sorted(set(values) - set(known) | needed - set(values)):
-            what = "is missing" if wrong[0] in known else "is unknown"
-            remedy = f"it has {', '.join(sorted(known))}"
-            raise TrainingError(f"params.yml: {where}: {wrong[0]} {what}", remedy=remedy)
+            raise TrainingError(f"params.yml: {where}: missing or unknown", found=wrong[0])
         rules = {name: _rule(each) for name, each in known.items() if name in values and each.type in (int, float)}
         if broken := broken_rule(values, rules):
             name, words, found = broken
@@ -106,10 +100,7 @@ class LessonRecipe(Recipe):
 
     @classmethod
     def of(cls, *, steps: int | None = None, phases: Collection[str] | None = None, **given: Any) -> Self:
-        """Take the recipe of params.yml, with each given value that is not None instead.
-
-        steps: in all, see `of_steps`. Raises TrainingError for names and values that it does not have.
-        """
+        """Take the recipe of params.yml, with each given value that is not None instead. Raises TrainingError."""
         values = params()[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
         recipe = cls.read(cls.SECTION, values)
         return recipe if steps is None else recipe.of_steps(steps, phases)
@@ -117,20 +108,15 @@ class LessonRecipe(Recipe):
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """A policy that has learned.
-
-    weights: by LeRobot's names without the leading `model.`. losses: by phase. folder: where the phases are saved.
-    notes: for the stage's file.
-    """
+    """A policy that has learned. losses: by phase. folder: where the phases are saved."""
 
     weights: dict[str, Tensor]
     losses: dict[str, list[float]]
     folder: Path
-    notes: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Work:
+class Work(ABC):
     """What is to be done, and where. origin: what the policy learns from; ROLE and VERB name it in files."""
 
     ROLE: ClassVar[str]
@@ -142,17 +128,17 @@ class Work:
     device: torch.device
     progress: Progress
 
+    @abstractmethod
     def action_range(self) -> dict[str, tuple[float, float]]:
         """Return the smallest and largest recorded value of each action."""
-        raise NotImplementedError
 
+    @abstractmethod
     def learn(self) -> Learned:
         """Train all phases."""
-        raise NotImplementedError
 
+    @abstractmethod
     def leave(self, new: Path, name: str, learned: Learned) -> None:
         """Judge the policy, and write all files of the run of that name into `new`."""
-        raise NotImplementedError
 
     def make(self, folder: Path) -> Path:
         """Learn, and leave the run's folder, which appears when it is complete. Returns it."""
@@ -210,8 +196,9 @@ class Work:
         self.train(saved, "transformer", model, rate, pool, lambda b: loss(policy.plan(b.seen(seen), b.states()), b))
         self.train(saved, "together", policy, rate / slower, pool, lambda b: loss(policy(b.pictures(), b.states()), b))
 
+    @property
     def described(self) -> dict[str, Any]:
-        """Return the recipe and the device, as a stage's params."""
+        """The recipe and the device, as a stage's params."""
         return asdict(self.recipe) | {"device": self.device.type}
 
     def write_policy(
@@ -221,7 +208,7 @@ class Work:
         settings = {"learning_rate": self.recipe.rate, "batch_size": self.recipe.batch, "seed": self.recipe.seed}
         settings |= {"data_dir": recordings, "output_dir": name, "device": self.device.type}
         origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}
-        return write_both(folder, self.config, weights, loss, origin | {self.VERB: self.described()}, **settings)
+        return write_both(folder, self.config, weights, loss, origin | {self.VERB: self.described}, **settings)
 
 
 def cache_for(kind: str, made_of: Mapping[str, Any]) -> Path:

@@ -1,7 +1,7 @@
 """Refit a layer that reads fewer inputs than before to the output that all of them gave.
 
 grams = grams_of({"head": layer}, rows_of, run)        # of what each layer reads while run() runs
-weight, errors = refit_layer(whole, grams["head"], kept)
+weight = refit_layer(whole, grams["head"], kept)
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -29,10 +29,7 @@ class Gram:
             self._multiply()
 
     def mean(self) -> Tensor:
-        """Return the mean, (inputs + 1, inputs + 1) float64. At least one row must have been added.
-
-        It can be asked for once: for 512 channels of 3x3 it has 170 MB, and another would be in memory beside it.
-        """
+        """Return the mean, (inputs + 1, inputs + 1) float64, once: for 512 channels of 3x3 it has 170 MB."""
         if self._waiting:
             self._multiply()
         assert self._sum is not None
@@ -71,24 +68,15 @@ def grams_of(
     return {name: gram.mean() for name, gram in grams.items()}
 
 
-def refit_layer(whole: Tensor, gram: Tensor, kept: Tensor) -> tuple[Tensor, dict[str, float]]:
+def refit_layer(whole: Tensor, gram: Tensor, kept: Tensor) -> Tensor:
     """Compute the weights of the inputs that stay, by least squares.
 
-    whole: (inputs + 1, outputs) float64, a row of weights for each input, and the bias last. gram: from `Gram.mean`.
-    kept: (n,), the indices of the inputs that stay. Returns the weights, (n + 1, outputs) float64, and how far the
-    output is off on the rows, in percent of its own size: error_pct with the other inputs left out, error_refit_pct
-    with the weights refitted after that.
+    whole: (inputs + 1, outputs) float64, the bias last. gram: from `Gram.mean`. kept: (n,), the inputs that stay.
+    Returns the weights, (n + 1, outputs) float64.
     """
     rows = torch.cat([kept, torch.tensor([len(gram) - 1])])  # and the 1 that carries the bias
     cut = whole[rows]
     inside = gram[rows][:, rows]
     # The least squares are of what is missing, so that the old weights stay where the rows say nothing.
     ridge = RIDGE * inside.diagonal()[:-1].mean() * torch.eye(len(rows), dtype=gram.dtype)
-    refit = cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)
-
-    def error_pct(own: Tensor) -> float:
-        off = -whole.clone()
-        off[rows] += own
-        return 100 * ((off * (gram @ off)).sum() / (whole * (gram @ whole)).sum()).clamp(min=0).sqrt().item()
-
-    return refit, {"error_pct": error_pct(cut), "error_refit_pct": error_pct(refit)}
+    return cut + torch.linalg.solve(inside + ridge, gram[rows] @ whole - inside @ cut)

@@ -2,17 +2,15 @@
 
     shape = StudentShape(height=180, width=320, decoder_layers=2, feedforward=1600)
     config = student_config(teacher, shape)
-    weights, notes = initial_weights(teacher, config, inputs)
+    weights = initial_weights(teacher, config, inputs)
 
-No weight of ACT depends on the picture's size, and positions are relative to it, so a student takes the backbone, the
-projections and the attention as they are. It takes the first of the decoder's layers, and the most important units of
-every feed-forward. The VAE's encoder is left out, because only training on recordings needs it, and a student learns
-its teacher's plans.
+No weight of ACT depends on the picture's size, so a student takes the backbone, the projections and the attention as
+they are, the first of the decoder's layers, and the most important units of every feed-forward. The VAE's encoder is
+left out, as only training on recordings needs it.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,9 +41,8 @@ class StudentShape:
 def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     """Return the student's config.
 
-    Raises TrainingError for a student that exceeds its teacher in anything, for a backbone whose channels cannot be
-    left out, and for a teacher that cannot teach from a car's recordings; CheckpointError for an image size at which
-    the teacher's weights do not run.
+    Raises TrainingError for a student that exceeds its teacher in anything, a backbone whose channels cannot be left
+    out, and a teacher of no car; CheckpointError for an image size at which the teacher's weights do not run.
     """
     c = teacher.config
     refuse_no_car(teacher)
@@ -54,10 +51,7 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     teachers = (height, width, c.decoder_layers, c.feedforward)
     for name, value, most in zip(("height", "width", "decoder layers", "feed-forward"), own, teachers, strict=True):
         if value is not None and not 1 <= value <= most:
-            remedy = "a student is a part of its teacher; train a larger policy on recordings instead"
-            raise TrainingError(
-                f"a student's {name} must be from 1 to its teacher's, {most}", found=value, remedy=remedy
-            )
+            raise TrainingError(f"a student's {name} must be from 1 to its teacher's, {most}", found=value)
     if (share := shape.backbone_channels) is not None:
         if not 0 < share <= 1:
             raise TrainingError("the share of the backbone's channels must be above 0, at most 1", found=share)
@@ -79,8 +73,7 @@ def refuse_no_car(policy: Checkpoint) -> None:
     """
     c = policy.config
     if len(c.cameras) != 1 or not c.state_names == c.action_names == ACTION_NAMES:
-        states, actions = quote_all(c.state_names), quote_all(c.action_names)
-        found = f"{len(c.cameras)} cameras, of state {states}, of action {actions}"
+        found = f"{len(c.cameras)} cameras, states {quote_all(c.state_names)}, actions {quote_all(c.action_names)}"
         remedy = "if it is of one camera, steering and throttle, name them so in the dataset's meta/info.json"
         raise TrainingError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
 
@@ -91,30 +84,22 @@ def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
     return sum(multiply_accumulates(ACT(config, weights)).values()) / 1e9
 
 
-def initial_weights(
-    teacher: Checkpoint, config: ActConfig, inputs: Iterable[tuple[Tensor, ...]]
-) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
+def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tuple[Tensor, ...]]) -> dict[str, Tensor]:
     """Return the teacher's weights in the student's shape, by LeRobot's names without the leading `model.`.
 
     inputs: calibration frames as the student sees them (`act.inputs_of`); they are only run if units are left out.
-    The weights are float32, each with its own memory. The second value returned has for each feed-forward that lost
-    units {"layer", "units", "of", "error_pct", "error_refit_pct"}: the errors say how far its output is off on the
-    frames, in percent of the output's own size, with the units left out, and with `down` refitted after that.
     """
     kept = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
     if config.feedforward == teacher.config.feedforward:
-        return kept, []
-    wide, notes = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights), []
-    downs = {}
+        return kept
+    wide, downs = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights), {}
     for name, module in wide.named_modules():
         if isinstance(module, FeedForward):
             part, index, _ = name.split(".")
             downs[f"{part}.layers.{index}"] = module.down
     for name, gram in grams_of(downs, lambda x: x[:1], lambda: [wide(*x)[0] for x in inputs]).items():
-        layer, notes_of_layer = _narrow(kept, name, gram, config.feedforward)
-        kept |= layer
-        notes.append(notes_of_layer)
-    return kept, notes
+        kept |= _narrow(kept, name, gram, config.feedforward)
+    return kept
 
 
 def _is_kept(name: str, config: ActConfig) -> bool:
@@ -124,9 +109,7 @@ def _is_kept(name: str, config: ActConfig) -> bool:
     return part != "decoder" or not rest or int(rest.split(".")[0]) < config.decoder_layers
 
 
-def _narrow(
-    weights: dict[str, Tensor], layer: str, gram: Tensor, units: int
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _narrow(weights: dict[str, Tensor], layer: str, gram: Tensor, units: int) -> dict[str, Tensor]:
     """Keep one feed-forward's most important units, and refit `down` to the output that all units gave.
 
     A unit's importance is its mean magnitude, or, where activations may be negative, the root of its mean square.
@@ -134,11 +117,10 @@ def _narrow(
     down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values
-    refit, errors = refit_layer(torch.cat([down, bias[:, None]], 1).T, gram, best)
-    made = {
+    refit = refit_layer(torch.cat([down, bias[:, None]], 1).T, gram, best)
+    return {
         f"{layer}.linear1.weight": weights[f"{layer}.linear1.weight"][best].clone(),
         f"{layer}.linear1.bias": weights[f"{layer}.linear1.bias"][best].clone(),
         f"{layer}.linear2.weight": refit[:-1].T.float().contiguous(),
         f"{layer}.linear2.bias": refit[-1].float(),
     }
-    return made, {"layer": layer, "units": units, "of": len(gram) - 1, **errors}

@@ -1,12 +1,4 @@
-"""Make a run of every combination of checkpoints, students, settings and seeds in a sheet, on Dask.
-
-    jobs = read_sheet("sweep.yml")
-    with open_cluster(workers=2) as client:
-        failed = sweep(jobs, "runs/sweep", client)
-
-A run is what `rover run` makes. One that is there is not made again, so an interrupted sweep continues where it was.
-docs/sweep.md describes the sheet, clusters, and the cost of a thousand policies.
-"""
+"""Make a run of every combination of checkpoints, students, settings and seeds in a sheet, on Dask (docs/sweep.md)."""
 
 import hashlib
 import io
@@ -39,10 +31,9 @@ MADE = "run.json"  # what a job leaves last
 
 @dataclass(frozen=True)
 class Job:
-    """One run.
+    """One run. student: options of `rover distill` for a student that is taught first; {} judges the checkpoint itself.
 
-    student: options of `rover distill` for a student that is taught first and then judged; {} judges the checkpoint
-    itself. notebooks: parameters of the notebooks. params: values of params.yml by their place, say "calibration.seed".
+    notebooks: parameters of the notebooks. params: values of params.yml by their place, say "calibration.seed".
     """
 
     checkpoint: str
@@ -52,15 +43,10 @@ class Job:
     params: Mapping[str, Any]
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Everything that may differ between two runs."""
-        return {"checkpoint": self.checkpoint, **self.student, **self.notebooks, **self.params}
-
-    @property
     def name(self) -> str:
         """The run's name: what it varies, and digits that change with its settings and with its checkpoint's file."""
-        told = [f"{key.split('.')[-1]}{value}" for key, value in self.settings.items() if key != "checkpoint"]
-        path = Path(self.checkpoint)
+        settings, path = {**self.student, **self.notebooks, **self.params}, Path(self.checkpoint)
+        told = [f"{key.split('.')[-1]}{value}" for key, value in settings.items()]
         made = [path.stat().st_size, path.stat().st_mtime_ns] if path.is_file() else []
         digits = hashlib.sha256(json.dumps([asdict(self), made], sort_keys=True).encode()).hexdigest()[:6]
         return re.sub(r"[^\w.-]+", "_", "-".join([path.stem, *told, digits])).lstrip(".-")
@@ -81,8 +67,7 @@ def read_sheet(path: Path | str) -> list[Job]:
     varied = {key: content.get(key) or {} for key in ("notebooks", "params")}
     paths, mappings = (*checkpoints, episodes), (*students, *varied.values())
     if not checkpoints or not all(isinstance(p, str) for p in paths) or not all(isinstance(m, dict) for m in mappings):
-        what = "it needs paths of checkpoints and one folder of episodes; students, notebooks and params are mappings"
-        raise ParamsError(f"{path}: {what}", remedy="docs/sweep.md has a sheet to begin with")
+        raise ParamsError(f"{path}: not a sheet of a sweep", remedy="docs/sweep.md has one to begin with")
     # A misspelt name would not act: runs that differ only in its value would be the same run.
     if unknown := [*sorted(set(content) - set(KEYS)), *sorted(set(varied["params"]) - set(_places(params())))]:
         raise ParamsError(f"{path}: unknown name", found=unknown[0], remedy="params.yml has the places of its values")
@@ -112,9 +97,6 @@ def _places(values: Any, before: str = "") -> Iterator[str]:
 def _combinations(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     every = itertools.product(*(_as_list(value) for value in values.values()))
     return [dict(zip(values, chosen, strict=True)) for chosen in every]
-
-
-# --- what a worker does -----------------------------------------------------------------------------------------------
 
 
 def make(job: Job, folder: Path) -> None:
@@ -156,13 +138,10 @@ def _settings_of(job: Job) -> Iterator[None]:
             yield
 
 
-# --- the cluster ------------------------------------------------------------------------------------------------------
-
-
 def open_cluster(address: str | None = None, workers: int | None = None) -> "Client":
-    """Connect to a Dask scheduler, or start `workers` processes here, by default one for every two cores.
+    """Connect to a Dask scheduler, or start `workers` processes here; None: one for two cores. Returns Dask's client.
 
-    Returns Dask's client, a context manager. Raises RoverError if no scheduler answers at the address.
+    Raises RoverError if no scheduler answers at the address.
     """
     from distributed import Client
 
@@ -177,10 +156,7 @@ def open_cluster(address: str | None = None, workers: int | None = None) -> "Cli
 
 
 def sweep(jobs: Sequence[Job], folder: Path | str, client: "Client", progress: Progress = silent) -> dict[str, str]:
-    """Make the missing runs of these jobs, and return a sentence for each failed one, by its name.
-
-    If a worker dies, another repeats what it was doing, at most three times.
-    """
+    """Make the missing runs of these jobs, and return a sentence for each failed one, by its name."""
     from distributed import as_completed
 
     folder, failed = Path(folder).resolve(), dict[str, str]()

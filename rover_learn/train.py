@@ -2,17 +2,13 @@
 
     train("episodes", "best_model.pth")
 
-Nothing is downloaded, so the ResNet starts from random weights, and with frozen batch norm it would learn nothing. So
-there are three phases: the backbone alone, with live batch norm, learns to predict the chunk; then the transformer
-learns on the frozen backbone's features, which are computed once; then both learn together at a tenth of the rate.
+The ResNet starts from random weights, and with frozen batch norm it would learn nothing. So there are three phases: the
+backbone alone, with live batch norm, learns to predict the chunk; then the transformer learns on the frozen backbone's
+features, which are computed once; then both learn together at a tenth of the rate.
 
-ACT's position codes are relative to the picture, and no weight depends on the picture's size. So the real car's policy
-goes through these phases at a quarter of its pixels, which takes a quarter of the time, and a few more steps at its own
-size carry it there.
-
-Few recordings are soon learned by heart. So while the transformer learns, episodes that it does not learn from are held
-against it again and again, and the best weights are kept. Recordings whose pictures are mirrored beside the others' are
-turned over.
+No weight depends on the picture's size, so the real car's policy goes through these phases at a quarter of its pixels,
+and a few more steps at its own size carry it there. While the transformer learns, it is judged by episodes that it does
+not learn from, and the best weights are kept. Recordings that are mirrored beside the others are turned over.
 """
 
 import math
@@ -120,15 +116,13 @@ def train(
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
 
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
-    part trains the policy, the choosing part gives best_val_loss, and the held-out part is left alone, so that it can
-    judge the policy later. size: 'small' (72x128, minutes on two cores) or 'full' (the user's policy, 360x640). steps:
-    optimiser steps of all phases together; those of the recipe when left out. device: 'cpu', 'cuda', or None for cuda
-    where torch finds it and cpu elsewhere.
+    part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
+    size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together; None: the recipe's.
+    device: 'cpu', 'cuda', or None for the best there is.
 
     Returns out_path, which appears complete or not at all. On one machine the same input gives the same weights, even
     if training was ended at any moment and started again. A checkpoint that was made before is taken from the cache.
-    Raises TrainingError for a size, device, steps or seed that it cannot use, and if another process trains the same,
-    and EpisodeError for recordings that cannot be used.
+    Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     out_path, source = Path(out_path), Source.of(episodes)
     device = training_device(device, TrainingError).type
@@ -142,17 +136,9 @@ def train(
     p = params()["calibration"]
     recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
-    made_of = {
-        "size": asdict(SIZES[size]),
-        "recipe": asdict(recipe),
-        "seed": seed,
-        "device": device,
-        "versions": [version(name) for name in VERSIONS],
-        "episodes": recordings.hashes(),
-        "rate_hz": rate_hz,
-        "split": p,
-        "version": FULL_VERSION,
-    }
+    made_of = {"size": asdict(SIZES[size]), "recipe": asdict(recipe), "seed": seed, "device": device, "split": p}
+    made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
+    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz}
     sources = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
     key = key_of(made_of, *(() if size == "full" and steps is None else sources))
     unfinished = cache_root() / f"training-{key}"
@@ -223,10 +209,7 @@ class _Training:
         return loop.policy_loss(self.policy, batch, self.weights)
 
     def judge(self, maps: RowFile | None = None) -> float:
-        """Return the policy's mean error on the judges, in units of the spreads; it stays in training.
-
-        maps: their feature maps, for a policy that takes those.
-        """
+        """Return the policy's mean error on the judges, in units of the spreads. maps: their feature maps, if taken."""
         judges, units = self.judges, self.weights.cpu().numpy()
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
         errors = [loop.driving_error(self.policy, judges, rows, units, maps) for rows in every]
@@ -253,16 +236,9 @@ def _train(
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
-        training = _Training(
-            size=first,
-            policy=policy,
-            data=data,
-            judges=Frames.of(judging, first.image_sizes[0]),
-            recipe=recipe,
-            weights=torch.from_numpy(1 / spread).to(device),
-            rng=np.random.default_rng([seed, 77]),
-            saved=saved,
-        )
+        weights, rng = torch.from_numpy(1 / spread).to(device), np.random.default_rng([seed, 77])
+        judged = Frames.of(judging, first.image_sizes[0])
+        training = _Training(first, policy, data, judged, recipe, weights, rng, saved)
         _train_backbone(training)
         _train_transformer(training)
         if recipe.at:
@@ -352,10 +328,7 @@ def _train_transformer(training: _Training) -> None:
 
 
 def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
-    """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file.
-
-    view: 'plain', 'mirrored', or 'judges', which are plain too. chosen: (n,) row numbers.
-    """
+    """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file. chosen: (n,) row numbers."""
     batch, (size,) = training.recipe.batch, training.size.image_sizes
     maps = RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
     for step in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, maps=maps):

@@ -1,10 +1,7 @@
 """What every training on recordings needs: frames, batches, the loss, and a way to go on after it was killed.
 
-    with Resumable(folder) as saved:
-        saved.train(Phase("backbone", 200, 1e-3), model, rng, batch, loss)
-
-A training that is ended at any moment and started again gives the same weights, to the last bit, as one that was never
-ended.
+with Resumable(folder) as saved:
+    saved.train(Phase("backbone", 200, 1e-3), model, rng, batch, loss)
 """
 
 import math
@@ -45,8 +42,8 @@ SAVING_SHARE = 0.05  # saving takes at most this share of the time, however slow
 class Frames:
     """Samples as arrays with a row for each, and their pictures at one size.
 
-    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool, true where a
-    chunk is padded. images: all pictures, if they are in memory; else they are read from their files when asked for.
+    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. images: all
+    pictures, if they are in memory; else they are read from their files when asked for.
     """
 
     samples: tuple[Sample, ...]
@@ -79,7 +76,7 @@ class Frames:
 
 
 class RowFile:
-    """Arrays of one shape in a file, appended and read by row, such as features that would not fit into memory.
+    """Arrays of one shape in a file, by row, such as features that would not fit into memory.
 
     Like a module it is a part of a training's saved state: after a restart it has the rows that it had when saved.
     """
@@ -131,10 +128,7 @@ class Phase:
 
 @dataclass
 class Best:
-    """The best weights so far, by their error on other episodes. A part of a training's saved state.
-
-    judge: returns the module's error now. stale: how often they were not beaten since.
-    """
+    """The best weights so far. judge: returns the module's error now. stale: how often they were not beaten since."""
 
     judge: Callable[[], float]
     error: float = math.inf
@@ -157,10 +151,9 @@ class Best:
 
 
 class Resumable:
-    """A training in phases that goes on where it was after Ctrl-C, kill -9 or a power cut at any moment.
+    """A training in phases, in a folder, that goes on where it was after a power cut at any moment, to the last bit.
 
-    folder: has a file for each phase; remove it once the training's result is safe. Only one process at a time may
-    train in it. every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase.
+    every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase.
     """
 
     def __init__(
@@ -191,8 +184,8 @@ class Resumable:
     def steps(self, phase: str, count: int, rng: np.random.Generator, **parts: Any) -> Iterator[int]:
         """Yield the numbers of the steps of a phase that are still to be done; the loop's body does one of them.
 
-        parts: everything that a step changes, each with state_dict() and load_state_dict(): modules, optimisers, files
-        of rows. They, rng and torch's own random numbers are restored as they were saved.
+        parts: everything that a step changes, each with state_dict() and load_state_dict(). They, rng and torch's own
+        random numbers are restored as they were saved.
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
@@ -214,10 +207,10 @@ class Resumable:
         loss: Callable[[B], Tensor],
         best: Best | None = None,
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Train a module for the steps of a phase that are still to be done, and note each one's loss.
+        """Train a module for the steps of a phase that are still to be done; return the optimiser and its scheduler.
 
         batch: draws a step's batch from rng. loss: of such a batch. best: if given, the module ends with the weights
-        that it judged best, and learns no longer once they are not beaten. Returns the optimiser and its scheduler.
+        that it judged best, and learns no longer once they are not beaten.
         """
         optimizer, scheduler = optimiser(phase, module.parameters())
         parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
@@ -233,15 +226,9 @@ class Resumable:
         return optimizer, scheduler
 
     def _save(self, file: Path, phase: str, step: int, rng: np.random.Generator, parts: dict[str, Any]) -> None:
-        content = {
-            "step": step,
-            "parts": {name: part.state_dict() for name, part in parts.items()},
-            "numpy": rng.bit_generator.state,
-            "torch": torch.get_rng_state(),
-            "cuda": torch.cuda.get_rng_state_all(),
-            "losses": self.losses[phase],
-        }
-        save_torch(file, content)
+        content = {"step": step, "parts": {name: part.state_dict() for name, part in parts.items()}}
+        content |= {"numpy": rng.bit_generator.state, "torch": torch.get_rng_state(), "losses": self.losses[phase]}
+        save_torch(file, content | {"cuda": torch.cuda.get_rng_state_all()})
 
     def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Any]) -> int:
         try:
@@ -306,18 +293,12 @@ def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.
 
 
 def recorded_spread(data: Frames) -> np.ndarray:
-    """Return each action's standard deviation, (2,) float32, at least 0.001.
-
-    It is the unit in which errors count, because throttle varies a tenth as much as steering.
-    """
+    """Return each action's standard deviation, (2,) float32, at least 0.001: the unit in which errors count."""
     return np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)
 
 
 def error_of(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
-    """Return the mean absolute error over the recorded actions, without padding, each action in its own unit.
-
-    predicted: (n, chunk, 2). loss_weights: (2,), one divided by each action's spread.
-    """
+    """Return the mean absolute error over the recorded actions, without padding, times loss_weights, (2,)."""
     recorded = ~batch[IS_PAD][..., None]
     error = (predicted - batch[ACTION]).abs() * loss_weights * recorded
     return error.sum() / (recorded.sum() * loss_weights.numel())
@@ -367,9 +348,9 @@ class Given(nn.Module):
 def driving_error(
     policy: "ACTPolicy", data: Frames, rows: np.ndarray, units: np.ndarray | float = 1.0, maps: RowFile | None = None
 ) -> float:
-    """Return the mean absolute error of the policy's plans on these rows (no latent is sampled), in action units.
+    """Return the mean absolute error of the policy's plans on these rows (no latent is sampled), times `units`.
 
-    units: what an error of 1 in each action counts. maps: feature maps to take instead of the pictures.
+    maps: feature maps to take instead of the pictures.
     """
     policy.eval()
     images = normalise(data.pictures(rows)) if maps is None else maps[rows]

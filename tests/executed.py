@@ -18,12 +18,6 @@ def shown(path: Path) -> str:
     return "\n".join(text_of(c) for c in nbformat.read(path, as_version=4).cells)
 
 
-def printed(path: Path) -> str:
-    """Return what all cells printed, without what they showed."""
-    cells = nbformat.read(path, as_version=4).cells
-    return "".join(o.text for c in cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream")
-
-
 def run_cells(name, run_dir, **given):
     """A notebook's cells, one after the other, without a kernel, which imports torch once more."""
     path, variables = NOTEBOOKS / f"{name}.ipynb", {}

@@ -1,9 +1,8 @@
-"""Stand-ins for Hailo's two Python packages, which nobody here has. They do what the documentation says, and no more.
+"""A stand-in for HailoRT's Python package, which nobody here has. It does what the documentation says, and no more.
 
-`hailo_sdk_client` is the compiler: its ClientRunner writes an ONNX file and the normalisation of its inputs into a
-"HEF". `hailo_platform` belongs to the driver: it runs such a HEF in ONNX Runtime, behind the interface of hailort v4.23
-and v5.2 (hailo_platform/pyhailort/pyhailort.py), with channels last. Nothing is quantized, so that any difference from
-the policy is an error of the kit or of the runner.
+`hailo_platform` runs a HEF in ONNX Runtime, behind the interface of hailort v4.23 and v5.2
+(hailo_platform/pyhailort/pyhailort.py), with channels last. Such a HEF is a kit's network and the normalisation of its
+input. Nothing is quantized, so that any difference from the policy is an error of the kit or of the runner.
 """
 
 import json
@@ -12,7 +11,6 @@ import sys
 import types
 from enum import Enum
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import onnx
@@ -89,48 +87,21 @@ class VDevice:
         return InferModel(hef_source)
 
 
-class ClientRunner:
-    first: ClassVar[int] = 1  # number of the first input layer
-    calibrated: ClassVar[np.ndarray]  # the data given to the last optimize()
-
-    def __init__(self, hw_arch: str):
-        assert hw_arch in ("hailo8", "hailo8l", "hailo10h")
-
-    def translate_onnx_model(self, path, name, *, start_node_names, end_node_names, net_input_shapes):
-        self._model, self._name = onnx.load(path), name
-        ((self._original, (_, c, self._height, self._width)),) = net_input_shapes.items()
-        assert start_node_names == [i.name for i in self._model.graph.input] == [self._original] and c == 3
-        made = {node.name: node.output[0] for node in self._model.graph.node}
-        assert [made[node] for node in end_node_names] == [o.name for o in self._model.graph.output]
-        self._layer, self._end = f"{name}/input_layer{self.first}", end_node_names[0]
-
-    def get_hn_dict(self) -> dict:
-        return {"layers": {self._layer: {"original_names": [self._original]}}}
-
-    def save_har(self, path: str) -> None:
-        Path(path).write_bytes(b"stand-in HAR")
-
-    def load_model_script(self, path: str) -> None:
-        found = re.search(NORMALIZATION, Path(path).read_text())
-        self._normalization = json.loads(found[1]), json.loads(found[2])
-
-    def optimize(self, data: np.ndarray) -> None:
-        assert data.shape[1:] == (self._height, self._width, 3)
-        ClientRunner.calibrated = data
-
-    def compile(self) -> bytes:
-        _, *grid = (d.dim_value for d in self._model.graph.output[0].type.tensor_type.shape.dim)
-        streams = [
-            (self._layer, [self._height, self._width, 3], self._original),
-            (f"{self._name}/{self._end}", [*grid[1:], grid[0]], self._end),
-        ]
-        about = json.dumps({"streams": streams, "normalization": self._normalization})
-        return MAGIC + about.encode() + b"\0" + self._model.SerializeToString()
+def compile_kit(kit: Path) -> Path:
+    """Do what Hailo's compiler would, and return the path of the HEF."""
+    content, model = json.loads((kit / "kit.json").read_text()), onnx.load(kit / "backbone.onnx")
+    ((original, (_, _, height, width)),), (end,) = content["inputs"].items(), content["end_nodes"]
+    _, *grid = (d.dim_value for d in model.graph.output[0].type.tensor_type.shape.dim)
+    streams = [("input", [height, width, 3], original), ("output", [*grid[1:], grid[0]], end)]
+    found = re.search(NORMALIZATION, (kit / "backbone.alls").read_text())
+    about = {"streams": streams, "normalization": [json.loads(found[1]), json.loads(found[2])]}
+    path = kit / "backbone.hef"
+    path.write_bytes(MAGIC + json.dumps(about).encode() + b"\0" + model.SerializeToString())
+    return path
 
 
 def install(monkeypatch) -> None:
-    """Install both packages until the test ends."""
-    platform, client = types.ModuleType("hailo_platform"), types.ModuleType("hailo_sdk_client")
-    platform.VDevice, platform.FormatType, client.ClientRunner = VDevice, FormatType, ClientRunner
+    """Install the package until the test ends."""
+    platform = types.ModuleType("hailo_platform")
+    platform.VDevice, platform.FormatType = VDevice, FormatType
     monkeypatch.setitem(sys.modules, "hailo_platform", platform)
-    monkeypatch.setitem(sys.modules, "hailo_sdk_client", client)

@@ -26,7 +26,7 @@ STATUS_LINE = (
 class Board:
     """The other end of a pty: says what it is told to, and records what the host says."""
 
-    def __init__(self, hello=f"<H 4 4.1.1 7 0 e {DEFAULT}", answer=None):
+    def __init__(self, hello=f"<H 4 4.2.0 7 0 e {DEFAULT}", answer=None):
         self.master, slave = pty.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)

@@ -48,14 +48,13 @@ def mounted(image):
 
 
 @pytest.fixture
-def disk(tmp_path):
-    """The folder of a file system of 2 GB."""
+def disk(tmp_path, request):
+    """The folder of a file system: small for a recording, which is copied often, and 2 GB for checkpoints."""
     if os.geteuid() or not (shutil.which("mkfs.ext4") and shutil.which("mount")):
         pytest.skip("needs root and the Debian packages e2fsprogs and mount")
     image = tmp_path / "disk"
-    with image.open("wb") as file:
-        file.truncate(2_000_000_000)
-    subprocess.run(["mkfs.ext4", "-q", "-F", image], check=True)
+    size = "2G" if "work" in request.fixturenames else "100M"
+    subprocess.run(["mkfs.ext4", "-q", "-F", image, size], check=True)
     with mounted(image) as folder:
         yield folder
 
@@ -87,8 +86,6 @@ def start(work, *args):
     code = 1
     try:
         os.setpgid(0, 0)
-        quiet = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(quiet, 1), os.dup2(quiet, 2)
         training.SAVING_SHARE = 1e9  # save after each step
         work(*args)
         code = 0
@@ -107,7 +104,7 @@ def ended(child):
 
 def record(inputs, folder, logged=True):
     """Record in real time until it is killed. Its syncs' durations are appended to a file beside the disk."""
-    sync = getattr(module, "sync_disk", None)
+    sync = module.sync_disk
 
     def timed(path):
         began_s = time.monotonic()
@@ -193,12 +190,12 @@ def finish(inputs, folder):
         finish_killed(part)
 
 
-def export(inputs, folder):
-    main(["export-dataset", str(inputs / "episodes"), str(folder / "out")])
+def export(inputs, folder, source="episodes"):
+    main(["export-dataset", str(inputs / source), str(folder / "out")])
 
 
 def import_tub(inputs, folder):
-    main(["export-dataset", str(inputs / "tub"), str(folder / "out")])
+    export(inputs, folder, "tub")
 
 
 def train(inputs, folder):
@@ -212,10 +209,12 @@ def run(inputs, folder):
 
 def content_of(folder):
     """The hash of each file that is not hidden, or in a hidden folder, by its path."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    named = {path.relative_to(folder): path for path in files}
-    seen = {name: path for name, path in named.items() if not any(part.startswith(".") for part in name.parts)}
-    return {str(name): hashlib.sha256(path.read_bytes()).hexdigest() for name, path in seen.items()}
+    content = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder)
+        if path.is_file() and not any(part.startswith(".") for part in name.parts):
+            content[str(name)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return content
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots.style import BLACK, BLUE, RED, SLATE, legend, legend_below, new_figure
+from rover_lib.workshop.plots.style import BLUE, RED, SLATE, legend_below, new_figure
 
 HOW = {True: ("compensated", BLUE, "o", -1), False: ("not compensated", SLATE, "s", 1)}  # label, colour, marker, side
-
-
-def _late(rows: Sequence[Mapping[str, Any]], *, pushed: bool = False) -> list[Mapping[str, Any]]:
-    """Return the rows without ensembling, of cars that were pushed or not. rows: of drive.json."""
-    return [r for r in rows if r["ensemble"] is None and bool(r["pushes"]) == pushed]
 
 
 def hit_bars(ax: Axes, x: Sequence[float], rows: Sequence[Mapping[str, Any]], key: str, **style: Any) -> np.ndarray:
@@ -27,7 +22,8 @@ def hit_bars(ax: Axes, x: Sequence[float], rows: Sequence[Mapping[str, Any]], ke
 
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
-    sets = [(title, _late(rows, pushed=pushed)) for title, pushed in (("left alone", False), ("pushed", True))]
+    late = [r for r in rows if r["ensemble"] is None]
+    sets = [("left alone", [r for r in late if not r["pushes"]]), ("pushed", [r for r in late if r["pushes"]])]
     sets = [(title, drives) for title, drives in sets if drives]
     counts = [len({r["latency_ms"] for r in drives}) for _, drives in sets]
     fig, axes = new_figure(1, len(sets), height_in=4.1, sharey=True, width_ratios=[c + 1 for c in counts])
@@ -49,29 +45,4 @@ def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
         ax.set(xlabel="an inference takes (ms)", xlim=(-0.6, len(places) - 0.4), ylim=(-4, 104))
     axes[0, 0].set_ylabel(f"worlds in which the balloon was hit\n(% of {rows[0]['trials']}), with the 95 % interval")
     legend_below(fig, axes[0, 0], 2)
-    return fig
-
-
-def beside_the_path(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw how far drives stray at most from the path that the first latency gave: median and 90 % of the worlds.
-
-    rows: of drive.json; those in which cars were stopped are left out.
-    """
-    drives = [r for r in _late(rows) if not r["stopped"]]
-    places = {ms: x for x, ms in enumerate(sorted({r["latency_ms"] for r in drives}))}
-    fig, axes = new_figure(1, height_in=3.3)
-    ax = axes[0, 0]
-    for compensate, (label, colour, _, side) in HOW.items():
-        shown = [r for r in drives if r["compensate"] == compensate]
-        x = [places[r["latency_ms"]] + 0.19 * side for r in shown]
-        middle, most = (np.array([r[f"aside_p{q}_cm"] for r in shown]) for q in (50, 90))
-        ax.bar(x, middle, 0.36, color=colour, alpha=0.85, label=label)
-        ax.vlines(x, middle, most, color=BLACK, lw=1)
-        ax.plot(x, most, "_", color=BLACK, ms=10, mew=1.5)
-        for at, y, value in zip(x, most, middle, strict=True):
-            ax.annotate(f"{value:.1f}", (at, y), (0, 3), textcoords="offset points", ha="center", fontsize=9)
-    ax.set_xticks(list(places.values()), [f"{ms:g}" for ms in places])
-    ax.set(xlabel="an inference takes (ms)", ylabel=f"beside the path of\n{min(places, default=0):g} ms, at most (cm)")
-    ax.set_title("bar and number: median of the worlds; line: 90 % of them", fontsize=11)
-    legend(ax, loc="upper left")
     return fig

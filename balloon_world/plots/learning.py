@@ -7,20 +7,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from balloon_world.plots.late_plans import hit_bars
-from rover_lib.workshop.plots.style import MIST, SLATE, Note, legend_below, new_figure
+from rover_lib.workshop.plots.style import MIST, SLATE, legend_below, new_figure
 
 # name, colour, marker, and to which side the marks are moved
 ARMS = (("corrected", SLATE, "o", -1.0), ("demonstrated", MIST, "s", 1.0))
 PANELS = (("pushed", "pushed"), ("alone", "left alone"), ("decoy", "beside a red decoy"))
 
 
-def hits_by_round(policies: Sequence[Mapping[str, Any]]) -> Figure | Note:
+def hits_by_round(policies: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the worlds hit against the human seconds that it cost, for both arms, with Wilson's 95 % interval.
 
     policies: rows of learn.json, first the one that all began with.
     """
-    if not policies:
-        return Note("nothing has been learned yet: there is no figure")
     fig, axes = new_figure(1, len(PANELS), height_in=3.4, sharey=True)
     for ax, (how, title) in zip(axes[0], PANELS, strict=True):
         _arms(ax, policies, how)

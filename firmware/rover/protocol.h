@@ -13,9 +13,9 @@ extern "C" {
 #define PROTOCOL_VERSION 4
 /* rover_lib/onboard/car/servo_link.py drives no other: change both. */
 #ifdef HUMAN_GAMEPAD
-#define FIRMWARE_VERSION "4.1.1-gamepad"
+#define FIRMWARE_VERSION "4.2.0-gamepad"
 #else
-#define FIRMWARE_VERSION "4.1.1"
+#define FIRMWARE_VERSION "4.2.0"
 #endif
 
 enum {

@@ -5,11 +5,8 @@
     emulation.total(section=0)
 
 An arm64 Debian's Python runs with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
-plugin of ours (guest/count.c). Packages are fetched by a private apt, unpacked without being installed, and cached.
-
-A peak of memory is the most that the emulator's process held resident, as the kernel records it, minus the emulator's
-own share: its translated code and the plugin's counters, which lie outside the addresses that are reserved for the
-guest. They grow slowly and are read five times a second. MB are 10**6 bytes.
+plugin of ours (guest/count.c). A peak of memory is the most that the emulator's process held resident, as the kernel
+records it, minus its translated code and the plugin's counters, which lie outside the guest's addresses.
 """
 
 import re
@@ -20,7 +17,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -67,9 +64,6 @@ SAMPLE_S = 0.2  # often enough, as the emulator's own memory grows slowly
 
 # As in count.c.
 BLOCK = np.dtype([(n, "<u8") for n in ("address", "entered", "instructions", "simd", "sdot", "quarters")])
-
-
-# --- preparing --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -164,9 +158,6 @@ def _environment(root: Path, home: Path) -> dict[str, str]:
     }
 
 
-# --- running ----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Emulation:
     """What one program did: its counts by section, and the most memory that it held in each of its steps."""
@@ -184,23 +175,17 @@ class Emulation:
         """Return the cycles that a section takes a Cortex-A76 that waits for nothing: `quarters_of` in count.c."""
         return self.total(section, "quarters") / 4
 
-    def near_lines(self, section: int) -> int:
-        """Return how many lines of 64 bytes the loads of a section had to fetch into its core's first cache."""
-        return int(self.more[section][0])
+    def lines(self, section: int) -> tuple[int, int]:
+        """Return how many lines of 64 bytes the loads of a section had to fetch into its core's first cache (near).
 
-    def far_lines(self, section: int) -> int:
-        """Return how many lines of 64 bytes the shared memory had to deliver, or twice if stores missed each cache."""
-        return int(self.more[section][4] + 2 * self.more[section][3])
+        And how many the shared memory had to deliver, or twice if stores missed each cache (far).
+        """
+        more = self.more[section]
+        return int(more[0]), int(more[4] + 2 * more[3])
 
 
 def emulate_script(
-    core: Core,
-    script: Path,
-    arguments: Sequence[object],
-    folder: Path,
-    *,
-    packages: Path | None = None,
-    **options: Any,
+    core: Core, script: Path, arguments: Sequence[object], folder: Path, packages: Path | None, **options: Any
 ) -> Emulation:
     """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
 
@@ -231,16 +216,8 @@ def emulate(
     plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
     qemu = [str(word) for word in (*_qemu(core.root), "-plugin", plugin, *command)]
     with (folder / "stderr").open("wb") as stderr:
-        process = subprocess.Popen(
-            qemu,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            env=environment or {},
-            cwd=folder,
-            text=True,
-            errors="replace",
-        )
+        talks: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": stderr}
+        process = subprocess.Popen(qemu, env=environment or {}, cwd=folder, text=True, errors="replace", **talks)
     assert process.stdout  # a pipe
     try:
         with _Watched(process.pid) as watched:
@@ -260,17 +237,16 @@ def emulate(
     return Emulation(sections, more, dict(watched.peak_mb))
 
 
-@dataclass
 class _Watched:
     """The memory of a running emulator, sampled while inside. Each printed line begins a step with its own peak."""
 
-    pid: int
-    step: str = ""
-    peak_mb: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-
-    def __enter__(self) -> "_Watched":
+    def __init__(self, pid: int):
+        self.pid, self.step = pid, ""
+        self.peak_mb: dict[str, float] = defaultdict(float)
         self._lock, self._over = Lock(), Event()
         self._thread = Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> "_Watched":
         self._thread.start()
         return self
 
@@ -280,29 +256,23 @@ class _Watched:
 
     def _run(self) -> None:
         while not self._over.wait(SAMPLE_S):
-            with self._lock:
-                self._sample()
+            self.begin(None)
 
-    def _sample(self) -> None:
-        peak_mb, outside_mb = _memory_mb(self.pid)
-        self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
-
-    def begin(self, step: str) -> None:
+    def begin(self, step: str | None) -> None:
+        """Take a sample, and begin a step unless it is the present one; None: none begins."""
         with self._lock:
-            self._sample()
-            if step != self.step:
+            peak_mb, outside_mb = _memory_mb(self.pid)
+            self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
+            if step not in (None, self.step):
                 with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
                     Path(f"/proc/{self.pid}/clear_refs").write_text("5")
-            self.step = step
-
-
-# Read from /proc, as psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
+            self.step = self.step if step is None else step
 
 
 def _memory_mb(pid: int) -> tuple[float, float]:
     """Return the most that a process held resident, and what it holds outside the guest's addresses now.
 
-    Both in MB, and zero if the process has ended.
+    Both in MB, and zero if it has ended. psutil knows neither the kernel's own peak (VmHWM) nor how to reset it.
     """
     outside_kb, in_guest = 0, False
     try:

@@ -57,11 +57,8 @@ class Counted:
 
     load: int  # instructions of load_policy: integrity check, unpacking, parity vectors
     inferences: tuple[int, ...]  # instructions of each
-    simd: int  # SIMD instructions of the steady inference
     sdot: int  # SDOT instructions of the steady inference
-    cycles: float  # of the steady inference, see Emulation, as are
-    near_lines: int
-    far_lines: int
+    work: dict[str, float]  # of the steady inference: simd, cycles, near_lines and far_lines, see Emulation
     kernels: dict[str, tuple[int, int]]  # (instructions, SDOT) of the steady inference by function
     peak_mb: float
     peak_loading_mb: float
@@ -96,23 +93,22 @@ def count_artifact(
 ) -> Counted:
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
-    samples: have frame_bgr() and state. If there are fewer than `counted`, which must be at least STEADY, they are
-    repeated from the first. on_line: called with each line that the guest prints. Raises RoverError if it fails.
+    samples: have frame_bgr() and state; if there are fewer than `counted`, at least STEADY, they are repeated. on_line:
+    called with each line that the guest prints. Raises RoverError if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
         observations = write_observations(folder / "observations.npz", samples)
         given = [Path(artifact).resolve(), observations, folder, counted, *guest.arguments]
-        options: dict[str, Any] = {"packages": guest.packages, "on_line": on_line, "watch": f"memory={STEADY}"}
-        done = emulate_script(core, guest.script, given, folder, **options)
+        watch = f"memory={STEADY}"
+        done = emulate_script(core, guest.script, given, folder, guest.packages, on_line=on_line, watch=watch)
+        work = {"simd": done.total(STEADY, "simd"), "cycles": done.cycles(STEADY)}
+        work["near_lines"], work["far_lines"] = done.lines(STEADY)
         return Counted(
             load=done.total(0),
             inferences=tuple(done.total(i) for i in range(1, counted + 1)),
-            simd=done.total(STEADY, "simd"),
             sdot=done.total(STEADY, "sdot"),
-            cycles=done.cycles(STEADY),
-            near_lines=done.near_lines(STEADY),
-            far_lines=done.far_lines(STEADY),
+            work=work,
             kernels=by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text())),
             peak_mb=done.peak_mb["predict"],
             peak_loading_mb=done.peak_mb["load"],
@@ -126,8 +122,7 @@ def side_by_side(
 ) -> dict[str, Counted]:
     """Count in several emulated machines, one for each of this machine's cores at a time.
 
-    counts: functions by name, each called with on_line (see `count_artifact`). inferences: how many all of them have
-    together, for the progress bar. what: the bar's label.
+    counts: functions by name, each called with on_line. inferences, what: all of them, and a label, for the bar.
     """
     bar = iter(progress(range(inferences), desc=what, total=inferences))
     one_at_a_time = Lock()

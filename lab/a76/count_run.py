@@ -39,14 +39,12 @@ class Plan(NamedTuple):
 def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
     """Count every artifact of a run; write and return its arm.json.
 
-    Artifacts are judged on `frames` of the run's held-out frames. What an artifact predicts in the emulated Pi, and on
-    this machine, is compared with what the FP32 artifact predicts on this machine. In the emulated Pi, FP32 takes up to
-    minutes for a frame, so it predicts only a few there, which must equal this machine's within the parity vectors'
-    tolerance. Raises RoverError.
+    What an artifact predicts on `frames` held-out frames, in the emulated Pi and on this machine, is compared with what
+    the FP32 artifact predicts here. FP32 takes up to minutes for an emulated frame, so it predicts only a few there,
+    which must equal this machine's within the parity vectors' tolerance. Raises RoverError.
     """
     run_dir = Path(run_dir)
-    files = [*run_dir.glob("policy_*.pt"), *run_dir.glob(f"policy_*{ONNX_SUFFIX}")]
-    artifacts = {p.stem: p for p in sorted(files)}
+    artifacts = {p.stem: p for p in sorted(run_dir.glob("policy_*")) if p.name.endswith((".pt", ONNX_SUFFIX))}
     if REFERENCE not in artifacts:
         raise RoverError(f"{run_dir}: no {REFERENCE}.pt in it", found=[*artifacts], remedy="'rover run' makes a run")
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
@@ -74,8 +72,7 @@ def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[st
         mode, gmac = manifests[stem]["mode"], manifests[stem]["gmac"]
         if mode == "fp32" and gmac >= SLOW_GMAC:
             plans[stem] = Plan(tuple(every[:STEADY]), STEADY)
-        elif mode in ("fp32", "dynamic"):
-            # Both are slow: FP32 is only compared with this machine's, and nobody would drive a Pi with dynamic.
+        elif mode in ("fp32", "dynamic"):  # both are slow
             plans[stem] = Plan(pick_evenly(every, COUNTED))
         else:
             plans[stem] = Plan(tuple(every))
@@ -101,10 +98,7 @@ def _judge(
     again: Opened,
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
-    """Judge the predictions of each artifact; return the rows for arm.json.
-
-    Raises RoverError if FP32 predicts something else in the emulated Pi than on this machine.
-    """
+    """Judge each artifact's predictions; return rows for arm.json. Raises RoverError if FP32 differs in the Pi."""
     rows: dict[str, dict[str, Any]] = {}
     ranges, names = again.recordings.action_range(), again.checkpoint.config.action_names
     here = chunks_here(artifacts[REFERENCE], samples, progress)
@@ -135,7 +129,7 @@ def errors_pct(
 ) -> dict[str, float | None]:
     """Return <action>_mae_pct: the mean difference of two sets of chunks (n, C, A), in percent of the recorded range.
 
-    It is None for an action that never changes in the recordings, which is not judged.
+    None for an action that never changes in the recordings.
     """
     mean = np.abs(chunks.astype(np.float64) - reference).mean((0, 1))
     return {f"{action}_mae_pct": pct_of_range(float(mean[i]), ranges[action]) for i, action in enumerate(actions)}

@@ -2,9 +2,8 @@
 
     count_peers("runs/full")      # adds metrics.peers to runs/full/arm.json, which count_run.count_run has written
 
-Each engine quantizes the float policy with its own tools, on the frames that calibrated ours, and is judged on the same
-held-out frames. Its packages are pinned here and come before ours on Python's path, on this machine and in the emulated
-Pi; they are never installed.
+Each engine quantizes the float policy with its own tools, on the frames that calibrated ours. Its packages are pinned
+here and come before ours on Python's path; they are never installed.
 """
 
 import json
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import nn
 
 from lab.a76.core import FOR_GUEST, GUEST, fetch_wheels, prepare
 from lab.a76.count import COUNTED, Counted, Guest, count_artifact, side_by_side
@@ -30,10 +28,8 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
-from rover_lib.workshop import act
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.int8.scheme import STAYS_FLOAT
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
@@ -49,7 +45,7 @@ FRAMES = 20  # how many judge a peer; its error only has to show that it compute
 
 @dataclass(frozen=True)
 class Engine:
-    """Another engine: the packages that it needs before ours, here and in the emulated Pi, and its files' suffix.
+    """Another engine: its files' suffix, and the packages that it needs before ours; in the emulated Pi only the first.
 
     FOLDER/make_<name>.py runs its tools. Dependencies such as numpy are not listed, as our own packages have them.
     """
@@ -57,30 +53,20 @@ class Engine:
     name: str
     suffix: str
     packages: tuple[str, ...]
-    guest_packages: tuple[str, ...]
 
 
-ONNXRUNTIME = Engine(
-    "onnxruntime",
-    ".onnx",
-    ("onnxruntime==1.31.1", "onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19"),
-    ("onnxruntime==1.31.1",),
+ONNX_PACKAGES = ("onnx==1.23.2", "ml-dtypes==0.6.0", "protobuf==7.36.2", "flatbuffers==25.12.19")
+ONNXRUNTIME = Engine("onnxruntime", ".onnx", ("onnxruntime==1.31.1", *ONNX_PACKAGES))
+# This torch is the newest that runs on the CUDA libraries of our torch 2.8, but for one.
+EXECUTORCH_PACKAGES = ("torchao==0.18.0", "torch==2.10.0", "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'")
+BESIDE = (
+    "flatbuffers==25.12.19",
+    "ruamel.yaml==0.19.1",
+    "tabulate==0.10.0",
+    "expecttest==0.3.0",
+    "parameterized==0.9.0",
 )
-EXECUTORCH = Engine(
-    "executorch",
-    ".pte",
-    (
-        "executorch==1.5.1",
-        "torchao==0.18.0",
-        # This torch only exports. It is the newest that runs on the CUDA libraries of our torch 2.8, gigabytes that
-        # an x86-64 wheel insists on; it needs one more of them.
-        "torch==2.10.0",
-        "nvidia-nvshmem-cu12==3.4.5; platform_machine == 'x86_64'",
-        *("flatbuffers==25.12.19", "ruamel.yaml==0.19.1", "tabulate==0.10.0"),
-        *("expecttest==0.3.0", "parameterized==0.9.0"),
-    ),
-    ("executorch==1.5.1",),  # only its C++ runtime is used: see executorch.cpp
-)
+EXECUTORCH = Engine("executorch", ".pte", ("executorch==1.5.1", *EXECUTORCH_PACKAGES, *BESIDE))
 ENGINES = (ONNXRUNTIME, EXECUTORCH)
 
 
@@ -96,11 +82,11 @@ def packages_here(engine: Engine) -> Path:
 
 def packages_there(engine: Engine) -> Path:
     """Return the same for the emulated Pi; for ExecuTorch, it includes our compiled caller of its C++ runtime."""
-    made = {"packages": engine.guest_packages, "for": FOR_GUEST}
+    made = {"packages": engine.packages[0], "for": FOR_GUEST}
     compiled = [SHIM] if engine is EXECUTORCH else []
 
     def make(folder: Path) -> None:
-        fetch_wheels(folder, *FOR_GUEST, *engine.guest_packages)
+        fetch_wheels(folder, *FOR_GUEST, engine.packages[0])
         if compiled:
             _compile(folder)
 
@@ -112,8 +98,7 @@ def _compile(folder: Path) -> None:
     install_packages(missing_packages(NEEDS), "ExecuTorch")
     sdk = folder / "executorch"
     command = [COMPILER, "-std=c++17", "-O2", "-Wall", "-shared", "-fPIC", "-o", folder / "policy.so", SHIM]
-    command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED"]
-    command += ["-isystem", sdk / "include"]
+    command += ["-DC10_USING_CUSTOM_GENERATED_MACROS", "-DET_EVENT_TRACER_ENABLED", "-isystem", sdk / "include"]
     command += ["-isystem", sdk / "include" / "executorch" / "runtime" / "core" / "portable_type" / "c10"]
     command += ["-L", sdk / "lib", "-Wl,-rpath,$ORIGIN/executorch/lib"]
     # Kernels and backends register themselves when they are loaded; nothing refers to them by name.
@@ -124,11 +109,10 @@ def _compile(folder: Path) -> None:
 
 def quantize_with(
     engine: Engine, checkpoint: Checkpoint, samples: Sequence[Sample], folder: Path
-) -> tuple[Path, dict[str, Any]]:
-    """Quantize the policy with an engine's own tools into `folder`. samples: for calibration.
+) -> tuple[Path, dict[str, str]]:
+    """Quantize the policy with an engine's own tools into `folder`; return the file and the tools' versions.
 
-    Returns the file, and what the tools reported: `int8_layers` (how many) and `versions`. Raises RoverError if they
-    fail, or leave a layer in float that is INT8 in our artifact.
+    samples: for calibration. Raises RoverError if they fail.
     """
     folder.mkdir(exist_ok=True)
     artifact = folder / f"{engine.name}{engine.suffix}"
@@ -140,52 +124,39 @@ def quantize_with(
         environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
         maker = FOLDER / f"make_{engine.name}.py"
         command = [sys.executable, maker, checkpoint.path.resolve(), calibration, temporary]
-        report = json.loads(run(*command, error=RoverError, env=environment).splitlines()[-1])
-        if (ours := int8_layers(checkpoint)) != report["int8_layers"]:  # tools have silently left some in float
-            raise RoverError(f"{engine.name}: {ours} layers of ours are INT8", found=report["int8_layers"])
-    return artifact, report
-
-
-def int8_layers(checkpoint: Checkpoint) -> int:
-    """Return how many convolutions and linear layers of the policy are INT8 in our artifact."""
-    modules = act.ACT(checkpoint.config, checkpoint.weights).named_modules()
-    layers = (name for name, m in modules if isinstance(m, (nn.Conv2d, nn.Linear)))
-    return sum(act.block_of(name) not in STAYS_FLOAT for name in layers)
+        versions = json.loads(run(*command, error=RoverError, env=environment).splitlines()[-1])
+    return artifact, versions
 
 
 def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
     """Count the peers of a run's static artifact, add them to its arm.json and return the content of that.
 
-    metrics.peers has rows like those of metrics.artifacts, with `file_mb`, `int8_layers` and `made_with`, the versions
-    of their tools. A peer's chunks come from the emulated Pi, the reference from this machine, whose FP32 count_run has
-    compared with the Pi's. What the engines make is kept in run_dir/peers. frames: how many held-out frames judge.
-    Raises RoverError if arm.json is missing or was counted from other artifacts, or if a peer cannot be had or run.
+    metrics.peers has rows like those of metrics.artifacts, with `file_mb` and `made_with`, the versions of their tools.
+    A peer's chunks come from the emulated Pi, the reference from this machine. What the engines make is kept in
+    run_dir/peers. frames: how many held-out frames judge. Raises RoverError if arm.json is missing or was counted from
+    other artifacts, or if a peer cannot be had or run.
     """
     run_dir = Path(run_dir)
     content, reference = open_counted_run(run_dir)
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     core = prepare(progress)
-    # Get the packages of all engines first: if some cannot be had, it fails before hours are spent on the others.
-    guests = {}
-    for engine in progress(ENGINES, desc="peers' packages", total=len(ENGINES)):
-        packages_here(engine)
-        size = again.checkpoint.config.image_sizes[0]
-        guests[engine.name] = Guest(FOLDER / "guest.py", (engine.name, *size), packages_there(engine))
     given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
-    made = {}
+    made, counts = {}, {}
     for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
+        size, packages = again.checkpoint.config.image_sizes[0], packages_there(engine)
+        guest = Guest(FOLDER / "guest.py", (engine.name, *size), packages)
         made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
-    counts = {n: partial(count_artifact, core, path, samples, guest=guests[n]) for n, (path, _) in made.items()}
+        counts[engine.name] = partial(count_artifact, core, made[engine.name][0], samples, guest=guest)
     counted = side_by_side(counts, max(len(samples), COUNTED) * len(made), "peers, emulated", progress)
 
     here, manifest = chunks_here(reference, samples, progress), read_manifest(reference)
     ranges = again.recordings.action_range()
     peers, inputs = {}, dict(content["inputs"])
-    for name, (path, report) in made.items():
-        about = {"file_mb": path.stat().st_size / 1e6, "int8_layers": report["int8_layers"]}
-        peers[name] = peer_metrics(counted[name], manifest, here, ranges) | about | {"made_with": report["versions"]}
+    for name, (path, versions) in made.items():
+        about = {"file_mb": path.stat().st_size / 1e6, "made_with": versions}
+        peers[name] = peer_metrics(counted[name], manifest, here, ranges) | about
         inputs[f"peers/{path.name}"] = sha256_of(path)
     metrics = content["metrics"] | {"peers": peers}
     return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
@@ -203,7 +174,7 @@ def open_counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
 def peer_metrics(
     counted: Counted, manifest: dict[str, Any], reference: np.ndarray, ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
-    """Return one peer's part of arm.json. manifest: of our FP32 artifact. reference: that artifact's chunks, (n, C, A).
+    """Return one peer's part of arm.json. manifest, reference: our FP32 artifact's, and its chunks, (n, C, A).
 
     Raises RoverError if the peer's chunks have another shape or are not finite.
     """

@@ -32,8 +32,7 @@ GROUPS = (
     ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
 )
 
-# Kernels that divide their work over the threads, by name or by the library if that has no names. The rest is executed
-# by one thread while the others wait.
+# Kernels that divide their work over the threads, by name or library. One thread executes the rest.
 DIVIDED = re.compile(r"xnn|pthreadpool|sgemm|[Ss]leef|flash_attention|qmaxpool|onnxruntime|Mlas")
 
 COLUMNS = {  # the table's, each with the key of arm.json and how it is written
@@ -53,11 +52,9 @@ def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, An
     floor_g = manifest["gmac"] / SDOT_MACS
     inferences_g = [n / 1e9 for n in counted.inferences]
     kernels_g = {name: row[0] / 1e9 for name, row in counted.kernels.items()}
-    counts = {"instructions": counted.steady, "simd": counted.simd, "cycles": counted.cycles}
-    counts |= {"near_lines": counted.near_lines, "far_lines": counted.far_lines}
+    counts = {"instructions": counted.steady, "sdot": counted.sdot} | counted.work
     work = {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels_g)}
     return work | {
-        "sdot_g": counted.sdot / 1e9,
         "floor_g": floor_g,
         "x_floor": counted.steady / 1e9 / floor_g,
         "first_g": inferences_g[0],
@@ -86,8 +83,7 @@ def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
 def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any]]:
     """Hold static artifacts to their gates; return `compare.gate` rows. limits: arm.gates of lab/params.yml.
 
-    A gate is left out if this run has no artifact for it: those of instructions are for the user's policy, known by its
-    multiply-accumulates. Errors are divided by this machine's, ONNX Runtime's by torch's too; the worst action counts.
+    Errors are divided by this machine's, ONNX Runtime's by torch's too; the worst action counts.
     """
     rows = []
     for stem, artifact in metrics["artifacts"].items():

@@ -36,9 +36,8 @@ class Functions:
             symbols: Any = np.frombuffer(table.data() if table else b"", SYMBOL)
             self._names = elf.get_section(table["sh_link"]).data() if table else b"\0"
         symbols = symbols[np.isin(symbols["info"] & 15, FUNCTIONS) & (symbols["section"] > 0) & (symbols["at"] > 0)]
-        # Mapping symbols ($x, $d) only mark code and data and are no names of functions.
         first = np.frombuffer(self._names, "u1")[symbols["name"]]
-        symbols = symbols[(first != ord("$")) & (first != 0)]
+        symbols = symbols[(first != ord("$")) & (first != 0)]  # $x, $d only mark code and data
         self._symbols = symbols[np.lexsort((symbols["size"], symbols["at"]))]
         self._at = self._symbols["at"].tolist()
 

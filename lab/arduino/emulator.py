@@ -149,7 +149,8 @@ class EmulatedArduino:
             _set_nice(self.pid, nice)
             deadline = time.monotonic() + START_S
             while not os.path.lexists(self.port):  # not Path.exists, which would follow the link
-                self._process.check()
+                if not self._process.running:
+                    raise self._process.ended()
                 if time.monotonic() > deadline:
                     raise RoverError(
                         f"the emulated Arduino did not start within {START_S:g} s", remedy="is this machine busy?"

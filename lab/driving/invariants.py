@@ -66,18 +66,17 @@ class Run:
         for start, end in seen.pauses:
             paused[start:end] = True
         self.clean = ~self.sick & ~_for_any(paused, STOP_MS + 20)
-        sent = [[(ms, hand.pulses()[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
-        self.receiver = {pin: _each_ms(sent[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)
-        sticks = [[(ms, hand.sticks[channel]) for ms, hand in seen.hands] for channel in (0, 1)]
-        self.stick = {pin: _each_ms(sticks[i], n, int) for i, pin in enumerate(("steering", "throttle"))}
+        self.receiver, self.stick = {}, {}
+        for i, pin in enumerate(NEUTRAL_US):
+            self.receiver[pin] = _each_ms([(ms, hand.pulses()[i]) for ms, hand in seen.hands], n, int)
+            self.stick[pin] = _each_ms([(ms, hand.sticks[i]) for ms, hand in seen.hands], n, int)
         self.signals = _each_ms(seen.hands, n, lambda h: all(h.pulses()))
         self.regular = _each_ms(seen.hands, n, lambda h: h.one_in == 1 and not h.misread_in)
         self.autonomous = self.state == ord("A")
-        armed = np.flatnonzero(np.diff(self.autonomous.astype(int)) == 1) + 1
-        left = np.flatnonzero(np.diff(self.autonomous.astype(int)) == -1) + 1
-        self.armed, self.left = armed.tolist(), left.tolist()
-        self.drives = list(zip(self.armed, [*self.left, seen.end_ms], strict=False))
+        edges = np.diff(self.autonomous.astype(int))
+        self.armed, self.left = ((np.flatnonzero(edges == way) + 1).tolist() for way in (1, -1))
+        self.drives = list(zip(self.armed, [*self.left, n], strict=False))
 
 
 def _each_ms(changes: list, n: int, value: Callable[[Any], Any]) -> np.ndarray:
@@ -117,8 +116,8 @@ def _asked_for(run: Run) -> str | None:
     for c in run.seen.commands:
         span = slice(c.at_ms, c.at_ms + VALID_MS)
         host[span] = np.maximum(host[span], c.throttle_us)
-    ends = [ms for ms, _ in run.seen.hands[1:]] + [run.seen.end_ms + 1]
-    for (start_ms, hand), until in zip(run.seen.hands, ends, strict=True):
+    hands = run.seen.hands
+    for (start_ms, hand), (until, _) in pairwise([*hands, (run.seen.end_ms + 1, hands[-1][1])]):
         if hand.receiver == LIVE:
             span, us = slice(start_ms, until + SIGNAL_MS + 25), hand.sticks[1]
         elif hand.receiver == HELD:  # nobody can tell this from a human, until the firmware starts anew: docs/safety.md
@@ -173,12 +172,8 @@ def _human_wins(run: Run) -> str | None:
         must_end = (moved & (run.live[span] == 1) & bool(run.live[before].all())) | (run.signals[span] == 0)
         for hung_ms, until_ms in run.seen.hung:  # a hung loop notices nothing; the watchdog ends that a little later
             must_end[max(0, hung_ms - armed) : max(0, until_ms - armed)] = False
-        longest = ms = 0
-        for i, must in enumerate(must_end):
-            longest = longest + 1 if must else 0
-            if longest > SIGNAL_MS:
-                ms = armed + i
-                return f"autonomous at {ms} ms, and for {longest} ms the human wanted the car, or was not there"
+        if (late := _first(_for_ms(must_end, SIGNAL_MS + 1))) is not None:
+            return f"autonomous at {armed + late} ms, and the human wanted the car for {SIGNAL_MS} ms, or was not there"
     return None
 
 
@@ -187,8 +182,7 @@ def _human_keeps(run: Run) -> str | None:
     good = (run.state == ord("M")) & (run.live == 1) & (run.signals == 1) & (run.regular == 1)
     for hung_ms, until_ms in run.seen.hung:
         good[hung_ms:until_ms] = False
-    still = np.concatenate([[False], np.diff(run.stick["steering"]) == 0])
-    good &= still
+    good[1:] &= np.diff(run.stick["steering"]) == 0
     ms = _first(_for_ms(good, 160) & (np.abs(run.steering - run.stick["steering"]) > 1))
     return None if ms is None else f"steering {run.steering[ms]} us at {ms} ms, the stick {run.stick['steering'][ms]}"
 
@@ -209,19 +203,14 @@ def _armed_by_people(run: Run) -> str | None:
         asked = [ms for ms in run.seen.asked if stopped < ms <= armed]
         if not asked or armed - asked[-1] > run.seen.asked_most_ms + SPARE_MS:
             return f"armed at {armed} ms, asked for at {run.seen.asked}, stopped at {stopped}"
-        since = max(
-            [
-                used,
-                armed - GESTURE_MS - SIDES_MS - SPARE_MS,
-                *(ms for ms in run.seen.starts if ms <= armed),
-                *np.flatnonzero(lost[: max(0, armed - SIGNAL_MS)]).tolist(),
-                *np.flatnonzero(off_rest[:armed])[-1:].tolist(),
-            ]
-        )
+        since = max(used, armed - GESTURE_MS - SIDES_MS - SPARE_MS)
+        since = max([since, *(ms for ms in run.seen.starts if ms <= armed)])
+        for ends_it in (lost[: max(0, armed - SIGNAL_MS)], off_rest[:armed]):
+            since = max([since, *np.flatnonzero(ends_it)[-1:].tolist()])
         held = np.abs(off[armed - LET_GO_MS + 60 : armed - 25]) > LET_GO_US
         sides = [np.flatnonzero(side[since:armed]) + since for side in (off <= -SIDE_US, off >= SIDE_US)]
         if _for_ms(held, GLIMPSE_MS).any() or not any(ms <= SIDES_MS + 60 for ms in _gaps(*sides)):
-            return f"armed at {armed} ms without a gesture since {since} ms (they were at {run.seen.wiggled})"
+            return f"armed at {armed} ms without a gesture since {since} ms"
         used = armed
     return None
 
@@ -246,7 +235,7 @@ def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:
 
 def _off_after(run: Run, since_ms: int, limit_ms: int, what: str, until_ms: int = 10**9) -> str | None:
     """Say whether a drive that goes on at since_ms still moves the car limit_ms later, before until_ms."""
-    for armed, left in zip(run.armed, [*run.left, run.seen.end_ms], strict=False):
+    for armed, left in run.drives:
         if armed <= since_ms < left:
             moving = np.flatnonzero(run.throttle[since_ms + limit_ms : min(left, until_ms)] > RESTING_US)
             if len(moving):
@@ -257,15 +246,11 @@ def _off_after(run: Run, since_ms: int, limit_ms: int, what: str, until_ms: int 
 def _ends_when_told(run: Run) -> str | None:
     """A signal, the view, a limit or a missing heartbeat ends a drive: throttle off within 250 ms."""
     for ms, since in run.seen.stops:
-        if ms < run.seen.end_ms and (not since or any(a <= since <= ms < b for a, b in _drives(run))):
+        if ms < run.seen.end_ms and (not since or any(a <= since <= ms < b for a, b in run.drives)):
             limit_ms = STOP_MS if run.clean[ms] else VALID_MS + 20
             if what := _off_after(run, ms, limit_ms, "told to stop"):
                 return what
     return None
-
-
-def _drives(run: Run) -> list[tuple[int, int]]:
-    return list(zip(run.armed, [*run.left, run.seen.end_ms + 1], strict=False))
 
 
 def _stopped_is_neutral(run: Run) -> str | None:
@@ -281,7 +266,7 @@ def _as_planned(run: Run) -> str | None:
     n = len(run.throttle)
     good = [p for p in run.seen.plans if not p.bad]
     young = np.zeros(n, bool)
-    for armed, _ in _drives(run):
+    for armed, _ in run.drives:
         young[armed : armed + PLANNED_MS] = True
     fresh = np.zeros(n, bool)
     for p in good:
@@ -333,7 +318,7 @@ def _answered(run: Run) -> str | None:
             while waiting and (heard[at][1] - waiting[0].sequence) % 2**32 < 2**31:
                 waiting.popleft()
             at += 1
-        while waiting and not any(a <= waiting[0].at_ms <= command.at_ms <= b + 1 for a, b in _drives(run)):
+        while waiting and not any(a <= waiting[0].at_ms <= command.at_ms <= b + 1 for a, b in run.drives):
             waiting.popleft()  # of an earlier drive, or of an earlier start of the Arduino
         if waiting and command.at_ms - waiting[0].at_ms > UNANSWERED_MS:
             span = waiting[0].at_ms - 2, command.at_ms + 2
@@ -354,20 +339,11 @@ def _in_time(run: Run) -> str | None:
             return what
         first = [b for a, b in pauses[:i] if 103 <= b - a <= 148 and b + 20 < start and end < b + 480]
         judged = first and end - start >= 48 and not run.sick[first[0] - 200 : end].any() and end < run.seen.end_ms
-        if judged and any(a < first[0] - 150 and end + 2 < b for a, b in _drives(run)):
+        if judged and any(a < first[0] - 150 and end + 2 < b for a, b in run.drives):
             return f"autonomous at {end} ms after a second pause"
     return None
 
 
-NAMED = re.compile(
-    "as requested|no heartbeat|from the view|have passed since"
-    "|took over|before it began|before a human armed|told to stop|transmitter|wiggled|at rest|was reset"
-    "|no valid command|the host asked|the host paused|took no data|writing failed|reading failed"
-    "|cannot be opened|no hello|no answer|said nothing|no status|not answered|no time|frozen|black|contrast"
-    "|pictures in a row|no (new )?frame|ended after|too old"
-    "|picture changed|no frames|squeezed|no such camera|has ended|not found|damaged|copy the file|firmware flash"
-    "|not finite|outside the range|told to fail|fresh plan|plan within|raised in the loop"
-)
 UNFORESEEN = re.compile(r"\w+(Error|Exception): (?!raised in the loop)")  # sentence_of()'s form for unforeseen errors
 
 
@@ -375,7 +351,7 @@ def _told(run: Run) -> str | None:
     """Each drive ends soon after the firmware has stopped the car, with a line that says why."""
     seen = run.seen
     for _, ms, words in seen.drives:
-        if words is not None and (UNFORESEEN.match(words) or not NAMED.search(words)):
+        if words == "" or UNFORESEEN.match(words or ""):
             return f"the drive that ended at {ms} ms says {words!r}"
     refused = [ms for ms, text in seen.log if text.startswith("not armed")]
     for left in run.left:
@@ -384,8 +360,7 @@ def _told(run: Run) -> str | None:
         for begin, end, words in seen.drives:
             late = end - left > ENDED_MS + seen.paused_ms
             drove = any(begin <= armed <= left for armed in run.armed)  # and did not only wait for a request
-            if (
-                begin <= left < end and drove and late and words is not None
-            ):  # if it is None, the next start tells of it
+            # None: it was killed, and the next start tells of it.
+            if begin <= left < end and drove and late and words is not None:
                 return f"stopped at {left} ms, and the drive ended at {end}"
     return None

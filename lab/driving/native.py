@@ -19,11 +19,10 @@ STICKS_EVERY_MS = 20
 class NativeArduino:
     """A board that a transmitter's pulses and the host's lines go into, and pulses come out of; one at a time.
 
-    You may set these: sticks: the transmitter's pulses (us), where 0 stands for no signal. misread: one in so many of
-    its throttle pulses is read as another pulse (us): (one in, us). heard_ms, asked_ms: the board's time that the host
-    claims to have heard last, and at which somebody asked to arm it; None stands for now_ms. sequence: of the last
-    command. car: of the transmitter and of the host; the board is told of it, unless it is the default. gamepad: the
-    firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
+    You may set: sticks: the transmitter's pulses (us), where 0 stands for no signal. misread: (one in, us): one in so
+    many throttle pulses is read as another. heard_ms, asked_ms: what the host claims to have heard last, and when asked
+    to arm; None stands for now_ms. sequence: of the last command. car: told to the board, unless it is the
+    default. gamepad: the firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
     """
 
     def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None, gamepad: bool = False):
@@ -57,6 +56,7 @@ class NativeArduino:
         return bool(self._board.c.board_may_keep() & 1)
 
     def _line(self, hello: bool) -> Any:
+        """Return the board's line, as the host reads it. hello: as it is after a power-on, instead of its status."""
         text = ctypes.create_string_buffer(256)
         length = self._board.c.board_line(hello, text)
         return parse(text.raw[: length - 1], 0.0)

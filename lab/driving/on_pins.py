@@ -7,6 +7,7 @@ between them, and the transmitter's pulses come from simavr. All other faults ar
 
 import contextlib
 import ctypes
+import functools
 import platform
 import re
 import resource
@@ -16,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +25,10 @@ from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.cable import PRIORITY, Cable, boost
-from lab.driving.pins import (
-    BEFORE_S,
-    CONTINUES,
-    HUMAN,
-    LATE_COMMAND_S,
-    STOPPED,
-    STOPPED_THROTTLE_US,
-    Gates,
-    Observation,
-    judge,
-    row_of,
-)
+from lab.driving.pins import BEFORE_S, CONTINUES, STOPPED_THROTTLE_US, Gates, Observation, judge, row_of
 from lab.driving.policy import RATE_HZ, make_artifact, pictures
+from lab.driving.rows import FaultRow
+from lab.driving.stories import read_stories
 from rover_lib.onboard.drive.watch import real_time
 from rover_lib.onboard.errors import RoverError
 
@@ -46,6 +37,9 @@ START_S = 90.0  # a drive imports torch twice, which takes a third of a minute w
 END_S = 6.0
 KNOWN_S = 0.05  # how long it takes until a pulse has ended and been read
 ATTEMPTS = 5  # how often a row is tried if this machine was too busy
+KILLED = -signal.SIGKILL
+LINE_S = 1.5  # within which a line must come
+LATE_COMMAND_S = 0.1  # three ticks of a drive
 # A drive waits for its human's gesture only if stdin is a terminal.
 IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
 THREAD_ENDS = f"from {__name__} import end_thread_on_signal; end_thread_on_signal(); "
@@ -60,28 +54,25 @@ def end_thread_on_signal() -> None:
 class Drive(Child):
     """`rover drive` with the bench's artifact, camera and cable. prepared: code that runs in its process before."""
 
-    def __init__(self, bench: "PinBench", prepared: str, *arguments: object):
+    def __init__(self, bench: "PinBench", prepared: str):
         self.prepared, self._marked = prepared, 0
         code = f"{IN_TERMINAL}{prepared}from rover_lib.onboard.cli import main; main()"
         devices = "--camera", bench.camera, "--port", bench.cable.port, "--view", bench.folder / "view"
         options = "--film", "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
-        command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options, *arguments)
+        command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options)
         super().__init__("rover drive", *command, error=RoverError)
 
     def mark(self) -> None:
         """Note that what it has printed until now is from before the fault."""
         self._marked = len(self.errors())
 
-    def line_of(self, message: str, within_s: float = 1.5) -> str | None:
-        """Return the first line since mark() that matches, or None if there is none within that time."""
-        deadline = time.monotonic() + within_s
-        while True:
-            for line in self.errors()[self._marked :]:
-                if re.search(message, line):
-                    return line
-            if time.monotonic() > deadline:
-                return None
-            time.sleep(0.1)
+    def line_of(self, message: str) -> str | None:
+        """Return the first line since mark() that matches, or None if there is none within LINE_S."""
+        deadline, line = time.monotonic() + LINE_S, None
+        while line is None and time.monotonic() < deadline:
+            line = next((line for line in self.errors()[self._marked :] if re.search(message, line)), None)
+            time.sleep(0.1 * (line is None))
+        return line
 
 
 class PinBench:
@@ -136,16 +127,16 @@ class PinBench:
             self.wait(AT_SPEED_S)
             if self.driving:
                 return
-        self.start(prepared)
+        self._start(prepared)
 
-    def start(self, prepared: str = "", *arguments: object) -> None:
+    def _start(self, prepared: str) -> None:
         """Start a new drive with a new cable, let the human arm it, and wait until it has been driving for a while."""
         self._end_drive()
         self.clear_faults()
         self.cable.unplug()
         self.cable = Cable(self.arduino.port)
         self.arduino.ready(True)
-        self._drive = drive = Drive(self, prepared, *arguments)
+        self._drive = drive = Drive(self, prepared)
         deadline = time.monotonic() + START_S
         first_s = None  # the time of its first command
         while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self.driving:
@@ -153,7 +144,7 @@ class PinBench:
             if first_s is None and self.cable.commands:
                 first_s = self.cable.commands[0].at_s
             if not drive.running or time.monotonic() > deadline:
-                raise RoverError("rover drive did not drive", found=drive.last_words(), remedy="drive it by hand")
+                raise RoverError("rover drive did not drive", found=drive.errors()[-3:], remedy="drive it by hand")
         self.arduino.ready(False)  # from here on the human only does what a fault says
 
     def clear_faults(self) -> None:
@@ -170,33 +161,14 @@ class PinBench:
 # ---- the faults
 
 
-@dataclass(frozen=True)
-class PinRow:
-    """One fault, and what is expected of the car.
-
-    inject: makes the fault happen; method: how, in words. message: a regular expression for the line that tells of it.
-    told_later: whether only the next drive prints that line. exit_code: of the drive, None if it goes on. starves:
-    whether the fault takes this machine's time away from the drive.
-    """
-
-    name: str
-    kind: str
-    expected: str
-    message: str
-    method: str
-    inject: Callable[[PinBench], object]
-    exit_code: int | None = 3
-    watch_s: float = 1.0
-    prepared: str = ""
-    told_later: bool = False
-    starves: bool = False
-    human_us: tuple[float, float] = REST_US
-
-
 def _stop_process(bench: PinBench) -> None:
     bench.drive.process.send_signal(signal.SIGSTOP)
     bench.wait(1.0)
     bench.drive.process.send_signal(signal.SIGCONT)
+
+
+def _signal(name: str) -> Callable[[PinBench], object]:
+    return lambda bench: bench.drive.process.send_signal(signal.Signals[name])
 
 
 def _starve(bench: PinBench) -> None:
@@ -211,39 +183,38 @@ def _fill_disk(bench: PinBench) -> None:
     bench.undo.callback(resource.prlimit, bench.drive.pid, resource.RLIMIT_FSIZE, limits)
 
 
-STEERED_US = REST_US[0] + 144, REST_US[1]
-PIN_ROWS = (
-    PinRow("Arduino reset", "firmware", STOPPED, r"was reset \(reset pin\)", "the reset button",
-           lambda bench: bench.arduino.reset()),
-    PinRow("Arduino's power cut", "firmware", STOPPED, r"was reset \(power-on\)", "off and on",
-           lambda bench: bench.arduino.power()),
-    PinRow("Arduino loop hung", "firmware", STOPPED, r"was reset \(watchdog\)", "an endless loop in the firmware",
-           lambda bench: bench.arduino.hang()),
-    PinRow("serial unplugged", "link", STOPPED, "is it still plugged in", "both ends of the port's pty are closed",
-           lambda bench: bench.cable.unplug()),
-    PinRow("serial stuck", "link", STOPPED, "took no data", "the port's output is suspended: writes block",
-           lambda bench: bench.cable.stick()),
-    PinRow("human takes over by steering", "receiver", HUMAN, "the human took over", "the transmitter's pulses",
-           lambda bench: bench.arduino.transmitter(*STEERED_US), exit_code=4, human_us=STEERED_US),
-    PinRow("host process stopped", "host", STOPPED, "no valid command for 150 ms|said nothing for",
-           "SIGSTOP, after 1 s SIGCONT", _stop_process),
-    PinRow("loop thread killed", "host", STOPPED, "the loop has not ticked", "the loop's thread leaves by exit(2)",
-           lambda bench: bench.drive.process.send_signal(signal.SIGUSR2), prepared=THREAD_ENDS),
-    PinRow("SIGTERM", "operator", STOPPED, "SIGTERM: stopping", "a signal from outside",
-           lambda bench: bench.drive.process.send_signal(signal.SIGTERM), exit_code=0),
-    PinRow("SIGKILL", "operator", STOPPED, "the drive before this one", "a signal from outside",
-           lambda bench: bench.drive.process.send_signal(signal.SIGKILL), exit_code=-9, told_later=True),
-    PinRow("CPU starved", "host", CONTINUES, "", "4 busy processes of ordinary priority",
-           _starve, exit_code=None, watch_s=3.0, starves=True),
-    PinRow("disk full while logging", "host", CONTINUES, "the flight log cannot be written",
-           "RLIMIT_FSIZE by prlimit", _fill_disk, exit_code=None, watch_s=2.0),
-)  # fmt: skip
+INJECT: dict[str, Callable[[PinBench], object]] = {
+    "Arduino reset": lambda bench: bench.arduino.reset(),
+    "Arduino's power cut": lambda bench: bench.arduino.power(),
+    "Arduino loop hung": lambda bench: bench.arduino.hang(),
+    "serial unplugged": lambda bench: bench.cable.unplug(),
+    "serial stuck": lambda bench: bench.cable.stick(),
+    "human takes over by steering": lambda bench: bench.arduino.transmitter(REST_US[0] + 144, REST_US[1]),
+    "host process stopped": _stop_process,
+    "loop thread killed": _signal("SIGUSR2"),
+    "SIGTERM": _signal("SIGTERM"),
+    "SIGKILL": _signal("SIGKILL"),
+    "CPU starved": _starve,
+    "disk full while logging": _fill_disk,
+}
+PREPARED = {"loop thread killed": THREAD_ENDS}
+STARVES = "CPU starved"  # takes the drive's time
+
+
+@functools.cache
+def pin_rows() -> list[FaultRow]:
+    """Read the faults on pins from stories.yml."""
+    return [FaultRow(**row) for row in read_stories("pins")]
+
+
+def _human_us(fault: FaultRow) -> tuple[float, float]:
+    return REST_US[0] + fault.moved_us[0], REST_US[1] + fault.moved_us[1]
 
 
 # ---- judging
 
 
-def run_pin_row(bench: PinBench, fault: PinRow, gates: Gates) -> dict[str, Any]:
+def run_pin_row(bench: PinBench, fault: FaultRow, gates: Gates) -> dict[str, Any]:
     """Inject a fault into a drive at speed, judge it, and return the row of metrics.faults.
 
     If this machine was too busy for the fault to be judged, it is repeated, up to ATTEMPTS times in all.
@@ -251,46 +222,46 @@ def run_pin_row(bench: PinBench, fault: PinRow, gates: Gates) -> dict[str, Any]:
     attempts, spoilt = 0, True
     while spoilt and attempts < ATTEMPTS:
         attempts += 1
-        bench.at_speed(fault.prepared)
+        bench.at_speed(PREPARED.get(fault.name, ""))
         seen, code, line = _inject(bench, fault)
         spoilt = _spoilt(fault, seen, gates)
-    verdict = judge(fault.expected, seen, gates, human_us=fault.human_us)
-    if code != fault.exit_code:
-        verdict.wrong.append(f"rover drive ended with {code}, expected {fault.exit_code}")
+    verdict = judge(fault.expected, seen, gates, human_us=_human_us(fault))
+    if code != fault.wanted_code:
+        verdict.wrong.append(f"rover drive ended with {code}, expected {fault.wanted_code}")
     with contextlib.suppress(RoverError):  # then it is not recovered
         bench.at_speed()
-    if fault.told_later:
+    if code == KILLED:  # the next drive tells of it
         line = bench.drive.line_of(fault.message)
     more = {"attempts": attempts, "stalled_ms": round(seen.stalled_ms(), 1)}
     line = line and line.replace(f"{bench.folder}/", "")
-    return row_of(fault, verdict, code, line, bench.driving, f"on pins: {fault.method}", **more)
+    return row_of(fault, verdict, code, line, bench.driving, "on pins", **more)
 
 
-def _inject(bench: PinBench, fault: PinRow) -> tuple[Observation, int | None, str | None]:
+def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
     """Inject a fault once. Returns what was seen, the drive's exit code, and the line that tells of the fault."""
     drive = bench.drive
     bench.events = bench.events[-2000:]
     drive.mark()
     at_s = time.monotonic()
-    fault.inject(bench)
-    bench.wait(fault.watch_s)
+    INJECT[fault.name](bench)
+    bench.wait(fault.watch_ms / 1e3)
     end_s = time.monotonic()
     bench.wait(KNOWN_S)
     commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
-    code = drive.process.poll() if fault.exit_code is None else drive.wait(END_S)
-    line = None if fault.told_later else drive.line_of(fault.message)
+    code = drive.process.poll() if fault.wanted_code is None else drive.wait(END_S)
+    line = None if code == KILLED else drive.line_of(fault.message)
     bench.clear_faults()
     return Observation(bench.events, commands, at_s, end_s), code, line
 
 
-def _spoilt(fault: PinRow, seen: Observation, gates: Gates) -> bool:
+def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
     """Whether this machine had no time for the Arduino or the drive, so that there is nothing to judge."""
     if seen.stalled_ms() or not seen.was_driving(gates.throttle_max_us):
         return True
-    return fault.expected == CONTINUES and not fault.starves and seen.longest_pause_s() > LATE_COMMAND_S
+    return fault.expected == CONTINUES and fault.name != STARVES and seen.longest_pause_s() > LATE_COMMAND_S
 
 
-def run_on_pins(faults: Sequence[PinRow], gates: Gates) -> Iterator[dict[str, Any]]:
+def run_on_pins(faults: Sequence[FaultRow], gates: Gates) -> Iterator[dict[str, Any]]:
     """Yield a row for each fault. Raises RoverError if the bench does not drive, or without an emulator."""
     if faults:
         with PinBench() as bench:

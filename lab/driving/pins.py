@@ -22,7 +22,6 @@ COMMAND_US = {"steering": 1.0, "throttle": 2.5}  # the error of a commanded puls
 STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pulse may begin 21 ms later
 BEFORE_S = 0.2  # how long the car must have been driving before a fault
 LAST_S = 0.2  # how long at the end there must be pulses
-LATE_COMMAND_S = 0.1  # three ticks of a drive
 DEFAULT = Car()
 
 
@@ -32,8 +31,6 @@ class Gates:
 
     stopped_ms: float
     takeover_ms: float
-    rows: int
-    stopped_rows: int
     throttle_max_us: float = STOPPED_THROTTLE_US
 
     @classmethod

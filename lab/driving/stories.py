@@ -6,10 +6,9 @@ To add a new kind of fault, write a function here that changes something in the 
 random drive may have it. stories.yml has the faults of docs/safety.md (rows.py), and what once broke an invariant.
 """
 
-import contextlib
 import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,11 +39,10 @@ class Happening:
 class Story:
     """What happens in a drive in addition to the usual: the human's gesture, an operator's start, a stop 3.3 s later.
 
-    wiggled: whether the gesture comes before the start. service: whether the drive is a service; then the operator also
-    asks it to arm the car. limited, heartbeat: see Process. terminal: whether the drive waits for the gesture.
-    longer_ms: how much later it is stopped, and if `late`, begun. clock_ms: the Arduino's clock when it is switched on.
-    steady: whether the policy always goes, instead of going and braking in turn. gamepad: whether the human has one,
-    which counts only while a link is open, so that the gesture and the request come later.
+    wiggled: whether the gesture comes. service: whether the drive is a service, which the operator also asks to arm.
+    limited, heartbeat: see Process. terminal: whether the drive waits for the gesture. longer_ms: how much later it is
+    stopped, and if `late`, begun. clock_ms: the Arduino's when it is switched on. steady: whether the policy never
+    brakes. gamepad: whether the human has one, which counts only while a link is open: all comes later.
     """
 
     happenings: tuple[Happening, ...] = ()
@@ -70,15 +68,7 @@ class Stage:
         self.world = World(clock_ms, car)
         self.process: Process | None = None
         self.start_due = False
-        self.view: Any = None
-        self.stack = contextlib.ExitStack()  # of what is closed at the end
         self._usual: dict[tuple[object, str], Any] = {}
-
-    @property
-    def running(self) -> Process:
-        """The process, which must be there."""
-        assert self.process
-        return self.process
 
     def during(self, happening: Happening, thing: object, **values: Any) -> None:
         """Set attributes of a thing while the happening lasts, then set them back to their usual values."""
@@ -99,24 +89,16 @@ class Stage:
             self.world.at(self.world.now_ms + ms, what)
 
     def wiggle(self) -> None:
-        """Let the human make the gesture. It counts if the receiver passed on pulses at both sides."""
-        world, hand = self.world, self.world.hand
-        heard = []
+        """Let the human move the steering stick to both sides and let go."""
+        self.steer(294)
+        self.world.at(self.world.now_ms + 70, lambda: self.steer(-306))
+        self.world.at(self.world.now_ms + 140, lambda: self.steer(0))
 
-        def move(steering_us: int) -> None:
-            heard.append(hand.receiver in (LIVE, HELD))
-            hand.sticks = [world.rest_us[0] + steering_us, hand.sticks[1]]
-            heard.append(heard[-1])
-            world.handle()
-
-        def let_go() -> None:
-            move(0)
-            if any(heard[1:3]) and any(heard[3:5]):  # for each side: when it was reached, and when it was left
-                world.seen.wiggled.append(world.now_ms)
-
-        move(294)
-        world.at(world.now_ms + 70, lambda: move(-306))
-        world.at(world.now_ms + 140, let_go)
+    def steer(self, steering_us: int, throttle_us: int | None = None) -> None:
+        """Let the human hold the steering stick so far from rest, and the throttle stick there or where it is."""
+        hand = self.world.hand
+        hand.sticks = [self.world.rest_us[0] + steering_us, hand.sticks[1] if throttle_us is None else throttle_us]
+        self.world.handle()
 
 
 Happen = Callable[[Stage, Happening], object]
@@ -156,10 +138,15 @@ def _freeze(stage: Stage, h: Happening) -> None:
 _may("frames come late", (20, 3000), A_WHILE)(during("lens", late_ms=AMOUNT))
 
 
-@_may("the camera is unplugged")
-def _unplug_camera(stage: Stage, h: Happening) -> None:
-    if stage.process:
-        stage.process.eyes.unplug()
+def _to_process(do: Callable[[Process], object]) -> Happen:
+    def happen(stage: Stage, h: Happening) -> None:
+        if stage.process:
+            do(stage.process)
+
+    return happen
+
+
+_may("the camera is unplugged")(_to_process(lambda process: process.eyes.unplug()))
 
 
 for _does in ("raise", "nan", "wild"):
@@ -223,15 +210,10 @@ def _steer_slowly(stage: Stage, h: Happening) -> None:
 def _by_hand(stage: Stage, h: Happening) -> None:
     """Around corners, with stops of a second in between."""
     world = stage.world
-
-    def turn(steering_us: int, throttle_us: int) -> None:
-        world.hand.sticks = [world.rest_us[0] + steering_us, throttle_us]
-        world.handle()
-
     for ms in range(0, h.for_ms, 1900):
         side = 300 if ms // 1900 % 2 else -300
-        world.at(world.now_ms + ms, partial(turn, side, world.throttle_us(h.amount)))
-        world.at(world.now_ms + ms + 800, partial(turn, 0, world.rest_us[1]))
+        world.at(world.now_ms + ms, partial(stage.steer, side, world.throttle_us(h.amount)))
+        world.at(world.now_ms + ms + 800, partial(stage.steer, 0, world.rest_us[1]))
 
 
 @_may("the receiver sends presets", (60, 700), A_WHILE)
@@ -301,18 +283,8 @@ def _kill(stage: Stage, h: Happening) -> None:
         stage.world.alive, stage.world.failing = False, Killed()
 
 
-@_may("the operator says stop")
-def _stop(stage: Stage, h: Happening) -> None:
-    if stage.process:
-        stage.process.stop("signal")
-
-
-@_may("somebody stops it from the view")
-def _stop_from_view(stage: Stage, h: Happening) -> None:
-    if stage.process:
-        stage.process.stop("view")
-
-
+_may("the operator says stop")(_to_process(lambda process: process.stop("signal")))
+_may("somebody stops it from the view")(_to_process(lambda process: process.stop("view")))
 _may("the operator's connection is lost")(lambda stage, h: setattr(stage.world, "operator_gone", True))
 
 
@@ -331,21 +303,16 @@ def _start_and_suspend(stage: Stage, h: Happening) -> None:
 
 
 def read_stories(section: str) -> list[dict[str, Any]]:
-    """Return a section of stories.yml: "rows" or "kept"."""
-    return yaml.safe_load(Path(__file__).with_suffix(".yml").read_text())[section]
-
-
-def told(happens: Sequence[Sequence[Any]]) -> tuple[Happening, ...]:
-    """Return the happenings that stories.yml lists: at_ms, what, and the amount and for_ms if they are not 0."""
-    return tuple(Happening(*each) for each in happens)
-
-
-def _kept(happens: Sequence[Sequence[Any]], end: str, **options: Any) -> tuple[Story, str]:
-    return Story(told(happens), **options), end
+    """Return a section of stories.yml, "rows", "pins" or "kept", with what `happens` as happenings."""
+    rows = yaml.safe_load(Path(__file__).with_suffix(".yml").read_text())[section]
+    return [row | {"happenings": tuple(Happening(*each) for each in row.pop("happens", ()))} for row in rows]
 
 
 # Stories that once broke an invariant, and how a drive ends in them: a regular expression.
-KEPT = {row.pop("name"): _kept(**row) for row in read_stories("kept")}
+KEPT: dict[str, tuple[Story, str]] = {}
+for _row in read_stories("kept"):
+    _name, _end = _row.pop("name"), _row.pop("end")
+    KEPT[_name] = Story(**_row), _end
 
 
 def random_story(seed: int) -> Story:
@@ -367,16 +334,6 @@ def random_story(seed: int) -> Story:
     return Story(in_order, wiggled, path == "service", clock_ms, terminal, *limits, longer_ms, late, gamepad=gamepad)
 
 
-def shortest(story: Story, breaks: Callable[[Story], bool]) -> Story:
-    """Leave out what the story does not need to break the same invariant; return the simplest one found."""
-    plain = (replace(story, **{name: value}) for name, value in vars(Story()).items() if name != "happenings")
-    fewer = (replace(story, happenings=tuple(h for h in story.happenings if h is not out)) for out in story.happenings)
-    for simpler in (*plain, *fewer):
-        if simpler != story and breaks(simpler):
-            return shortest(simpler, breaks)
-    return story
-
-
 def drive_story(story: Story, car: Car | None = None) -> Seen:
     """Drive a story, in some hundredths of a second, and return what was seen. Raises RoverError without gcc."""
     stage = Stage(story.clock_ms, Car(human="gamepad") if story.gamepad else car)
@@ -390,11 +347,11 @@ def drive_story(story: Story, car: Car | None = None) -> Seen:
         happen = TOLD[h.what] if h.what in TOLD else HAPPENINGS[h.what][0]
         world.at(h.at_ms, partial(happen, stage, h))
     stop_ms = STOP_MS + story.longer_ms + pad_ms
-    start, stop = (Happening(ms, what) for ms, what in ((START_MS, "start"), (stop_ms, "stop")))
-    world.at(START_MS + later_ms, lambda: _start(stage, start))
-    world.at(stop_ms, lambda: _stop(stage, stop))
+    usual = {START_MS + later_ms: "the operator starts it", stop_ms: "the operator says stop"}
     if story.service:
-        world.at(ASK_MS + later_ms + pad_ms, lambda: _start(stage, start))
+        usual[ASK_MS + later_ms + pad_ms] = "the operator starts it"
+    for ms, what in usual.items():
+        world.at(ms, partial(HAPPENINGS[what][0], stage, Happening(ms, what)))
     while world.now_ms < stop_ms + END_MS - STOP_MS:
         world.advance(world.now_ms + 1)
         if stage.start_due and world.now_ms < stop_ms:
@@ -403,5 +360,4 @@ def drive_story(story: Story, car: Car | None = None) -> Seen:
             stage.process.run()
             stage.process = None
     world.close()
-    stage.stack.close()
     return world.seen

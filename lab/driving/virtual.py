@@ -46,10 +46,7 @@ class Event(ctypes.Structure):
 
 @functools.cache
 def library(human: str = "receiver") -> Path:
-    """Get the sketch as a library for this machine, from the cache or compiled now. Raises RoverError without gcc.
-
-    human: as in `make -C firmware HUMAN=gamepad`.
-    """
+    """Get the sketch for that human as a library, from the cache or compiled now. Raises RoverError without gcc."""
     rover = FIRMWARE / "rover"
     sources = [BOARD, *sorted(p for p in rover.iterdir() if p.is_file())]
     key = key_of({"names": [source.name for source in sources], "human": human}, *sources)
@@ -63,10 +60,7 @@ def library(human: str = "receiver") -> Path:
 
 
 class Board:
-    """The sketch from one start to the next, one at a time. Raises RoverError if there is no gcc.
-
-    numbers: of the car in its EEPROM. human: as for library().
-    """
+    """The sketch from one start to the next, one at a time. numbers: of the car in its EEPROM."""
 
     def __init__(self, clock_ms: int, boot: int, cause: str, numbers: Sequence[int], human: str):
         self.c = ctypes.CDLL(str(library(human)))
@@ -100,14 +94,14 @@ class Board:
 class Wire:
     """One direction of the serial line, which carries whole lines in order. You may set its latency and faults.
 
-    change: returns the lines that come out for one that goes in, None for that line itself.
+    change: returns what comes out for a line that goes in.
     """
 
     def __init__(self, world: "World", arrive: Callable[[bytes], None]):
         self._world, self._arrive = world, arrive
         self.latency_ms = 1
         self.lost_pct = self.garbled_pct = 0
-        self.change: Callable[[bytes], list[bytes]] | None = None
+        self.change: Callable[[bytes], bytes] | None = None
         self._busy_ms = 0.0
         self._last_ms = 0
 
@@ -121,8 +115,8 @@ class Wire:
             bad = bytearray(line)
             bad[world.rng.randrange(len(bad))] ^= 1 << world.rng.randrange(8)
             line = bytes(bad)
-        for out in self.change(line) if self.change else [line]:
-            world.at(self._last_ms, functools.partial(self._arrive, out))
+        out = self.change(line) if self.change else line
+        world.at(self._last_ms, functools.partial(self._arrive, out))
 
 
 @dataclass(eq=False)
@@ -148,10 +142,10 @@ class Hand:
 class Lens:
     """What the camera shows. frozen_ms: since when it shows the same. late_ms: how old the pictures are that come.
 
-    film: what it shows instead, in turn: pictures (h, w, 3) uint8 BGR, or JPEGs.
+    film: what it shows instead, in turn: pictures (h, w, 3) uint8 BGR.
     """
 
-    film: Sequence[np.ndarray | bytes] = ()
+    film: Sequence[np.ndarray] = ()
     frozen_ms: int | None = None
     black: bool = False
     silent: bool = False
@@ -204,7 +198,6 @@ class Seen:
     hands: list[tuple[int, Hand]] = field(default_factory=list)  # what human and receiver do
     commands: list[Asked] = field(default_factory=list)
     asked: list[int] = field(default_factory=list)  # when an operator asked to arm the car
-    wiggled: list[int] = field(default_factory=list)  # when a gesture was complete
     starts: list[int] = field(default_factory=list)  # of the sketch
     hung: list[tuple[int, int]] = field(default_factory=list)  # from when to when the sketch's loop hung
     drives: list[tuple[int, int, str | None]] = field(default_factory=list)  # begin, end, last sentence; None: killed
@@ -224,15 +217,13 @@ class Seen:
 class World:
     """The whole world. Its methods and attributes are what may break.
 
-    clock_ms: the Arduino's when it is switched on. rest_us: the pulses of sticks at rest. wall_step_s: by how much
-    somebody has set the host's clock.
+    clock_ms: the Arduino's when it is switched on. rest_us: the pulses of sticks at rest.
     """
 
     def __init__(self, clock_ms: int = 0, car: Car | None = None):
         self.car = car or Car()
         self.rest_us = self.car.numbers[2], self.car.numbers[6]
         self.now_ms = 0
-        self.wall_step_s = 0.0
         self.rng = random.Random(0)
         self.seen = Seen(self.car.human == "gamepad")
         self.hand = Hand(list(self.rest_us), list(self.rest_us))
@@ -253,8 +244,6 @@ class World:
         self._count = 0
         self._started_ms = self._hung_ms = 0
         self.view_stop = self.operator_gone = False
-        self.view: Path | None = None  # the socket at which a view listens
-        self.opening: Callable[[], object] = lambda: None  # what a process opens first; it may raise
         self.down, self.up = Wire(self, self._arrive_down), Wire(self, self._arrive_up)
         self._power(clock_ms, "p")
 

@@ -36,7 +36,6 @@ RATE_HZ = 30.0
 PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
 LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
-WALL_S = 1.7e9
 NO_VIEW = Path("/nowhere/view")
 SIZE = (128, 72)  # of the camera's pictures, and of those that the policy has seen: width, height
 
@@ -132,16 +131,14 @@ class VirtualLink(ServoLink):
     def __init__(self, world: World):
         super().__init__("the virtual port", car=world.car, clock=world.clock)
         self._world = world
-        condition: Any = _Waiting(world)
-        self._heard = condition
+        self._heard = cast(Any, _Waiting(world))
 
     def open(self) -> Hello:
         self._world.port = self
         if self._world.unplugged:
             self._world.port = None
             raise LinkError(f"{self.port}: cannot be opened", remedy="is the Arduino plugged in?")
-        port: Any = self
-        self._serial = port
+        self._serial = cast(Any, self)
         hello = self._wait_for_hello()
         self._tell_car(hello)
         if self.car.human == "gamepad":
@@ -173,11 +170,6 @@ class VirtualLink(ServoLink):
             self._relay(self._gamepad, now_s)
 
 
-def wall_clock(world: World) -> float:
-    """Return the time in seconds, in place of time.time()."""
-    return WALL_S + world.clock() + world.wall_step_s
-
-
 @functools.cache
 def scenery() -> list[np.ndarray]:
     """Return the pictures of a drive, (72, 128, 3) uint8 BGR, no two of them alike."""
@@ -194,8 +186,7 @@ class Eyes:
     def __init__(self, world: World):
         self._world = world
         self.camera = Camera("the virtual camera", clock=world.clock)
-        condition: Any = _Waiting(world)
-        self.camera._changed = condition
+        self.camera._changed = cast(Any, _Waiting(world))
         self.content: dict[int, int] = {}  # by a frame's number, when (ms) its scene was really to be seen
         self._shown = 0  # pictures of a film
         self._seen_ms = -1_000_000
@@ -208,7 +199,7 @@ class Eyes:
         self.on_frame: Callable[[], None] = lambda: None
         self._tick()
 
-    def _pictures(self) -> Iterator[tuple[np.ndarray | bytes, float | None]]:
+    def _pictures(self) -> Iterator[tuple[np.ndarray, float | None]]:
         try:
             self._idle.put(None)
             while isinstance(given := self._given.get(), tuple):
@@ -220,7 +211,7 @@ class Eyes:
             self._over = True
             self._idle.put(None)
 
-    def _give(self, picture: tuple[np.ndarray | bytes, float] | Exception | None) -> None:
+    def _give(self, picture: tuple[np.ndarray, float] | Exception | None) -> None:
         if not self._over:
             self._given.put(picture)
             self._idle.get()
@@ -270,8 +261,7 @@ class VirtualPlanner(Planner):
         self._number = 0
         self.content: dict[int, int] = {}  # by a plan's number, when (ms) its picture's scene was really to be seen
         super().__init__(eyes.camera, self._never, commanded, RATE_HZ, limits=world.car.limits, clock=world.clock)
-        condition: Any = _Waiting(world)
-        self._news = condition
+        self._news = cast(Any, _Waiting(world))
         eyes.on_frame = self._look
 
     def _never(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -398,14 +388,13 @@ class Process:
         self.world, self.stopped, self._terminal = world, _Stop(world), terminal
         self.report, self.log = Report(), cast(Any, _Log(world))
         self._operators = Service(self.report, self.stopped, clock=world.boottime)
-        turn: Any = _Waiting(world)
-        self._operators._turn = turn
+        self._operators._turn = cast(Any, _Waiting(world))
         self._limits = Request(LIMIT_MS / 1e3 if limited else None, HEARTBEAT_MS / 1e3 if heartbeat else None)
         world.seen.asked_most_ms = 2000 if service else 31_000
         world.alive = True
         self.eyes, commanded = Eyes(world), Commanded()
         self.planner = VirtualPlanner(world, self.eyes, commanded)
-        self._feed = Feed(world.view or NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self._feed = Feed(NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
         self.session = _Session(
             DriveOptions(Path("virtual"), hz=RATE_HZ, asked_s=world.boottime()), Settings.of(params()["drive"]),
             self.report, self.log, self._feed, None, self.eyes.camera, self.planner, commanded, RATE_HZ, "virtual",
@@ -453,7 +442,6 @@ class Process:
         try:
             with contextlib.ExitStack() as stack:
                 with self._told():
-                    world.opening()
                     session.link = stack.enter_context(VirtualLink(world))
                     if frame := session.camera.latest():
                         check_shape(session.camera.source, frame.image, SIZE)

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 from urllib.request import getproxies
 
 from lab.pi.debian_image import debian_image
@@ -42,8 +43,7 @@ CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 class Container:
     """One emulated Pi; a context manager, which leaves nothing behind.
 
-    name: of the rover. root: the host's path of its file system. bench: the host's path of BENCH. port: of its sshd, on
-    the loopback. key: the ssh key of its user.
+    root, bench: the host's paths of its file system and of BENCH. port: of its sshd. key: the ssh key of its user.
     """
 
     def __init__(self, name: str):
@@ -77,24 +77,16 @@ class Container:
         self._stack.close()
 
     def boot(self) -> None:
-        """Switch it on, and wait until its sshd answers.
-
-        Raises RoverError with the last lines of its console if sshd does not answer.
-        """
+        """Switch it on, and wait until its sshd answers. Raises RoverError if it does not."""
         command = ["systemd-nspawn", "--quiet", "--boot", "--register=no", "--keep-unit", "--link-journal=no"]
         command += [f"--machine={self.machine}", f"--hostname={self.name}", f"--directory={self.root}"]
         command += ["--capability=CAP_SYS_RESOURCE"]  # for limits such as the drive loop's real-time priority
         command += ["--resolv-conf=replace-host", "--timezone=off", "--console=pipe"]
         command += [f"--bind={self.bench}:{BENCH}", f"--bind=/dev/pts:{PTS}"]
         console = self._stack.enter_context((self._own / "console.log").open("wb"))
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=console,
-            stderr=subprocess.STDOUT,
-            preexec_fn=self._enter,
-            start_new_session=True,  # a terminal's ^C must reach only this program, which then stops it in order
-        )
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": console, "stderr": subprocess.STDOUT}
+        # In its own session: a terminal's ^C must reach only this program, which then stops it in order.
+        process = subprocess.Popen(command, preexec_fn=self._enter, start_new_session=True, **streams)
         self._stack.callback(_power_off, process)
         self._wait_for_sshd(process)
 
@@ -122,14 +114,13 @@ class Container:
 
     def _configure(self) -> None:
         """Write to its disk what makes it this Pi, before it boots."""
-        etc = self.root / "etc"
+        etc, units = self.root / "etc", self.root / "etc/systemd/system"
         for name in MASKED:
-            (etc / "systemd/system" / name).unlink(missing_ok=True)
-            (etc / "systemd/system" / name).symlink_to("/dev/null")
+            (units / name).unlink(missing_ok=True)
+            (units / name).symlink_to("/dev/null")
         for name in TRANSLATED:
-            (etc / "systemd/system" / f"{name}.service.d").mkdir(exist_ok=True)
-            settings = "[Service]\nMemoryDenyWriteExecute=no\n"
-            (etc / "systemd/system" / f"{name}.service.d" / "emulated.conf").write_text(settings)
+            (units / f"{name}.service.d").mkdir(exist_ok=True)
+            (units / f"{name}.service.d" / "emulated.conf").write_text("[Service]\nMemoryDenyWriteExecute=no\n")
         (etc / "hostname").write_text(f"{self.name}\n")
         (etc / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{self.name}\n")
         settings = f"Port {self.port}\nListenAddress 127.0.0.1\nUseDNS no\nPasswordAuthentication no\n"
@@ -149,10 +140,7 @@ def _power_off(nspawn: subprocess.Popen) -> None:
 
 
 def _lend_systemd(root: Path) -> None:
-    """Copy this machine's own systemd, which must have the Pi's version, into the Pi; everything else stays aarch64.
-
-    Under qemu-user, a service's sandbox fails (PrivateNetwork=, credentials) or has no effect (seccomp).
-    """
+    """Copy this machine's systemd, of the Pi's version, into the Pi: under qemu-user, a service's sandbox fails."""
     libraries = {Path(word) for word in run("ldd", SYSTEMD).split() if word.startswith("/")}
     ask = ["dpkg-query", "--show", "--showformat=${Version}"]
     here, there = run(*ask, "systemd"), run(*ask, f"--admindir={root}/var/lib/dpkg", "systemd:arm64")
@@ -184,10 +172,7 @@ def _lend_registries(etc: Path) -> None:
 
 
 def pip_settings(config: str, proxy: str = "") -> str:
-    """Make a pip.conf for another machine from the output of `pip config list` here: only where to get packages.
-
-    Folders of this machine are left out. The path of its certificates is replaced by that of the other machine's.
-    """
+    """Make a pip.conf for another machine from `pip config list` here, without folders of this machine."""
     found = {"cert": str(CERTIFICATES), "proxy": proxy}
     for line in config.splitlines():
         key, _, value = line.partition("=")

@@ -3,14 +3,12 @@
     with emulation():
         debian_image().root      # /etc, /usr, ... of the Pi, owned by root; never written to
 
-The packages are those of this machine's own Debian (12 or 13), fetched by a private apt. dpkg unpacks them natively, as
-that would take minutes under emulation; only their configuration is emulated. The image has nothing that provision.yml
-must install.
+The packages are those of this machine's own Debian (12 or 13). dpkg unpacks them natively; only their configuration is
+emulated. The image has nothing that provision.yml must install.
 """
 
 import os
 import platform
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
@@ -37,8 +35,8 @@ dpkg --configure --pending --force-depends
 for group in {GROUPS.replace(",", " ")}; do getent group $group > /dev/null || groupadd --system $group; done
 useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
 """
-# These programs stand before the real ones while the packages are configured. So no service is started, and no bundle
-# of certificates is made, which takes a minute under emulation: a container gets this machine's.
+# These stand before the real programs while packages are configured, so that no service is started, and no bundle of
+# certificates is made: a container gets this machine's.
 STAND_INS = {"usr/sbin/policy-rc.d": "exit 101", "usr/local/sbin/update-ca-certificates": "exit 0"}
 
 
@@ -58,9 +56,8 @@ def debian_image() -> DebianImage:
 
 def _codename() -> str:
     about = platform.freedesktop_os_release()
-    if about["ID"] != "debian" or not shutil.which("dpkg"):
-        what = "the emulated Pi's packages come by the apt sources of a Debian 12 or 13"
-        raise RoverError(what, found=about["PRETTY_NAME"])
+    if about["ID"] != "debian":
+        raise RoverError("the emulated Pi needs the apt sources of a Debian 12 or 13", found=about["PRETTY_NAME"])
     return about["VERSION_CODENAME"]
 
 
@@ -103,8 +100,6 @@ def _unpack(root: Path, packages: list[Path]) -> None:
         (status / name).mkdir(parents=True, exist_ok=True)
     for name in ("status", "available"):
         (status / name).touch()
-    (root / "etc" / "dpkg" / "dpkg.cfg.d").mkdir(parents=True, exist_ok=True)
-    (root / "etc" / "dpkg" / "dpkg.cfg.d" / "emulated").write_text("force-unsafe-io\n")  # a cache can be made again
     forced = [f"--force-{what}" for what in FORCE]
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C.UTF-8"}
     for part in ([p for p in packages if p.name.startswith(f"{FIRST}_")], packages):
@@ -125,6 +120,5 @@ def _personalize(root: Path, public_key: str) -> None:
     keys = home / ".ssh" / "authorized_keys"
     keys.write_text(public_key)
     keys.chmod(0o600)
-    owner = home.stat()
     for path in (home / ".ssh", keys):
-        os.chown(path, owner.st_uid, owner.st_gid)
+        os.chown(path, home.stat().st_uid, home.stat().st_gid)

@@ -2,12 +2,10 @@
 
 From a flashed card: provision, and again, which changes nothing; deploy; a damaged artifact is refused, and the model
 in use stays; benchmark, and fetch it; deploy another model, and drive by it; roll back. The Pi is a container, its
-Arduino the real firmware in simavr, its camera a FIFO of JPEGs. Emulated programs are some ten times slower than a
-Pi's, so that a policy with a constant plan drives, deployed like any other, at HZ.
+Arduino the real firmware in simavr, its camera a FIFO of JPEGs. A policy with a constant plan drives, at HZ.
 
-runs/pi.json is a stage "pi" (onboard/stage.py). Its metrics are steps: [{step, seconds, ok}], gates: [{gate, wanted,
-found, holds}] and wrong, a sentence for everything that is not as it should be. pi.log beside it has all that the
-playbooks printed.
+runs/pi.json is a stage "pi". Its metrics are steps: [{step, seconds, ok}], gates: [{gate, wanted, found, holds}] and
+wrong, a sentence for everything that is not as it should be. pi.log has all that the playbooks printed.
 """
 
 import contextlib
@@ -42,9 +40,9 @@ LEAST_TICKS = 10  # with the policy driving
 
 
 def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lambda text: None) -> list[str]:
-    """Do all steps, write the report whatever fails, and return `wrong`. demo: a run's folder with ARTIFACT.
+    """Do all steps, write the report whatever fails, and return `wrong`. Raises RoverError if it cannot begin.
 
-    Raises RoverError if it cannot begin: without root, without the artifact, or if packages cannot be installed.
+    demo: a run's folder with ARTIFACT.
     """
     artifact = demo.absolute() / ARTIFACT
     if not artifact.is_file():
@@ -78,8 +76,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
 class Deployment:
     """The steps, and what they found. The report is written after each step.
 
-    inputs: of the report. say: called with a line for each step and gate. folder: for what comes and goes. log: takes
-    what the playbooks print.
+    say: called with a line for each step and gate. folder: for what comes and goes. log: takes what playbooks print.
     """
 
     def __init__(self, path: Path, inputs: dict[str, str], say: Callable[[str], None], folder: Path, log: TextIO):
@@ -87,15 +84,9 @@ class Deployment:
         self.steps: list[dict[str, Any]] = []
         self.gates: list[dict[str, Any]] = []
         self.wrong: list[str] = []
-        self.variables: dict[str, Any] = {
-            "rover_wheels": str(folder / "wheels"),
-            "rover_fetched": str(folder / "fetched"),
-            "rover_camera": CAMERA,
-            "rover_film": True,
-            "rover_port": PORT,
-            "rover_hz": HZ,
-            "rover_ready_s": READY_S,
-        }
+        self.variables: dict[str, Any] = {f"rover_{name}": str(folder / name) for name in ("wheels", "fetched")}
+        self.variables |= {"rover_camera": CAMERA, "rover_film": True, "rover_port": PORT}
+        self.variables |= {"rover_hz": HZ, "rover_ready_s": READY_S}
 
     def gate(self, name: str, wanted: str, found: Any, holds: bool) -> None:
         """Add a gate, and a sentence to `wrong` if it does not hold."""

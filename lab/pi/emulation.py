@@ -21,8 +21,8 @@ NEEDS = {  # commands, each with its Debian package
 }
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 BINFMT_NAME = "rover-aarch64"
-# How to recognize an ELF file for aarch64. Of the flags in emulation(), P keeps argv[0], F lets the interpreter be
-# outside of the container, and C gives setuid programs such as sudo their rights.
+# An ELF file for aarch64. Of the flags in emulation(), P keeps argv[0], F lets the interpreter be outside of the
+# container, and C gives setuid programs such as sudo their rights.
 MAGIC = r"\x7f\x45\x4c\x46\x02\x01\x01\x00\x00\x00\x00\x00\x00\x00\x00\x00\x02\x00\xb7\x00"
 MASK = r"\xff\xff\xff\xff\xff\xff\xff\x00\xff\xff\xff\xff\xff\xff\xff\xff\xfe\xff\xff\xff"
 INTERPRETERS = ("/usr/libexec/qemu-binfmt/aarch64-binfmt-P", "/usr/bin/qemu-aarch64-static")
@@ -71,14 +71,13 @@ def emulation() -> Iterator[None]:
 def in_cgroup(name: str) -> Iterator[Callable[[], None]]:
     """Make a control group, and give a function with which a process enters it before it executes its program.
 
-    Without groups, the systemds of two containers would take each other's processes for their own. Afterwards the group
-    is removed, and what is left in it is killed. Of cgroup v1's controllers only that of devices is used, which
+    Afterwards what is left in the group is killed. Of cgroup v1's controllers only that of devices is used, which
     DevicePolicy= needs; its cpu controller admits no real-time processes.
     """
     used = {"name=systemd", "devices"}
-    mounts = [line.split() for line in Path("/proc/self/mounts").read_text().splitlines()]
     folders = []
-    for _, place, kind, options, *_ in mounts:
+    for line in Path("/proc/self/mounts").read_text().splitlines():
+        _, place, kind, options, *_ = line.split()
         if kind == "cgroup2" or (kind == "cgroup" and used & {*options.split(",")}):
             folders.append(Path(place, name))
     try:

@@ -44,27 +44,18 @@ class Play:
 
 
 def run(book: str, pi: Container, folder: Path, variables: Mapping[str, Any]) -> Play:
-    """Run ansible/<book>.yml on a rover. A play that fails raises nothing.
+    """Run ansible/<book>.yml on a rover, with variables. A play that fails raises nothing.
 
-    folder: for the inventory and Ansible's own files; plays with the same folder share ssh connections. variables:
-    passed with -e. Raises RoverError if the play takes longer than MOST_S.
+    folder: for the inventory and Ansible's own files. Raises RoverError if the play takes longer than MOST_S.
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     (folder / "inventory.ini").write_text(inventory(pi))
     given = {"rover_command": str(program.with_name("rover")), **variables}
     command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml", "-e", json.dumps(given)]
     try:
-        done = subprocess.run(
-            [str(word) for word in command],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            cwd=REPOSITORY,
-            env=_environment(folder),
-            text=True,
-            errors="replace",
-            timeout=MOST_S,
-        )
+        how: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        how |= {"cwd": REPOSITORY, "env": _environment(folder), "errors": "replace", "timeout": MOST_S}
+        done = subprocess.run([str(word) for word in command], text=True, **how)
     except subprocess.TimeoutExpired:
         raise RoverError(f"{book}.yml took more than {MOST_S:g} s") from None
     return Play(done.returncode, done.stdout)

@@ -3,11 +3,8 @@
     python3 compile.py hailo8                     # parse, quantize, compile, pack
     python3 compile.py hailo8 --hef mine.hef      # only pack a HEF that was compiled otherwise
 
-It runs where Hailo's Dataflow Compiler is installed: on x86-64 Linux, version 3.x for Hailo-8 and 8L, 5.x for
-Hailo-10H. It is a kit's compile.py, and needs nothing else of the project.
-
-Nobody who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo. The quantized
-network stays in a .har for Hailo's own tools, such as `hailo analyze-noise`.
+It needs Hailo's Dataflow Compiler, 3.x for Hailo-8 and 8L, 5.x for Hailo-10H, and nothing else of the project. Nobody
+who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo.
 """
 
 import argparse
@@ -32,11 +29,7 @@ def main() -> None:
 
 
 def compile_network(kit: Path, chip: str) -> Path:
-    """Compile the network and return the path of its HEF.
-
-    Ends the program if the compiler does not number the inputs as the model script takes them to be numbered: it would
-    normalise another one.
-    """
+    """Compile the network and return the path of its HEF. Ends the program if its inputs are numbered otherwise."""
     from hailo_sdk_client import ClientRunner
 
     network = json.loads((kit / "kit.json").read_text())

@@ -23,8 +23,7 @@ from rover_lib.workshop.run.session import Opened
 
 NAME = "backbone"  # of the network on the chip
 LEAST_SAMPLES = 1024  # as many as the zoo's scripts use to calibrate transformers (vit_small.alls, deit_base.alls)
-# The chip's answers may be this many times as far from FP32 as what is allowed to torch's INT8. The chip rounds in
-# other places, and nobody knows by how much; a HEF that computes something else is hundreds of times as far off.
+# times what is allowed to torch's INT8: a HEF that computes something else is hundreds of times as far off
 STATIC_TIMES = 2.5
 
 
@@ -103,10 +102,7 @@ def _describe(policy: ACT, network: Network) -> dict[str, Any]:
 
 
 def _manifest(run_dir: Path, samples: int, folder: Path) -> dict[str, Any]:
-    """Return the manifest of what compile.py packs, without what depends on the networks, and write parity.npz.
-
-    Both come from the run's FP32 artifact, and how far the chip may be off from its static INT8.
-    """
+    """Return the manifest of what compile.py packs, without what depends on the networks, and write parity.npz."""
     with Artifact(run_dir / "policy_fp32.pt") as fp32, Artifact(run_dir / "policy_static.pt") as static:
         np.savez_compressed(folder / "parity.npz", allow_pickle=False, **fp32.parity)
         manifest, allowed = fp32.manifest, static.manifest["parity"]["tolerance"]

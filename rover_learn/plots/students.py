@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.plots.style import MIST, OTHERS, SLATE, Note, bar_values, legend, new_figure
+from rover_lib.workshop.plots.style import MIST, SLATE, bar_values, legend, new_figure
 
 # prefix of a row's keys, label, face colour, marker, and how far the marks are moved
 DRIVES = (("", "left alone", SLATE, "o", -0.16), ("pushed_", "pushed", "white", "s", 0.16))
@@ -66,25 +66,3 @@ def _hits(ax: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     trials = max(row["trials"] or 0 for row in rows)
     ax.set_xlabel(f"worlds hit (% of {trials}),\nwith the 95 % interval")
     legend(ax, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
-
-
-def losses(by_student: Mapping[str, Mapping[str, Sequence[float]]], means: int = 40) -> Figure | Note:
-    """Draw how each student learned, with a panel for each phase. A point is the mean of neighbouring steps.
-
-    by_student: {name: {phase: losses}}. means: at most this many points for a curve.
-    """
-    phases = list(dict.fromkeys(phase for found in by_student.values() for phase, steps in found.items() if steps))
-    if not phases:
-        return Note("no student has a step of training behind it")
-    fig, axes = new_figure(1, len(phases), height_in=2.8)
-    for ax, phase in zip(axes[0], phases, strict=False):
-        for i, (name, found) in enumerate(by_student.items()):
-            if steps := found.get(phase):
-                parts = np.array_split(np.arange(len(steps)), min(means, len(steps)))
-                y = [np.asarray(steps)[part].mean() for part in parts]
-                ax.plot([part.mean() + 1 for part in parts], y, color=OTHERS[i % len(OTHERS)], lw=1.5, label=name)
-        ax.set_title(phase, fontsize=11)
-        ax.set(xlabel="step", ylim=(0, None))
-    axes[0, 0].set_ylabel("loss")
-    legend(axes[0, -1], loc="upper right")
-    return fig

@@ -217,13 +217,14 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
 
     Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
-    from rover_lib.onboard.car.calibrate import measure, refuse_existing, write_car
+    from rover_lib.onboard.car.calibrate import measure, write_car
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
 
     path = output or default_place()
-    refuse_existing(path, force)
+    if path.exists() and not force:
+        raise CarError(f"{path}: exists already", remedy="--force replaces it")
     check_output(path, None)
     more = {key: value for key, value in more.items() if value is not None}
     with contextlib.suppress(CarError):  # measured again, its actions must mean what they meant

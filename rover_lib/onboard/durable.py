@@ -1,8 +1,5 @@
 """Files and folders that survive a kill and a power cut: made beside their place, synced, renamed, the rename synced.
 
-    with build_folder(folder) as new:                           # or atomic_path(file)
-        ...                                                     # fill it
-
 After a rename alone, a power cut leaves a new name without its content. One process at a time works in a folder; what
 a killed one left is removed by the next.
 """
@@ -21,6 +18,8 @@ ASKED = ".asked"  # a file in a folder that is being filled, if that can be resu
 GOES = ".goes"  # a file in a complete folder: names of the old files without a successor, one per line
 
 _libc = ctypes.CDLL(None, use_errno=True)
+_UMASK = os.umask(0o077)
+os.umask(_UMASK)
 
 
 def sync(path: Path) -> None:
@@ -51,10 +50,7 @@ def move_durably(new: Path, place: Path) -> None:
 
 
 def lock_folder(folder: Path, wait: bool = False) -> int | None:
-    """Lock a folder for this process, until the returned file is closed; None if it is gone or another one has it.
-
-    wait: until the other one has closed it.
-    """
+    """Lock a folder until the returned file is closed; None if it is gone, or, unless `wait`, another has the lock."""
     try:
         file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:
@@ -85,10 +81,9 @@ def build_folder(
 ) -> Iterator[Path]:
     """Yield a hidden folder `.<name>.new` beside `folder`; its content moves into `folder` if the block ends well.
 
-    The hidden folder begins empty and is removed in any case. But if `asked` is given, all that decides the content,
-    ASKED is in it, and while that is there the content stays, also after an error or a kill: a process that asks the
-    same finds it again, less unfinished files. If this process is killed while the content moves, the next call for
-    that folder moves the rest.
+    It begins empty, nobody else can open it, and it is removed in any case. But if `asked` is given, all that decides
+    the content, ASKED is in it, and while that is there the content stays, also after an error or a kill: who asks the
+    same finds it again, less unfinished files. After a kill while the content moves, the next call moves the rest.
 
     replaced: returns the files of `folder` to remove then, in addition to those with a successor; all others stay.
     wait: while another process makes something for that folder; else RoverError is raised.
@@ -102,6 +97,7 @@ def build_folder(
         yield new
         (new / ASKED).unlink(missing_ok=True)
         if not folder.exists():
+            new.chmod(0o777 & ~_UMASK)
             move_durably(new, folder)
             return
         goes = {path.name for path in replaced(folder)} - {path.name for path in new.iterdir()}
@@ -120,12 +116,11 @@ def _make_locked(new: Path, wait: bool) -> int:
     try:
         new.parent.mkdir(parents=True, exist_ok=True)
         while True:
-            new.mkdir(exist_ok=True)
+            new.mkdir(0o700, exist_ok=True)  # so that no other user can hold the lock
             if (lock := lock_folder(new, wait)) is not None:
                 return lock
             if not wait and new.exists():
-                remedy = "wait for it, or give another name"
-                raise RoverError(f"{new}: another process is at work in it", remedy=remedy)
+                raise RoverError(f"{new}: another process is at work in it", remedy="wait, or give another name")
     except OSError as error:  # of a hidden folder that nobody knows: its place is what the user named
         raise OSError(error.errno, error.strerror, str(new.parent)) from error
 

@@ -14,10 +14,7 @@ POLL_S = 0.01
 
 
 class SignalEvent(threading.Event):
-    """A flag that the handler of a signal may set at any moment; wait() polls it.
-
-    Python's own Event takes a lock: a handler that interrupted the thread which holds it would wait for itself.
-    """
+    """A flag that the handler of a signal may set at any moment: it has no lock, which the handler could wait for."""
 
     def __init__(self) -> None:
         self._is_set = False

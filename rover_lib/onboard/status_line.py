@@ -12,14 +12,13 @@ from typing import TextIO
 
 EVERY_S, PLAIN_EVERY_S = 0.25, 10.0  # on a terminal, and elsewhere
 QUEUE_LINES = 256
-CLOSE_S = 0.5  # close() waits no longer for a terminal that was stopped
+CLOSE_S = 0.5  # longest wait for a terminal that was stopped
 
 
 class StatusLine(logging.Handler):
-    """One line of status on a stream, overwritten on a terminal, inside the context; also a handler of log records.
+    """One line of status (what callback returns) on a stream, overwritten on a terminal, inside the context.
 
-    callback: returns the status. Log records appear above it. Whoever logs them waits for nothing: of a terminal that
-    was stopped, some are lost.
+    As a handler, it shows log records above it; of a terminal that was stopped, some are lost.
     """
 
     def __init__(self, callback: Callable[[], str], stream: TextIO | None = None, every_s: float | None = None):

@@ -10,8 +10,7 @@ from rover_lib.workshop.progress import TTY_VARIABLE
 def browse(count: int, draw: Callable[[int], Any], what: str = "frame") -> Any:
     """A slider from 0 to count - 1 with what draw(index) gives below it, a figure or a table.
 
-    None, and nothing is drawn, where no JupyterLab session is: under papermill, nbval and `rover run`, so that what is
-    stored of a notebook doesn't depend on who executed it.
+    None without a JupyterLab session, so that what is stored of a notebook does not depend on who executed it.
     """
     if not count or "JPY_SESSION_NAME" not in os.environ or TTY_VARIABLE in os.environ:
         return None

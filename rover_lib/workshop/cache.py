@@ -15,8 +15,7 @@ from rover_lib.onboard.durable import build_folder
 
 def cache_root() -> Path:
     """Where what is expensive to make is kept: $ROVER_CACHE, or rover/ in the user's cache."""
-    given = os.environ.get("ROVER_CACHE")
-    return Path(given) if given else Path.home() / ".cache" / "rover"
+    return Path(os.environ.get("ROVER_CACHE") or Path.home() / ".cache" / "rover")
 
 
 def key_of(params: dict[str, Any], *sources: ModuleType | Path) -> str:
@@ -34,10 +33,7 @@ def car_in_key() -> dict[str, Any]:
 
 
 def cache_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:
-    """The folder <cache>/<kind>-<key>, made by `make(temporary folder)` if it is not there yet.
-
-    It appears complete or not at all. A second process that needs it waits for the first.
-    """
+    """The folder <cache>/<kind>-<key>, made whole by `make(temporary folder)`, by one process, if it is not there."""
     folder = cache_root() / f"{kind}-{key}"
     if not folder.is_dir():
         with build_folder(folder, wait=True) as new:

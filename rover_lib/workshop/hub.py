@@ -2,8 +2,7 @@
 
     folder = fetch("user/name@v1", "model", CheckpointError)
 
-The revision must be given. So a mistyped path is never taken for an id, and nobody trains on an outdated version
-without noticing. Fetched files stay in the Hub's own cache, where later runs find them without a network.
+The revision must be given, so that a mistyped path is never taken for an id. Fetched files stay in the Hub's cache.
 """
 
 import re
@@ -12,8 +11,15 @@ from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
 
-ID = re.compile(r"(?P<repo>\w[\w.-]*/\w[\w.-]*)@(?P<revision>[\w.-]+(/[\w.-]+)*)")
+ID = re.compile(r"\w[\w.-]*/\w[\w.-]*@[\w.-]+(/[\w.-]+)*")
 FILES = {"model": ("*.json", "*.safetensors"), "dataset": ("meta/*", "data/*", "videos/*")}
+
+REMEDY = "is its name right, and is it public?"
+REMEDIES = {  # by the error of the Hub's client
+    "LocalEntryNotFoundError": "the Hub cannot be reached: fetch it where there is a network, or give a folder",
+    "GatedRepoError": "request access on its page, and log in with 'huggingface-cli login'",
+    "RevisionNotFoundError": "give a branch, a tag or a commit that is there",
+}
 
 
 def is_hub_id(path: Path | str) -> bool:
@@ -32,32 +38,13 @@ def fetch(hub_id: Path | str, kind: str, error: type[RoverError], files: Sequenc
     kind: "model" or "dataset". files: patterns; None takes all that we read of such a repository. Raises `error`, in
     one sentence, if there is no network, if the Hub does not have it, or if its owner restricts access.
     """
-    # Imported here, because it takes a second, and a local path does not need it.
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import GatedRepoError, LocalEntryNotFoundError, RevisionNotFoundError
+    from huggingface_hub import snapshot_download  # here, because it takes a second
 
-    found = ID.fullmatch(str(hub_id))
-    assert found, hub_id
-    repo, revision = found["repo"], found["revision"]
+    repo, _, revision = str(hub_id).partition("@")
+    wanted = list(files or FILES[kind])
     try:
-        return Path(
-            snapshot_download(repo, repo_type=kind, revision=revision, allow_patterns=list(files or FILES[kind]))
-        )
-    except LocalEntryNotFoundError:
-        raise error(
-            f"{hub_id}: is not in the Hub's cache on this machine, and the Hub cannot be reached",
-            remedy="fetch it where there is a network, or give a folder",
-        ) from None
-    except GatedRepoError:
-        raise error(
-            f"{hub_id}: a gated repository",
-            remedy="request access on its page, and log in with 'huggingface-cli login'",
-        ) from None
-    except RevisionNotFoundError:
-        raise error(f"{hub_id}: has no revision '{revision}'", remedy="give a branch, a tag or a commit") from None
+        return Path(snapshot_download(repo, repo_type=kind, revision=revision, allow_patterns=wanted))
     except Exception as e:  # requests, the Hub's client and the disk each raise their own types
+        name = type(e).__name__
         reason = (str(e).strip().splitlines() or [""])[0][:160]
-        raise error(
-            f"{hub_id}: cannot be fetched as a {kind} ({type(e).__name__}{': ' if reason else ''}{reason})",
-            remedy="is its name right, and is it public?",
-        ) from None
+        raise error(f"{hub_id}: no {kind} fetched ({name}: {reason})", remedy=REMEDIES.get(name, REMEDY)) from None

@@ -24,10 +24,11 @@ def conversion(root: Path, hub_id: str = "") -> str:
     hub_id: user/name of a dataset on the Hub, which it then fetches; else the folder `root` is converted.
     """
     new = find_spec("lerobot") and find_spec("lerobot.scripts.convert_dataset_v21_to_v30")
-    module = "lerobot.scripts" if new else "lerobot.datasets.v30"
-    given = [f"--repo-id={hub_id}"]
-    if not hub_id:
-        root = root.resolve()  # 0.4 takes the folder around it, and joins the two
-        given = [f"--repo-id=local/{root.name}", f"--root={root}"] if new else [f"--repo-id={root.name}"]
-        given += [] if new else [f"--root={root.parent}"]
+    module, root = "lerobot.scripts" if new else "lerobot.datasets.v30", root.resolve()
+    if hub_id:
+        given = [f"--repo-id={hub_id}"]
+    elif new:
+        given = [f"--repo-id=local/{root.name}", f"--root={root}"]
+    else:  # 0.4 takes the folder around it, and joins the two
+        given = [f"--repo-id={root.name}", f"--root={root.parent}"]
     return shlex.join(["python", "-m", f"{module}.convert_dataset_v21_to_v30", *given, "--push-to-hub=false"])

@@ -18,7 +18,7 @@ Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, tot
 
 
 def silent(items: Iterable[T], **_: object) -> Iterable[T]:
-    """Show no bar. This is the default of every function that takes a `progress`."""
+    """Show no bar: the default of every function that takes a `progress`."""
     return items
 
 
@@ -30,7 +30,7 @@ def terminal_bar() -> Progress:
 
 
 def lines(stream: TextIO, items: Iterable[T], *, desc: str = "", total: int | None = None, **_: object) -> Iterator[T]:
-    """Yield the items, and write a line to the stream once LINES_S have passed, and then as often as that."""
+    """Yield the items, and write a line to the stream each LINES_S."""
     told_s = time.monotonic()
     for count, item in enumerate(items):
         if time.monotonic() - told_s > LINES_S:
@@ -40,22 +40,15 @@ def lines(stream: TextIO, items: Iterable[T], *, desc: str = "", total: int | No
 
 
 def notebook_bar() -> Progress:
-    """A notebook's bar if somebody watches; in stored outputs, bars would only be noise.
-
-    Somebody watches in the terminal where `rover run` was started, or in a JupyterLab session. If that command's output
-    goes into a log, lines go there.
-    """
+    """A bar in the terminal where `rover run` was started, lines in its log, or a bar in JupyterLab; else none."""
     from tqdm import tqdm
 
     if name := os.environ.get(LOG_VARIABLE):
         with suppress(OSError):
             return partial(lines, Path(name).open("a"))
     if name := os.environ.get(TTY_VARIABLE):
-        try:
-            stream = Path(name).open("w")  # noqa: SIM115, open as long as the kernel lives
-        except OSError:
-            return silent
-        return partial(tqdm, file=stream, leave=False)
+        with suppress(OSError):  # open as long as the kernel lives
+            return partial(tqdm, file=Path(name).open("w"), leave=False)
     if "JPY_SESSION_NAME" in os.environ:
         return partial(tqdm, leave=False)
     return silent

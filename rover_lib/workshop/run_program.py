@@ -1,7 +1,6 @@
 """Run another program to its end; if it fails, the error contains the last lines that it printed."""
 
 import subprocess
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,35 +9,21 @@ from rover_lib.onboard.errors import RoverError
 LAST_LINES = 3
 
 
-def run(
-    *command: object,
-    error: type[RoverError] = RoverError,
-    remedy: str = "",
-    cwd: Path | str | None = None,
-    env: Mapping[str, str] | None = None,
-    input: str | None = None,
-    timeout_s: float | None = None,
-    **options: Any,
-) -> str:
+def run(*command: object, error: type[RoverError] = RoverError, remedy: str = "", **options: Any) -> str:
     """Run a command to its end and return its standard output.
 
-    error: the type to raise, with `remedy`, if the command cannot be started, fails, or takes longer than timeout_s.
-    The sentence has its name and the last lines that it printed. options: further ones of subprocess.run.
+    error: the type to raise, with `remedy`, if the command cannot be started or fails; the sentence has its name and
+    the last lines that it printed. options: of subprocess.run, such as cwd, env and input.
     """
     words = [str(part) for part in command]
     name = Path(words[0]).name
     try:
-        done = subprocess.run(
-            words, capture_output=True, text=True, cwd=cwd, env=env, input=input, timeout=timeout_s, **options
-        )
+        done = subprocess.run(words, capture_output=True, text=True, **options)
     except FileNotFoundError:
         raise error(f"{name} is not here", remedy=remedy or "install it") from None
-    except subprocess.TimeoutExpired:
-        raise error(f"{name} did not end within {timeout_s:g} s", remedy=remedy) from None
     if done.returncode:
-        raise error(
-            f"{name} failed (exit status {done.returncode}): {last_words(done.stderr or done.stdout)}", remedy=remedy
-        )
+        last = last_words(done.stderr or done.stdout)
+        raise error(f"{name} failed (exit status {done.returncode}): {last}", remedy=remedy)
     return done.stdout
 
 

@@ -1,9 +1,31 @@
 """What a file from anywhere holds, put in a sentence: short, on one line, and without a walk through all of it."""
 
+import json
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
+from rover_lib.onboard.stage import read_plain
+
+JSON_BYTES = 60_000_000  # an hour and a half of driving
+MOST_VALUES = 2_000_000  # lists and objects: each takes 70 bytes and more, and in the file three
 LONGEST = 60  # characters of one value
 LARGEST = 10**20  # Python refuses to print an integer of thousands of digits
+
+
+def read_json(path: Path, most_bytes: int = JSON_BYTES) -> Any:
+    """Return what a JSON file holds. Raises OSError if it cannot be read or is larger, else as `parse_json`."""
+    return parse_json(read_plain(path, most_bytes))
+
+
+def parse_json(data: bytes) -> Any:
+    """Return what JSON says. Raises ValueError for anything else, and for what would take many times its size."""
+    if (count := data.count(b"[") + data.count(b"{")) > MOST_VALUES:
+        raise ValueError(f"{count} lists and objects in it, at most {MOST_VALUES} are read")
+    try:
+        return json.loads(data)
+    except RecursionError:  # brackets nested too deep
+        raise ValueError("nested too deep") from None
 
 
 def quote(value: object) -> str:

@@ -1,9 +1,7 @@
 """All that a Pi installs, in one folder, so that a rover without internet can be set up from a laptop.
 
-rover_policy-0.1.0+<hash of its files>-py3-none-any.whl       rover_lib/onboard, nothing else
-torch-2.8.0-cp313-...aarch64.whl, ...                          as requirements_pi.txt pins and hashes them, or
-onnxruntime-1.31.1-cp313-...aarch64.whl, ...                   requirements_pi_onnxruntime.txt
-aiohttp-3.14.5-cp313-...aarch64.whl, ...                       requirements_pi_view.txt
+rover_policy-<version>+<hash of its files>-py3-none-any.whl is rover_lib/onboard, nothing else; the others are as
+requirements_pi.txt, or requirements_pi_onnxruntime.txt, and requirements_pi_view.txt pin and hash them.
 """
 
 import os
@@ -20,10 +18,8 @@ from rover_lib.onboard.wheel_version import ONBOARD, wheel_version
 from rover_lib.workshop.run_program import run
 
 REPOSITORY = Path(__file__).parents[2]
-REQUIREMENTS = {  # by engine
-    "torch": REPOSITORY / "requirements_pi.txt",
-    "onnxruntime": REPOSITORY / "requirements_pi_onnxruntime.txt",
-}
+PINS, ONNX_PINS = REPOSITORY / "requirements_pi.txt", REPOSITORY / "requirements_pi_onnxruntime.txt"
+REQUIREMENTS = {"torch": PINS, "onnxruntime": ONNX_PINS}  # by engine
 VIEW = REPOSITORY / "requirements_pi_view.txt"  # with either, for `rover view`
 PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which follows them
 # The newest glibc that a wheel may ask for is Debian 12's 2.36; pip takes a list, not "at most".
@@ -42,9 +38,9 @@ class Wheelhouse:
 def make(
     folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bool = False, engine: str = "torch"
 ) -> Wheelhouse:
-    """Fill a folder with the rover's own wheel and those that it needs; what is there already is not fetched again.
+    """Fill a folder with the rover's own wheel and those that it needs and that are not there. Raises RoverError.
 
-    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS. Raises RoverError.
+    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -75,7 +71,6 @@ def _build(folder: Path) -> tuple[Path, str]:
 
 
 def _fetch(folder: Path, python: str, requirements: Path) -> None:
-    """The other wheels, for one Python."""
     lines = requirements.read_text().splitlines()
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as f:
         # Without conditions: pip would judge them by this machine's Python, not by the Pi's.

@@ -72,12 +72,9 @@ class Fleet:
         (self.folder / "inventory.ini").write_text("\n".join(["[rovers]", *self.lines.values(), *shared]) + "\n")
         own = {"ansible_python_interpreter": sys.executable, "rover_home": str(self.folder / "home")}
         given = json.dumps({**own, "rover_ready_s": 2, **variables})
-        env = {
-            **{k: v for k, v in os.environ.items() if not k.startswith(("ANSIBLE", "COV"))},
-            "PATH": f"{self.folder}/bin:{BINARY}:{os.environ['PATH']}",
-            "ANSIBLE_HOME": str(self.folder / "ansible"),
-            "ANSIBLE_NOCOLOR": "1",
-        }
+        env = {k: v for k, v in os.environ.items() if not k.startswith(("ANSIBLE", "COV"))}
+        env |= {"PATH": f"{self.folder}/bin:{BINARY}:{os.environ['PATH']}", "ANSIBLE_NOCOLOR": "1"}
+        env["ANSIBLE_HOME"] = str(self.folder / "ansible")
         command = [BINARY / "ansible-playbook", "-i", self.folder / "inventory.ini", ROOT / "ansible" / f"{book}.yml"]
         return subprocess.run([*map(str, command), *options, "-e", given], capture_output=True, text=True, env=env)
 

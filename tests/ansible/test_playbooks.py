@@ -43,8 +43,7 @@ def run(*command: object, tmp: Path) -> subprocess.CompletedProcess:
 def play_each(tmp_path: Path, cases: list[tuple[str, dict, str]], *options: str) -> None:
     """Assert what the role does with what is given: (task file, variables, words with which it refuses that or "").
 
-    Each case is a machine of one play, as ansible-playbook takes seconds to start. facts: what a machine says of
-    itself. bin: a folder in which it finds its commands first.
+    Each case is a machine of one play. facts: what it says of itself. bin: where it finds its commands first.
     """
     hosts = {f"host{i}": {"file": file, **given} for i, (file, given, _) in enumerate(cases)}
     local = {"ansible_connection": "local", "ansible_python_interpreter": sys.executable}
@@ -82,8 +81,7 @@ def test_lint_finds_nothing(tmp_path):
 def test_the_defaults_are_those_of_the_specs():
     options = {name: option for s in SPECS.values() for name, option in s["options"].items()}
     assert {n: o["default"] for n, o in options.items() if not o.get("required")} == DEFAULTS
-    assert DEFAULTS["rover_start_at_boot"] is False and DEFAULTS["rover_arm"] is False
-    assert DEFAULTS["rover_while_driving"] == "refuse"
+    assert (DEFAULTS["rover_start_at_boot"], DEFAULTS["rover_while_driving"]) == (False, "refuse")
 
 
 PI = {
@@ -100,7 +98,6 @@ def test_wrong_arguments_and_machines_are_refused_before_anything_is_done(tmp_pa
     machines = [
         (trixie, ""),
         ({"architecture": "armv7l"}, "armv7l"),
-        ({"distribution_major_version": "11"}, "Debian 12.9"),
         ({"python_version": "3.14.0"}, "Python 3.14.0"),
         (full, "900 MB free"),
         ({"memtotal_mb": 430}, "430 MB of memory"),
@@ -112,11 +109,8 @@ def test_wrong_arguments_and_machines_are_refused_before_anything_is_done(tmp_pa
     values = [
         ("artifact", {"rover_artifact": "nowhere.pt"}),
         ("deploy", {"rover_while_driving": "yes please"}),
-        ("deploy", {"rover_allow": ["torch"]}),
-        ("deploy", {"rover_models": ""}),
         ("drive", {"rover_arm": "maybe"}),
         ("service", {"rover_camera": "/dev/video0\nExecStartPre=+/bin/true"}),
-        ("service", {"rover_hz": "30\nUser=root"}),
         ("service", {"rover_memory_mb": 0}),  # systemd ignores such a limit: there would be none
         ("system", {"rover_port": '/dev/rover-arduino", RUN+="/bin/true'}),
         ("system", {"rover_usb_ids": ['2341:0043", RUN+="/bin/true']}),
@@ -203,11 +197,6 @@ def units(tmp_path) -> Path:
     return tmp_path
 
 
-def analyze(*arguments: object) -> None:
-    done = subprocess.run(["systemd-analyze", *map(str, arguments)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr + done.stdout[-3000:]
-
-
 def command(unit: str) -> list[str]:
     return shlex.split(re.search("^ExecStart=(.*)", unit, re.M)[1])[1:]
 
@@ -220,8 +209,9 @@ def command(unit: str) -> list[str]:
 def test_systemd_understands_the_units_and_finds_them_closed_enough(units, given):
     for name, threshold in EXPOSURE.items():
         (units / name).write_text(render(name, rover_home=units, **given))
-        analyze("verify", "--man=no", "--recursive-errors=no", units / name)
-        analyze("security", "--offline=true", f"--threshold={threshold}", "--no-pager", units / name)
+        for how in (["verify", "--recursive-errors=no"], ["security", "--offline=true", f"--threshold={threshold}"]):
+            done = subprocess.run(["systemd-analyze", *how, units / name], capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr + done.stdout[-3000:]
 
 
 def test_no_unit_lets_root_load_an_artifact_and_no_playbook_runs_one_itself(units):
@@ -256,7 +246,6 @@ def test_the_units_say_what_the_command_line_takes(units):
 
 
 def test_a_value_in_a_unit_is_one_word_of_its_command():
-    """Otherwise a camera could carry options, or a newline a command for root."""
     words = command(render(DRIVE, rover_camera='/dev/video0 --hz 1\nUser="root"', rover_models="/%h $HOME"))
     assert words[words.index("--camera") + 1] == '/dev/video0 --hz 1\\nUser="root"'
     assert words[2] == "/%%h $$HOME/current/policy.pt"  # which systemd reads as one % and one $
@@ -269,7 +258,7 @@ def test_the_service_may_open_what_its_camera_and_its_human_need_and_no_more():
         assert ("DeviceAllow=char-input r" in lines) == gamepad == ("SupplementaryGroups=video dialout input" in lines)
 
 
-@pytest.mark.parametrize(("firmware", "flashes"), [("4.1.1-gamepad", False), ("4.1.1", True)])
+@pytest.mark.parametrize(("firmware", "flashes"), [("4.2.0-gamepad", False), ("4.2.0", True)])
 def test_a_board_is_not_flashed_again_for_want_of_a_gamepad(tmp_path, firmware, flashes):
     tasks = yaml.safe_load((ROLE / "tasks" / "firmware.yml").read_text())
     (asks,) = [task["ansible.builtin.command"]["argv"] for task in tasks if "Ask the Arduino" in task["name"]]

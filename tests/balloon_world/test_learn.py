@@ -8,7 +8,7 @@ from policies import of_a_cars_size
 
 from balloon_world import learn, plots
 from balloon_world.drives import count_hits, drive_in
-from balloon_world.learn import Experiment, Human, demonstrate, drive_corrected, gates, run_experiment, sentences, table
+from balloon_world.learn import Experiment, demonstrate, drive_corrected, gates, human_beside, run_experiment, table
 from balloon_world.world import World, expert
 from rover_learn.finetune import human_samples
 from rover_lib.onboard.drive.pilot import Order
@@ -46,13 +46,10 @@ def order(steering):
 
 def test_a_human_takes_over_after_their_time_and_forgives_what_is_shorter():
     world = World(CURVE)
-    right, wrong = order(expert(world)[0]), order(expert(world)[0] - 0.3)
-    takes_over = Human(off=0.25, for_s=0.4).watching(world)
+    takes_over, right, wrong = human_beside(world), order(expert(world)[0] - 0.2), order(expert(world)[0] - 0.3)
     assert [takes_over(wrong) for _ in range(11)] == [False] * 11
-    assert not takes_over(right)
+    assert not any(takes_over(right) for _ in range(60))
     assert [takes_over(wrong) for _ in range(12)] == [False] * 11 + [True]
-    takes_over = Human(off=0.35, for_s=0.4).watching(world)
-    assert not any(takes_over(wrong) for _ in range(60))
 
 
 def test_a_drive_that_is_taken_over_ends_after_that_tick():
@@ -125,17 +122,12 @@ def test_gates_are_of_the_last_round(corrected, demonstrated, alone, passed):
     assert [row["passed"] for row in gates(rows)] == passed
 
 
-def test_what_is_shown_and_what_where_nothing_is(tmp_path):
+def test_what_is_shown():
     rows = policies({"before": range(9), "corrected-1": range(7), "demonstrated-1": []})
     rounds = [{"round": 1, "human_s": 10.0, "takeovers": 5, "drives": 20, "missed": 1}]
-    content = {"metrics": {"policies": rows, "pairs": learn._pairs(rows), "rounds": rounds}}
-    text = "\n".join(sentences(content["metrics"]))
-    assert "within chance, than before" in text and "worse than demonstrated-1: 33 of 40" in text
+    content = {"metrics": {"policies": rows, "rounds": rounds}}
     assert "corrected, round 1" in str(table(content)) and "5 of 20" in str(learn.rounds_table(content))
     assert len(plots.hits_by_round(rows).axes) == 3
-    assert learn.read_experiment(tmp_path) is None
-    assert learn.NOTHING in str(table(None)) and learn.NOTHING in str(learn.rounds_table(None))
-    plots.hits_by_round([])
 
 
 # --- the whole ---
@@ -201,5 +193,5 @@ def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, 
 
 def test_what_is_missing_is_said(tmp_path):
     with pytest.raises(TrainingError, match="best_model"):
-        run_experiment(tmp_path, tmp_path / "out")
+        run_experiment(tmp_path, tmp_path / "out", FEW)
     assert not list(tmp_path.iterdir())

@@ -8,10 +8,10 @@ import pytest
 
 from balloon_world import drives, students
 from balloon_world.drives import SEED
-from balloon_world.students import gates_of, judge_students, recommendation, sentences, table
+from balloon_world.students import gates_of, judge_students, recommendation, table
 from rover_learn import plots
 from rover_lib.onboard.care.pi5 import Work, predict_ms
-from rover_lib.onboard.errors import TrainingError
+from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 
@@ -99,6 +99,10 @@ def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     assert student["teacher_throttle_pct"] == pytest.approx(2 * teacher["teacher_throttle_pct"], rel=1e-3)
     assert {late and round(late, 6) for *_, late in made.driven} == {None, 90, 20}
     assert content["metrics"]["latency"] == "counted" and content["metrics"]["recommendation"]["name"] == "teacher"
+    work, hits = plots.frontier(content["metrics"]["students"], "fast").axes
+    assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
+    assert {"10.3 to 20", "46.2 to 90"} <= {text.get_text() for text in work.texts}
+    assert "2, 20 ms late" in {text.get_text() for text in hits.texts}
 
 
 def test_what_was_driven_once_is_kept(made):
@@ -118,37 +122,20 @@ def test_where_there_is_no_world_nobody_drives(made):
     assert len(plots.frontier(found["students"], "teacher").axes) == 1
 
 
-@pytest.mark.slow
-def test_rows_are_drawn(made):
-    counted(made.teacher, 90)
-    counted(made.student, 20)
-    rows = judge_students(made.teacher, [made.student], worlds=3)["metrics"]["students"]
-    work, hits = plots.frontier(rows, "fast").axes
-    assert [label.get_text().split("\n")[0] for label in work.get_yticklabels()] == ["teacher", "fast"]
-    assert {"10.3 to 20", "46.2 to 90"} <= {text.get_text() for text in work.texts}
-    assert "2, 20 ms late" in {text.get_text() for text in hits.texts}
-    work, _ = plots.frontier([row | {"computed_ms": None} for row in rows], "fast").axes
-    assert "multiply-accumulates" in work.get_xlabel()
-
-
 @pytest.mark.parametrize(
-    ("breaks", "says"),
+    "breaks",
     [
-        (lambda made: made.student.rename(made.student.with_name("teacher")), "none is 'teacher'"),
-        (lambda made: (made.student / "distill.json").unlink(), "no distill.json in it"),
-        (lambda made: (made.student / "policy_static.pt").unlink(), r"policy_static\.pt: not there"),
-        (lambda made: (made.teacher / "policy_fp32.pt").unlink(), "as it was trained"),
-        (lambda made: (made.teacher / "load.json").unlink(), "give --episodes"),
-        (lambda made: distilled(made.student, teacher="another"), "not its teacher"),
-        (lambda made: distilled(made.student, own="another"), "is not the student"),
+        lambda made: made.student.rename(made.student.with_name("teacher")),
+        lambda made: (made.student / "distill.json").unlink(),
+        lambda made: distilled(made.student, teacher="another"),
+        lambda made: distilled(made.student, own="another"),
     ],
 )
-def test_what_does_not_belong_together_is_refused(made, breaks, says):
+def test_what_does_not_belong_together_is_refused(made, breaks):
     student = breaks(made) or made.student
-    before = {p: p.read_bytes() for p in made.teacher.iterdir()}
-    with pytest.raises(TrainingError, match=says):
+    with pytest.raises(RoverError):
         judge_students(made.teacher, [student], worlds=1)
-    assert {p: p.read_bytes() for p in made.teacher.iterdir()} == before
+    assert not (made.teacher / "students.json").exists()
 
 
 # --- the rule ---
@@ -194,9 +181,8 @@ def test_the_fastest_of_those_within_the_limits_is_recommended():
     rows = [TEACHER, slow | {"instructions_g": None, "computed_ms": None, "gmac": 1.0}, fast, wrong]
     verdict = recommendation(rows, LIMITS)
     assert verdict["name"] == "slow"  # then by multiply-accumulates
-    metrics = {"students": rows, "recommendation": verdict, "notes": ["a note"], "warnings": []}
-    assert "Recommended: slow" in sentences(metrics)[0] and "20 only the student hit" in sentences(metrics)[2]
-    assert "not counted" in str(table(metrics)) and "180 of 200 at 60 ms" in str(table(metrics))
+    shown = str(table({"students": rows, "recommendation": verdict, "notes": ["a note"], "warnings": []}))
+    assert "params.yml: slow" in shown and "not counted" in shown and "180 of 200 at 60 ms" in shown
 
 
 def test_where_nobody_drove_errors_decide():

@@ -29,11 +29,9 @@ def test_the_same_seed_gives_the_same_drive_and_frames():
     assert frame_hash(worlds[0]) == frame_hash(worlds[1])
 
 
-@pytest.mark.slow
 def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
-    for seed in range(30):
+    for seed in range(5):
         plain, with_decoys = World(seed, 2), World(seed, 2, decoys=2)
-        assert frame_hash(plain) == frame_hash(World(seed, 2, decoys=0)) if seed < 3 else True
         assert (plain.balloon, plain._shoves) == (with_decoys.balloon, with_decoys._shoves)
         *others, first, second = with_decoys.distractors
         assert tuple(others) == plain.distractors and first != second
@@ -64,36 +62,24 @@ def test_the_expert_hits_almost_always(shoves):
     assert all(1.5 < w.state.time_s <= TIMEOUT_S for w in worlds)
 
 
-def test_steering_lags():
+def test_steering_lags_and_a_car_that_stands_hits_nothing():
     world = World(2)
     world.step(0.5, 0.0)
     assert 0 < world.state.steering < 0.2
-    for _ in range(30):
+    while not world.done:
         world.step(0.5, 0.0)
     assert world.state.steering == pytest.approx(0.5, abs=0.01)
-    assert (world.state.x_m, world.state.y_m) == (0.0, 0.0), "a car without throttle stands"
+    assert (world.state.x_m, world.state.y_m, world.outcome) == (0.0, 0.0, "timeout")
 
 
-@pytest.mark.parametrize(("action", "outcomes"), [((0.0, 0.0), ["timeout"]), ((1.0, 0.09), ["left", "timeout"])])
-def test_a_car_that_stands_or_drives_away_hits_nothing(action, outcomes):
-    world = World(2)
-    while not world.done:
-        world.step(*action)
-    assert world.outcome in outcomes and not world.hit
-
-
-@pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1), (0.0, 1.1)])
-def test_an_action_outside_its_range_is_refused(action):
-    with pytest.raises(TrainingError):
-        World(1).step(*action)
-
-
-def test_what_is_no_world_is_refused():
+@pytest.mark.parametrize("action", [(np.nan, 0.0), (0.0, np.nan), (1.1, 0.0), (0.0, -0.1)])
+def test_an_action_outside_its_range_and_what_has_ended_are_refused(action):
     world = World(1)
+    with pytest.raises(TrainingError):
+        world.step(*action)
     drive(world)
-    for refused in (lambda: world.step(0.0, 0.0), lambda: World(-1)):
-        with pytest.raises(TrainingError):
-            refused()
+    with pytest.raises(TrainingError):
+        world.step(0.0, 0.0)
 
 
 @pytest.mark.parametrize(("left", "side"), [(None, -1), (1, 1), (-1, -1)])

@@ -31,8 +31,7 @@ def throttles(pins):
 
 def moved_after_ms(pins):
     """How long the throttle was above neutral."""
-    moving = [n for n, us in enumerate(throttles(pins)) if us > 120]
-    return moving[-1] + 1 if moving else 0
+    return max((n + 1 for n, us in enumerate(throttles(pins)) if us > 120), default=0)
 
 
 # ---- a receiver that goes on without its transmitter
@@ -67,11 +66,8 @@ def test_a_takeover_by_throttle_passes_once_it_was_at_rest(armed):
 
 def test_arming_asks_for_one_thing_after_the_other():
     board = NativeArduino()
-    for sticks, missing in (
-        *(([0, 0], "s"), ([0, 124], "s"), ([1460, 0], "s")),
-        *(([1460, 300], "t"), ([1460, 124], "w")),
-    ):
-        board.sticks = sticks
+    needed = ([0, 0], "s"), ([0, 124], "s"), ([1460, 0], "s"), ([1460, 300], "t"), ([1460, 124], "w")
+    for board.sticks, missing in needed:
         board.run(200)
         assert (board.command("A"), board.status.missing) == (missing, missing)
     board.wiggle()
@@ -98,12 +94,11 @@ def drive_by_hand(board, steering_us, throttle_us, ms):
     board.run(ms)
 
 
-@pytest.mark.parametrize("between_ms", [100, 9000])
-def test_driving_by_hand_is_no_gesture(board, between_ms):
+def test_driving_by_hand_is_no_gesture(board):
     """It was: each side could be 30 s old, with throttle in between, and 9 ms at rest sufficed."""
     for turn in range(6):
         drive_by_hand(board, (1750, 1150)[turn % 2], 200, 400)
-        drive_by_hand(board, 1456, 120 if turn % 3 else 180, between_ms)
+        drive_by_hand(board, 1456, 120 if turn % 3 else 180, 100)
         assert board.command("A") in ("t", "w")
     drive_by_hand(board, 1456, 120, 1500)
     assert board.command("A") == "w"
@@ -116,10 +111,9 @@ def test_the_two_sides_of_a_gesture_belong_together(board):
         assert board.command("A") == "w"
 
 
-@pytest.mark.parametrize("held_us", [1948, 1600])
-def test_a_stick_held_to_a_side_is_not_let_go(board, held_us):
+def test_a_stick_held_to_a_side_is_not_let_go(board):
     board.wiggle()
-    drive_by_hand(board, held_us, 120, 2000)
+    drive_by_hand(board, 1600, 120, 2000)
     assert board.command("A") == "w"
 
 
@@ -150,9 +144,7 @@ def test_the_period_of_a_signal_may_be_off_by_a_quarter(board, channel, off, mis
 
 
 def test_a_throttle_at_rest_frees_nothing_while_the_steering_is_lost(board):
-    pins = []
-    for sticks, ms in (([0, 0], 200), ([0, 120], 300), ([1500, 300], 400)):
-        board.sticks = sticks
+    for board.sticks, ms in (([0, 0], 200), ([0, 120], 300), ([1500, 300], 400)):
         pins = board.run(ms)
     assert set(throttles(pins)) == {120}
 
@@ -170,11 +162,9 @@ def test_a_wiggle_is_good_for_one_arming_within_30_seconds(board):
 # ---- the host is not trusted
 
 
-@pytest.mark.parametrize("asked_us", [240, 711])
-def test_the_throttle_has_a_cap(armed, asked_us):
+def test_the_throttle_has_a_cap(armed):
     """One line of 711 us was obeyed within a pulse."""
-    pins = armed.drive(1456, asked_us, 1000)
-    assert max(throttles(pins)) == CAP_US == armed.status.cap_us
+    assert max(throttles(armed.drive(1456, 711, 1000))) == CAP_US == armed.status.cap_us
     assert armed.status.state is State.AUTONOMOUS
 
 
@@ -189,7 +179,7 @@ def test_the_cap_goes_down_and_never_up(board):
     assert (board.command("L", 150), board.status.cap_us) == ("k", 150)
 
 
-@pytest.mark.parametrize("every_ms", [5, 33, 100])
+@pytest.mark.parametrize("every_ms", [5, 100])
 def test_no_pulse_jumps(armed, every_ms):
     """From 900 to 2012 us and from 120 to 711 within one pulse, both ways."""
     pins = [NEUTRAL]
@@ -205,42 +195,30 @@ def test_no_pulse_jumps(armed, every_ms):
 # ---- the human takes over, however bad the signal is
 
 
-@pytest.mark.parametrize(("share", "read_us"), [(3, 120), (2, 0), (3, 90)])
-def test_a_misread_throttle_takes_over(armed, share, read_us):
+@pytest.mark.parametrize(("share", "read_us"), [(3, 120), (2, 0), (3, 90), (3, 400)])
+def test_a_misread_throttle_takes_over_and_noise_does_not(armed, share, read_us):
     """Every third pulse misread: the human never got the car, three in a row were asked for."""
     armed.misread = share, read_us
-    armed.drive(1600, 200, 200)
+    armed.drive(1600, 200, 500)
     assert armed.status.state is State.AUTONOMOUS
     armed.sticks[THROTTLE] = 400
     assert moved_after_ms(armed.drive(1600, 200, 500)) <= HUMAN_MS
     assert armed.status.state is State.MANUAL
 
 
-def test_noise_is_no_takeover(armed):
-    armed.misread = 3, 400
-    armed.drive(1600, 200, 1000)
-    assert armed.status.state is State.AUTONOMOUS
-
-
 # ---- what waited in the link
 
 
-@pytest.mark.parametrize(("age_ms", "result"), [(0, "k"), (60, "k"), (150, "k"), (151, "l"), (2000, "l")])
-def test_a_command_that_waited_in_the_link_is_late(armed, age_ms, result):
-    armed.drive(1456, 150, 500)
-    armed.heard_ms = armed.now_ms - age_ms
-    assert armed.command("D", 1600, 200) == result
-    assert (armed.status.sequence == armed.sequence) == (result == "k")
-
-
-@pytest.mark.parametrize(("age_ms", "holds_ms"), [(0, 150), (50, 150), (51, 149), (100, 100), (150, 50)])
-def test_a_command_holds_for_less_the_older_it_is(armed, age_ms, holds_ms):
+@pytest.mark.parametrize(("age_ms", "holds_ms"), [(0, 150), (50, 150), (51, 149), (150, 50), (151, 0), (2000, 0)])
+def test_a_command_that_waited_in_the_link_holds_for_less_or_is_late(armed, age_ms, holds_ms):
     """It was 150 ms from when it came, whatever its age: so a car obeyed for 300 ms what was over."""
     armed.drive(1456, 150, 500)
     armed.heard_ms = armed.now_ms - age_ms
-    assert armed.command("D", 1456, 150) == "k"
-    assert moved_after_ms(armed.run(300)) == holds_ms - 1
-    assert armed.status.reason == "t"
+    assert armed.command("D", 1456, 150) == ("k" if holds_ms else "l")
+    assert (armed.status.sequence == armed.sequence) == (holds_ms > 0)
+    if holds_ms:
+        assert moved_after_ms(armed.run(300)) == holds_ms - 1
+        assert armed.status.reason == "t"
 
 
 # ---- a host that has no time for the car
@@ -250,9 +228,7 @@ def test_a_command_holds_for_less_the_older_it_is(armed, age_ms, holds_ms):
 def test_a_host_that_pauses_again_and_again_stops_the_car(armed, phase_ms):
     """110 ms of every 150 drove on, and then stopped after 269 ms. phase_ms: from its last command to its pause."""
     armed.drive(1456, 200, 495 + phase_ms)
-    pins = armed.run(110)
-    pins += armed.drive(1456, 200, 40)
-    pins += armed.run(300)
+    pins = armed.run(110) + armed.drive(1456, 200, 40) + armed.run(300)
     assert 110 < moved_after_ms(pins) <= 195
     assert (armed.status.state, armed.status.reason) == (State.STOPPED, "p")
 
@@ -269,9 +245,8 @@ def test_one_pause_is_no_reason_to_stop(armed, phase_ms):
 # ---- near the wraps of clock and sequence
 
 
-@pytest.mark.parametrize("before_ms", [1, 1000])
-def test_nothing_happens_when_the_clock_wraps(before_ms):
-    board = NativeArduino(now_ms=(1 << 32) - before_ms)
+def test_nothing_happens_when_the_clock_wraps():
+    board = NativeArduino(now_ms=(1 << 32) - 1000)
     board.run(120)
     board.wiggle()
     assert board.command("A") == "k"

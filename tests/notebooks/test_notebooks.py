@@ -70,40 +70,32 @@ def test_rovers_are_drawn(tmp_path):
 # --- executing ---
 
 
-def written(folder, name, *cells):
-    """A small notebook: cells are (id, source) or (id, source, outputs)."""
-    made = nbformat.v4.new_notebook(metadata={"language_info": {"name": "python"}})
-    for cell_id, source, *outputs in cells:
-        cell = nbformat.v4.new_code_cell(source, outputs=outputs[0] if outputs else [], id=cell_id)
-        if cell_id == "parameters":
-            cell.metadata["tags"] = ["parameters"]
-        made.cells.append(cell)
+def written(folder, parameters='run_dir = "."  # here', work="pass"):
+    """Write a small 01_load.ipynb: these parameters, and one more cell."""
+    cells = [nbformat.v4.new_code_cell(source) for source in (parameters, work)]
+    cells[0].metadata["tags"] = ["parameters"]
     folder.mkdir(exist_ok=True)
-    nbformat.write(made, folder / f"{name}.ipynb")
+    made = nbformat.v4.new_notebook(metadata={"language_info": {"name": "python"}}, cells=cells)
+    nbformat.write(made, folder / "01_load.ipynb")
 
 
 @pytest.fixture
 def one_notebook(monkeypatch, tmp_path):
-    for module in (runs,):
-        monkeypatch.setattr(module, "NAMES", ("01_load",))
+    monkeypatch.setattr(runs, "NAMES", ("01_load",))
     return tmp_path / "notebooks"
 
 
 @pytest.mark.slow
 def test_parameters_act_where_they_stand_and_a_run_may_be_moved(one_notebook, tmp_path):
-    parameters = ("parameters", 'run_dir = "../runs/demo"  # here\nworlds = 1  # count\nsamples = 1  # of params.yml')
+    parameters = 'run_dir = "../runs/demo"  # here\nworlds = 1  # count\nsamples = 1  # of params.yml'
     work = "import pathlib, sys\npathlib.Path(run_dir, 'made').write_text(f'{worlds} {samples} {sys.executable}')"
-    written(one_notebook, "01_load", parameters, ("work", work))
+    written(one_notebook, parameters, work)
     folder = runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook, worlds=7)
     samples = params()["calibration"]["samples"]
     assert (folder / "made").read_text() == f"7 {samples} {runs.sys.executable}"
     assert {p.name for p in folder.iterdir()} == {"made", "01_load.ipynb"}
     first, second = nbformat.read(folder / "01_load.ipynb", as_version=4).cells
-    assert first.source.splitlines() == [
-        "run_dir = '.'  # here",
-        "worlds = 7  # count",
-        f"samples = {samples}  # of params.yml",
-    ]
+    assert first.source == f"run_dir = '.'  # here\nworlds = 7  # count\nsamples = {samples}  # of params.yml"
     assert second.source == work
 
 
@@ -116,14 +108,14 @@ def test_parameters_act_where_they_stand_and_a_run_may_be_moved(one_notebook, tm
     ],
 )  # fmt: skip
 def test_a_failing_cell_is_one_sentence_and_no_file(one_notebook, tmp_path, source, words):
-    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'), ("work", source))
+    written(one_notebook, work=source)
     with pytest.raises(runs.RoverError, match=words):
         runs.run("ck", "episodes", "mine", runs_dir=tmp_path / "runs", notebooks=one_notebook)
     assert not list((tmp_path / "runs").iterdir())
 
 
 def test_what_a_run_was_not_asked_to_know_is_refused_before_anything_runs(one_notebook, tmp_path):
-    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'))
+    written(one_notebook)
     began = time.monotonic()
     with pytest.raises(runs.RoverError, match="wrlds"):
         runs.run("ck", "episodes", runs_dir=tmp_path, notebooks=one_notebook, wrlds=1)
@@ -141,7 +133,7 @@ OF_OTHERS = ("benchmark-pi.json", "best_model.pth", "episodes/frame.jpg", "disti
 @pytest.fixture
 def old_run(one_notebook, tmp_path):
     """A run of the name `mine`, with a checkpoint and recordings in its folder, as the demo's."""
-    written(one_notebook, "01_load", ("parameters", 'run_dir = "."  # here'))
+    written(one_notebook)
     folder = tmp_path / "runs" / "mine"
     for name in (*OF_ARTIFACTS, *OF_OTHERS, "figures/01_old.png"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -165,32 +157,27 @@ def whole(source, folder, given, bars):
         (folder / name).write_text("new")
 
 
-@pytest.mark.parametrize("error", [runs.RoverError("no such checkpoint"), KeyboardInterrupt()], ids=repr)
-def test_a_run_that_does_not_end_costs_nothing_of_the_last_one(one_notebook, old_run, monkeypatch, error):
-    def ends_early(source, folder, given, bars):
-        whole(source, folder, given, bars)
-        raise error
+def test_a_run_takes_the_place_of_the_last_one_only_when_it_is_whole(one_notebook, old_run, monkeypatch):
+    """A student's distill.json is of its checkpoint and stays; a teacher's students.json is of its old artifact."""
 
-    def ends_at_once(*args):
-        raise error
+    def ends_early(*given):
+        whole(*given)
+        raise KeyboardInterrupt
+
+    def ends_at_once(*given):
+        raise runs.RoverError("no such checkpoint")
 
     before = contents(old_run)
-    with pytest.raises(type(error)):
+    with pytest.raises(KeyboardInterrupt):
         run_with(monkeypatch, one_notebook, old_run, ends_early)
     assert contents(old_run) == before and contents(old_run.parent / ".mine.new")["policy_static.pt"] == "new"
-    # the same command goes on there, and with another checkpoint it begins anew
-    assert run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began again")) == old_run
-    assert contents(old_run)["policy_static.pt"] == "new" and [p.name for p in old_run.parent.iterdir()] == ["mine"]
-    with pytest.raises(type(error)):
-        run_with(monkeypatch, one_notebook, old_run, ends_early)
-    with pytest.raises(type(error)):
+    with pytest.raises(runs.RoverError):  # with another checkpoint it begins anew
         run_with(monkeypatch, one_notebook, old_run, ends_at_once, "other")
-    assert [p.name for p in old_run.parent.iterdir()] == ["mine"]
-
-
-def test_a_whole_run_takes_the_place_of_the_last_one(one_notebook, old_run, monkeypatch):
-    """A student's distill.json is of its checkpoint and stays; a teacher's students.json is of its old artifact."""
-    assert run_with(monkeypatch, one_notebook, old_run, whole) == old_run
+    assert contents(old_run) == before and [p.name for p in old_run.parent.iterdir()] == ["mine"]
+    with pytest.raises(KeyboardInterrupt):
+        run_with(monkeypatch, one_notebook, old_run, ends_early)
+    # and the same command goes on there
+    assert run_with(monkeypatch, one_notebook, old_run, lambda *args: pytest.fail("it began again")) == old_run
     made = ("load.json", "01_load.ipynb", "policy_static.pt", "figures/01_new.png")
     assert contents(old_run) == dict.fromkeys(made, "new") | dict.fromkeys(OF_OTHERS, "old")
     assert [p.name for p in old_run.parent.iterdir()] == ["mine"]

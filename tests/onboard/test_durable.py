@@ -1,10 +1,10 @@
 """Two processes that make the same thing at once do not disturb each other, and a kill or a power cut costs nothing."""
 
-import ctypes
 import os
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -37,6 +37,7 @@ def test_while_one_is_in_it_another_is_refused_or_waits(tmp_path):
 
     waiting = threading.Thread(target=second)
     with build_folder(tmp_path / "mine") as folder:
+        assert folder.stat().st_mode & 0o777 == 0o700  # or another user could hold the lock
         write(folder, "first", text="")
         with pytest.raises(RoverError), build_folder(tmp_path / "mine"):
             pass
@@ -44,7 +45,9 @@ def test_while_one_is_in_it_another_is_refused_or_waits(tmp_path):
         waiting.join(0.1)
         assert waiting.is_alive() and names_in(folder) == ["first"]
     waiting.join(10)
-    assert names_in(tmp_path / "mine") == ["first", "second"] and names_in(tmp_path) == ["mine"]
+    (tmp_path / "usual").mkdir()
+    assert (tmp_path / "mine").stat().st_mode == (tmp_path / "usual").stat().st_mode
+    assert names_in(tmp_path / "mine") == ["first", "second"] and names_in(tmp_path) == ["mine", "usual"]
 
 
 def end_by_a_kill(lines, *args):
@@ -100,14 +103,6 @@ def test_content_is_synced_before_its_name_and_the_name_after_it(tmp_path, monke
     assert calls[6:] == ["sync", "rename", "sync", "rename", "sync"]
 
 
-def test_a_disk_that_cannot_sync_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(ctypes, "get_errno", lambda: 5)
-    monkeypatch.setattr(durable._libc, "syncfs", lambda file: -1)
-    with pytest.raises(OSError, match="Input/output"), build_folder(tmp_path / "mine") as new:
-        write(new, "file", text="")
-    assert names_in(tmp_path) == []
-
-
 def test_a_run_that_is_a_link_is_made_where_the_link_leads(tmp_path):
     """The link may lie on another disk than the run, and nothing can be renamed from one disk to another."""
     (tmp_path / "runs").mkdir()
@@ -123,7 +118,7 @@ NEW = dict.fromkeys(("figures/one", "pretrained_model/config.json", "policy_mixe
 OLD = ("figures/one", "figures/two", "pretrained_model", "report.html", "fast.json/one", "users/frame.jpg")
 
 
-@pytest.mark.parametrize("count", [*range(1, 7), 99])
+@pytest.mark.parametrize("count", [1, 2, 4, 99])
 def test_a_kill_while_it_takes_its_place_costs_nothing(tmp_path, monkeypatch, count):
     """A student's files were once mixed with its predecessor's, and nobody could tell which were whose."""
     rename, moved = Path.rename, []
@@ -137,11 +132,9 @@ def test_a_kill_while_it_takes_its_place_costs_nothing(tmp_path, monkeypatch, co
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", ends)
-        try:
-            with build_folder(tmp_path / "mine", lambda folder: [folder / "report.html", folder / "figures"]) as new:
-                write(new, *NEW, text="new")
-        except KeyboardInterrupt:
-            assert count <= 5
+        filled = build_folder(tmp_path / "mine", lambda folder: [folder / "report.html", folder / "figures"])
+        with suppress(KeyboardInterrupt), filled as new:
+            write(new, *NEW, text="new")
     if count == 1:  # before it was known to be complete: nothing of the old one is lost
         assert whole(tmp_path) == {f"mine/{name}": "old" for name in OLD}
         return

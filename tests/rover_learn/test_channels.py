@@ -74,7 +74,7 @@ def block():
 def test_the_reader_is_refitted_by_least_squares(block):
     """Compare with torch's lstsq on the patches themselves."""
     kept, before = torch.tensor([0, 2]), {k: v.clone() for k, v in block.weights.items()}
-    errors = _leave_out(block.weights, "b", kept, block.gram)
+    _leave_out(block.weights, "b", kept, block.gram)
     w = block.weights
     assert not w["b.conv1.weight"][[1, 3, 4, 5, 6, 7]].any() and not w["b.conv2.weight"][:, [1, 3, 4, 5, 6, 7]].any()
     assert torch.equal(w["b.conv1.weight"][kept], before["b.conv1.weight"][kept])
@@ -90,20 +90,14 @@ def test_the_reader_is_refitted_by_least_squares(block):
     best = few @ torch.linalg.lstsq(few, wanted.T.double()).solution - wanted.T
     off = (own + own_shift - wanted - shift).norm()
     assert best.norm() <= off < 1.01 * best.norm()
-    assert errors["error_refit_pct"] < errors["error_pct"]
-    gain = (before["b.bn2.weight"] / (before["b.bn2.running_var"] + 1e-5).sqrt())[:, None]  # of the next batch norm
-    share = ((own + own_shift - wanted - shift) / gain).norm() / (wanted / gain).norm()
-    assert errors["error_refit_pct"] == pytest.approx(100 * share.item(), rel=1e-2)
 
 
 @pytest.mark.slow
 def test_a_policy_in_lerobots_shape_that_computes_half(tiny):
     """Its INT8 layers in the blocks have half the channels, and its plans are LeRobot's."""
     pictures = torch.stack([inputs_of(s, tiny.config)[1] for s in memory_samples(16)])
-    made, notes = without_channels(tiny.weights, tiny.config, 0.5, pictures.split(4), np.random.default_rng(0))
+    made = without_channels(tiny.weights, tiny.config, 0.5, pictures.split(4), np.random.default_rng(0))
     assert {k: v.shape for k, v in made.items()} == {k: v.shape for k, v in tiny.weights.items()}
-    assert [n["block"] for n in notes] == BLOCKS and all(2 * n["channels"] == n["of"] for n in notes)
-    assert all(n["error_refit_pct"] < n["error_pct"] for n in notes)
     half = replace(tiny, weights=made)
     layers = int8_layers(quantize(half, Scheme(), calibrate(half, memory_samples(4))).module)
     assert layers["backbone.layer4.0.body.0"].weight().shape == (256, 256, 3, 3)
@@ -111,5 +105,5 @@ def test_a_policy_in_lerobots_shape_that_computes_half(tiny):
     model, samples = ACT(tiny.config, made), memory_samples(3, seed=5)
     ours = predictions(model, [inputs_of(s, tiny.config) for s in samples])
     assert (ours - lerobots(half, samples)).abs().max() < 1e-5
-    again, nothing = without_channels(made, tiny.config, 1.0, [], np.random.default_rng(0))
-    assert nothing == [] and all(torch.equal(value, made[name]) for name, value in again.items())
+    again = without_channels(made, tiny.config, 1.0, [], np.random.default_rng(0))
+    assert all(torch.equal(value, made[name]) for name, value in again.items())

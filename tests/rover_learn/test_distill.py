@@ -130,7 +130,6 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
     content = json.loads((folder / "distill.json").read_text())
     of_teacher, of_student = content["metrics"]["students"]
     assert of_student["gmac"] < 0.56 * of_teacher["gmac"] and of_student["backbone_channels"] == 0.5
-    assert [note["block"] for note in content["metrics"]["backbone"]][-1] == "backbone.layer4.1"
     artifact = load_policy(folder / "policy_static.pt")
     assert artifact.manifest["gmac"] == pytest.approx(of_student["gmac"])
     assert (folder / "policy_static.pt").stat().st_size < 8e6  # it has 12 MB with all channels
@@ -141,19 +140,15 @@ def test_a_student_of_half_the_channels_keeps_its_zeros(teacher, episodes, recip
 
 
 def test_a_run_that_is_there_is_not_overwritten(teacher, episodes, tmp_path, monkeypatch):
-    (tmp_path / "fast").mkdir()
-    with pytest.raises(TrainingError, match="is there already"):
-        distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path)
-    (tmp_path / "fast").rmdir()
-
     def learn(self):  # meanwhile another command makes it
         (tmp_path / "fast").mkdir()
         return Learned({}, {}, tmp_path / "gone")
 
     monkeypatch.setattr(Distillation, "learn", learn)
     monkeypatch.setattr(Distillation, "leave", lambda self, new, *_: (new / "distill.json").touch())
-    with pytest.raises(TrainingError, match="is there already"):
-        distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
+    for _ in range(2):
+        with pytest.raises(TrainingError, match="is there already"):
+            distill(teacher, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
     assert not list((tmp_path / "fast").iterdir())
 
 

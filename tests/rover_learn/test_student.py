@@ -22,8 +22,8 @@ def shapes(weights):
 
 def test_at_another_size_it_is_the_teacher(tiny):
     config = student_config(tiny, StudentShape(54, 96))
-    weights, narrowed = initial_weights(tiny, config, [])
-    assert (config.image_sizes, config.vae_layers, narrowed) == (((54, 96),), 0, [])
+    weights = initial_weights(tiny, config, [])
+    assert (config.image_sizes, config.vae_layers) == (((54, 96),), 0)
     assert shapes(weights) == expected_shapes(config)
     smaller = tiny.at_size(54, 96)
     observations = [inputs_of(s, config) for s in memory_samples(2)]
@@ -39,30 +39,23 @@ def test_units_that_do_nothing_are_the_ones_to_go(tiny, inputs):
             dead[name][::2] = 0
             dead[name.replace("weight", "bias")][::2] = -1
     config = student_config(tiny, StudentShape(feedforward=64))
-    weights, narrowed = initial_weights(replace(tiny, weights=dead), config, inputs)
+    weights = initial_weights(replace(tiny, weights=dead), config, inputs)
     assert torch.equal(weights["encoder.layers.0.linear1.weight"], dead["encoder.layers.0.linear1.weight"][1::2])
     expected = predictions(ACT(tiny.config, dead), inputs)
     assert (predictions(ACT(config, weights), inputs) - expected).abs().max() < 1e-5
-    assert all(note["error_refit_pct"] < 1e-2 for note in narrowed)
 
 
 @pytest.mark.parametrize(
-    "shape",
-    [
-        StudentShape(height=144, width=256),
-        StudentShape(decoder_layers=3),
-        StudentShape(feedforward=129),
-        StudentShape(backbone_channels=0),
-    ],
+    "wrong", [{"height": 144}, {"decoder_layers": 3}, {"feedforward": 0}, {"backbone_channels": 0}]
 )
-def test_a_student_is_no_larger_than_its_teacher(tiny, shape):
+def test_a_student_is_no_larger_than_its_teacher(tiny, wrong):
     with pytest.raises(TrainingError):
-        student_config(tiny, shape)
+        student_config(tiny, StudentShape(**wrong))
 
 
-@pytest.mark.parametrize(("height", "width", "says"), [(72, 72, "aspect ratio"), (18, 32, "at least 32")])
-def test_a_picture_that_the_policy_cannot_see_is_refused(tiny, height, width, says):
-    with pytest.raises(CheckpointError, match=says):
+@pytest.mark.parametrize(("height", "width"), [(72, 72), (18, 32)])  # another aspect ratio; less than 32 pixels
+def test_a_picture_that_the_policy_cannot_see_is_refused(tiny, height, width):
+    with pytest.raises(CheckpointError):
         student_config(tiny, StudentShape(height, width))
 
 

@@ -1,10 +1,6 @@
 """A training that is ended at any moment gives what one gives that was not."""
 
 import math
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -69,22 +65,6 @@ def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, ev
         losses, weights, after = train(tmp_path / str(kill_at), **options)
         assert torch.equal(weights, whole[1])
         assert (losses, after) == (whole[0], whole[2])
-
-
-@pytest.mark.slow
-def test_killed_for_real_while_it_saves(tmp_path, whole):
-    """SIGKILL from outside, at moments that nobody chose."""
-    script = "import sys; from test_training import *; print('up', flush=True); [train(Path(sys.argv[1]))]"
-    for wait_s in (0.005, 0.02):
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-        child = subprocess.Popen([sys.executable, "-c", script, tmp_path], stdout=subprocess.PIPE, env=env)
-        assert child.stdout.read(2) == b"up"
-        try:
-            child.wait(wait_s)
-        except subprocess.TimeoutExpired:
-            child.send_signal(signal.SIGKILL)
-        child.communicate()
-    assert torch.equal(train(tmp_path)[1], whole[1])
 
 
 def test_two_processes_do_not_train_the_same(tmp_path):

@@ -12,7 +12,7 @@ from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.recording.outcome import relabel
+from rover_lib.onboard.recording.outcome import label
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
@@ -23,8 +23,8 @@ READERS = {
     "run.json": lambda path: read_stage(path, "run"),
     "car.yml": read_car,
     "flight.log": read_log,
-    "control_data.csv": lambda path: load_recordings(path.parent, 8),
-    "episode_data.json": lambda path: relabel(path.parent, "hit"),
+    "episode_data.json": lambda path: load_recordings(path.parent, 8),
+    "./episode_data.json": lambda path: label([path.parent], "hit"),
     "best_model.pth": load_checkpoint,
     "calibration.pt": Calibration.load,
     "manifest.json": lambda path: read_tub(path.parent, Car()),

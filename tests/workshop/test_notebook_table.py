@@ -1,15 +1,11 @@
 """Tables and figures of notebooks: cells can be copied, and figures are sharp."""
 
-import io
 import re
-from base64 import b64decode
-
-from PIL import Image
 
 from rover_lib.workshop import browse, plots
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.style import Note, new_figure
+from rover_lib.workshop.plots.style import Note
 from rover_lib.workshop.progress import TTY_VARIABLE
 
 
@@ -27,12 +23,6 @@ def test_gates_have_a_verdict_and_a_shade_each():
     assert [row[-1] for row in table.rows] == ["kept", "MISSED", "not measured"]
     assert table.caption == "1 of 3 promises kept, 1 missed, 1 not measured"
     assert len(set(table.shades)) == 3 and table._repr_html_().count("background") == 3
-
-
-def test_a_figure_is_shown_with_twice_the_pixels_at_its_size():
-    data, metadata = new_figure(1, height_in=2.0)[0]._repr_mimebundle_()
-    assert metadata["image/png"] == {"width": 900, "height": 200}
-    assert Image.open(io.BytesIO(b64decode(data["image/png"]))).size == (1800, 400)
 
 
 def test_a_sentence_leaves_no_figure_and_takes_an_old_one_away(tmp_path):

@@ -11,15 +11,9 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from rover_lib.onboard.car.car import (
-    DEFAULT,
-    FAST_PULSE_MAX_US,
-    PERIOD_MIN_US,
-    Car,
-    yaml_of,
-)
+from rover_lib.onboard.car.car import DEFAULT, FAST_PULSE_MAX_US, PERIOD_MIN_US, Car, yaml_of
 from rover_lib.onboard.car.protocol import Telemetry
 from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.stage import atomic_path
@@ -47,15 +41,6 @@ PERIODS_US = (20000, 12500, 7900, 5000, 3200)
 KINDS = (Car(), *(_slow(us, us) for us in PERIODS_US), *(_slow(a, b) for a in PERIODS_US for b in PERIODS_US if a != b))
 
 
-class Held(NamedTuple):
-    """The medians of what both channels did while they were measured, microseconds."""
-
-    steering_us: int
-    throttle_us: int
-    steering_period_us: int
-    throttle_period_us: int
-
-
 def measure(
     link: "ServoLink",
     ask: Callable[[str], object],
@@ -75,9 +60,8 @@ def measure(
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
     _find(link, sleep)
-    rest = _hold(link, "at rest", sleep)
-    notify(f"at rest: steering {rest.steering_us} us, throttle {rest.throttle_us} us; periods "
-           f"{rest.steering_period_us} and {rest.throttle_period_us} us")  # fmt: skip
+    steering_us, throttle_us, *periods_us = _hold(link, "at rest", sleep)
+    notify(f"at rest: {steering_us} and {throttle_us} us, with periods of {periods_us[0]} and {periods_us[1]} us")
     ends = {}
     for where, stick in (
         ("left", "Move the steering stick fully to the left"),
@@ -86,23 +70,22 @@ def measure(
         ("back", "Pull the throttle fully back (leave it at rest if this car has no reverse)"),
     ):
         ask(f"{stick}, and hold it there.")
-        held = _hold(link, f"with the stick {where}", sleep)
-        ends[where] = held.throttle_us if where in ("forward", "back") else held.steering_us
+        ends[where] = _hold(link, f"with the stick {where}", sleep)[where in ("forward", "back")]
         notify(f"{where}: {ends[where]} us")
     ask("Let go of both sticks.")
-    fast = rest.throttle_period_us < PERIOD_MIN_US
+    fast = periods_us[1] < PERIOD_MIN_US
     if fast and ends["forward"] > FAST_PULSE_MAX_US:
         notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
         ends["forward"] = FAST_PULSE_MAX_US
     steering = {
-        "period_us": rest.steering_period_us,
+        "period_us": periods_us[0],
         "left_us": ends["left"],
-        "neutral_us": rest.steering_us,
+        "neutral_us": steering_us,
         "right_us": ends["right"],
         "positive": positive or ("right" if ends["right"] > ends["left"] else "left"),
     }
-    throttle = {"period_us": rest.throttle_period_us, "neutral_us": rest.throttle_us, "forward_us": ends["forward"]}
-    if abs(ends["back"] - rest.throttle_us) > RETURNS_US and not fast:
+    throttle = {"period_us": periods_us[1], "neutral_us": throttle_us, "forward_us": ends["forward"]}
+    if abs(ends["back"] - throttle_us) > RETURNS_US and not fast:
         throttle["reverse_us"] = ends["back"]
     try:
         return Car.of({**more, "steering": steering, "throttle": throttle}, "the measured car")
@@ -122,54 +105,41 @@ def _find(link: "ServoLink", sleep: Callable[[float], None]) -> None:
             seen |= {name for name, us in zip(NAMES, pulses, strict=True) if us is not None}
             if None not in pulses:
                 return
-    silent = [name for name in NAMES if name not in seen]
-    raise CarError(
-        f"no pulse of {' and '.join(silent) or 'both channels at a time'} came from the receiver",
-        remedy="is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?",
-    )
+    silent = " and ".join(name for name in NAMES if name not in seen)
+    remedy = "is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?"
+    raise CarError(f"no pulse of {silent or 'both channels at a time'} came from the receiver", remedy=remedy)
 
 
 def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
     return (status.receiver_steering_us, status.receiver_throttle_us) if status else (None, None)
 
 
-def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> Held:
-    """Measure both channels for MEASURE_S. Raises CarError if a signal is lost or a stick moves."""
+def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list[int]:
+    """Measure both channels for MEASURE_S. Return the medians of both pulses and both periods, in microseconds.
+
+    Raises CarError if a signal is lost or a stick moves.
+    """
     rows = []
     for _ in range(round(MEASURE_S / STEP_S)):
         sleep(STEP_S)
         status = link.latest()
         for name, pulse_us in zip(NAMES, _pulses(status), strict=True):
             if pulse_us is None:
-                raise CarError(
-                    f"no pulse of {name} {where} that a servo would take, 800 to 2200 us",
-                    remedy="set the transmitter's end points to 100 %, and keep it on",
-                )
+                what = f"no pulse of {name} {where} that a servo would take, 800 to 2200 us"
+                raise CarError(what, remedy="set the transmitter's end points to 100 %, and keep it on")
         assert status is not None
         periods = status.receiver_steering_period_us or 0, status.receiver_throttle_period_us or 0
         rows.append([us or 0 for us in (*_pulses(status), *periods)])
     columns = list(zip(*rows, strict=True))
     for name, column in zip(NAMES, columns, strict=False):
         if max(column) - min(column) > STEADY_US:
-            raise CarError(
-                f"{name} moved while it was measured {where}",
-                found=f"{min(column)} to {max(column)} us",
-                remedy="hold the stick still, and start again",
-            )
-    return Held(*(round(statistics.median(column)) for column in columns))
-
-
-def refuse_existing(path: Path, force: bool) -> None:
-    """Raise CarError if the car.yml exists, unless `force` allows replacing it."""
-    if path.exists() and not force:
-        raise CarError(f"{path}: exists already", remedy="--force replaces it")
+            found = f"{min(column)} to {max(column)} us"
+            raise CarError(f"{name} moved while it was measured {where}", found=found, remedy="hold the stick still")
+    return [round(statistics.median(column)) for column in columns]
 
 
 def write_car(car: Car, path: Path) -> None:
-    """Write car.yml atomically. Raises CarError if it cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            temporary.write_text(yaml_of(car))
-    except OSError as error:
-        raise CarError(f"{path}: cannot be written ({error.strerror})", remedy="name another with --output") from None
+    """Write car.yml atomically. Raises OSError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml_of(car))

@@ -3,18 +3,16 @@
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
 
-Substitutes for a camera are a folder of JPEGs, and JPEGs through a FIFO. A picture counts as a frame only if it is
-complete and new. Single bad pictures are left out; a few bad ones in a row mean that the camera has failed.
+Substitutes for a camera are a folder of JPEGs, and JPEGs through a FIFO. Single bad pictures are left out; a few bad
+ones in a row mean that the camera has failed.
 """
 
 import contextlib
-import math
 import os
 import select
 import stat
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +22,10 @@ import numpy as np
 
 from rover_lib.onboard.car.csi import is_csi, newest_jpeg, read_csi
 from rover_lib.onboard.car.picture import (
+    COLUMNS,
     LEAST,
     MOST_BYTES,
+    ROWS,
     block_sums,
     brightness,
     decode_jpeg,
@@ -45,10 +45,9 @@ REFUSED_MOST = 4  # bad pictures in a row mean that the camera has failed; 0.13 
 # noise alone 0.37; a strip of 5 % of a picture, which still changes, touches 2 of 9 rows and leaves 0.78.
 SAME = 0.6
 REMEMBERED = 32  # pictures; a driver has at most this many buffers that it could repeat (VIDEO_MAX_FRAME)
-DECIDING = 5  # frames after which it is decided whether time stamps are the machine's
 OLD_S = 0.5  # a frame this old is of no use: a plan's throttle begins to fade at this age
 AHEAD_S = 0.01  # a time stamp may lie this far in the future, because it may be rounded
-USUAL_SIZES = ((640, 360), (640, 480))  # (width, height) that nearly every USB camera gives
+WIDTH = 640  # pixels to ask a camera for; nearly every USB camera gives 640x360 and 640x480
 NEAR_S = 600.0  # a time stamp further from a clock than this does not come from that clock
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
@@ -57,8 +56,7 @@ Reader = Generator[Read, None, None]
 
 def size_like(width: int, height: int) -> tuple[int, int]:
     """Return the (width, height) to ask a camera for, so that its pictures have the shape of width x height."""
-    usual = [size for size in USUAL_SIZES if not is_squeezed(size, (width, height))]
-    return usual[0] if usual else (USUAL_SIZES[0][0], round(USUAL_SIZES[0][0] * height / width / 2) * 2)
+    return WIDTH, round(WIDTH * height / width / 2) * 2
 
 
 def check_shape(source: str, image: np.ndarray, wanted: tuple[int, int]) -> None:
@@ -66,8 +64,8 @@ def check_shape(source: str, image: np.ndarray, wanted: tuple[int, int]) -> None
     height, width = image.shape[:2]
     if is_squeezed((width, height), wanted):
         raise CameraError(
-            f"{source}: gives {width}x{height}, and the policy has seen pictures of the shape of "
-            f"{wanted[0]}x{wanted[1]}: they would be squeezed",
+            f"{source}: pictures must have the shape of the policy's, {wanted[0]}x{wanted[1]}",
+            found=f"{width}x{height}",
             remedy="use a camera that can give that shape ('rover doctor' lists sizes), or a policy for this one",
         )
 
@@ -76,11 +74,10 @@ def check_shape(source: str, image: np.ndarray, wanted: tuple[int, int]) -> None
 class Frame:
     """One picture. Nobody may write into it.
 
-    image: (h, w, 3) uint8 BGR. captured_s: when it was captured, by time.monotonic() (or the clock given to Camera);
-    when it arrived, if the camera does not tell. number: counts this camera's frames from 1. repeats: how many frames
-    in a row, up to this one, repeat nearly all of one of the 32 pictures before them, byte for byte; a sensor's noise
-    keeps this at 0. mean: of the pixels, 0 to 255. contrast: as in picture.brightness(). jpeg: as it arrived;
-    None if the camera delivers raw pictures.
+    image: (h, w, 3) uint8 BGR. captured_s: when it was captured, by the camera's clock; when it arrived, if the camera
+    does not tell. number: counts from 1. repeats: how many frames in a row, up to this one, repeat nearly all of one of
+    the 32 pictures before them, byte for byte; a sensor's noise keeps this at 0. mean, contrast: picture.brightness().
+    jpeg: as it arrived; None if the camera delivers raw pictures.
     """
 
     image: np.ndarray
@@ -113,14 +110,17 @@ class Camera:
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._clock = clock
-        self._stamps = _Stamps(clock)
-        self._shown = np.zeros((REMEMBERED, 0), np.uint64)  # the newest pictures' block_sums(), one row each
+        self.time_stamps = NO_CLOCK  # their clock; NO_CLOCK: frames get their time of arrival
+        self._stamp_s = float("-inf")  # the newest one
+        self._shown = np.zeros(
+            (REMEMBERED, ROWS * COLUMNS), np.uint64
+        )  # the newest pictures' block_sums(), one row each
         self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: CameraError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
-        self._held = held
         if not held:
             self._begun.set()
+        self._held = held
         self._changed = threading.Condition()  # guards the three below
         self._frame: Frame | None = None
         self._arrived_s = 0.0  # when it came, by `clock`
@@ -140,13 +140,15 @@ class Camera:
         self._thread.start()
         try:
             if self.wait(0, FIRST_FRAME_S) is None:
-                why = self._refusal or CameraError("none came", remedy="is it a camera that no other program uses?")
-                what = f"{self.source}: no frame within {FIRST_FRAME_S:g} s: {why.what}"
-                raise CameraError(what, found=why.found, remedy=why.remedy)
+                none = CameraError("none came", remedy="is it a camera that no other program uses?")
+                raise self._failed(f"no frame within {FIRST_FRAME_S:g} s", self._refusal or none)
         except BaseException:
             self.close()
             raise
         return self
+
+    def _failed(self, what: str, why: CameraError) -> CameraError:
+        return CameraError(f"{self.source}: {what}: {why.what}", found=why.found, remedy=why.remedy)
 
     def begin(self) -> None:
         """Start held pictures from the first one, see __init__. Has no effect on a camera."""
@@ -188,11 +190,6 @@ class Camera:
         """How many frames have come so far."""
         return self._frame.number if self._frame else 0
 
-    @property
-    def time_stamps(self) -> str:
-        """The clock of the camera's time stamps: "monotonic", or "no" if frames get their time of arrival."""
-        return self._stamps.kind or NO_CLOCK
-
     def _read(self, reader: Reader) -> None:
         refused = 0
         try:
@@ -201,17 +198,15 @@ class Camera:
                     if self._closing.is_set():
                         return
                     try:
-                        captured_s = self._stamps.captured_s(stamp_s)
+                        captured_s = self._captured_s(stamp_s)
                         image = decode_jpeg(picture) if isinstance(picture, bytes) else picture
                     except CameraError as error:
                         self._refusal, refused = error, refused + 1
                         if self._frame and refused >= REFUSED_MOST:
-                            what = f"{self.source}: {refused} pictures in a row were no frames: {error.what}"
-                            raise CameraError(what, found=error.found, remedy=error.remedy) from None
+                            raise self._failed(f"{refused} pictures in a row were no frames", error) from None
                         continue
                     refused = 0
-                    if captured_s is not None:
-                        self.add(image, captured_s, picture if isinstance(picture, bytes) else None)
+                    self.add(image, captured_s, picture if isinstance(picture, bytes) else None)
                 raise CameraError(f"{self.source}: it ended after {self.frames} frames", remedy=UNPLUGGED)
         except CameraError as error:
             failure = error
@@ -220,6 +215,23 @@ class Camera:
         with self._changed:
             self._failure = failure
             self._changed.notify_all()
+
+    def _captured_s(self, stamp_s: float | None) -> float:
+        """Return when a frame that has just arrived was captured, seconds by `clock`.
+
+        Time stamps near the machine's monotonic clock come from it: CameraError for one that is old, in the future or
+        does not change.
+        """
+        now_s = self._clock()
+        if stamp_s is not None and self._stamp_s < 0 and abs(now_s - stamp_s) < NEAR_S:
+            self.time_stamps = MONOTONIC
+        if stamp_s is None or self.time_stamps == NO_CLOCK:
+            return now_s
+        age_s, stands, self._stamp_s = now_s - stamp_s, stamp_s <= self._stamp_s, stamp_s
+        if stands or not -AHEAD_S <= age_s <= OLD_S:
+            found = "the same again" if stands else f"one of {age_s:.2f} s ago"
+            raise CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
+        return min(now_s, stamp_s)
 
     def add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
         """Make a picture the newest frame. Raises CameraError if it is unfit, or has another size than before."""
@@ -233,8 +245,6 @@ class Camera:
         if w < LEAST[0] or h < LEAST[1]:
             raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
         shown, number = block_sums(image), self.frames + 1
-        if before is None:
-            self._shown = np.zeros((REMEMBERED, len(shown)), np.uint64)
         if self._held and self._begun.is_set():  # a film starts: it may show the earlier pictures again
             self._held, self._remembered = False, 0
         same = (self._shown[: self._remembered] == shown).mean(axis=1).max(initial=0.0)
@@ -245,53 +255,6 @@ class Camera:
         with self._changed:
             self._frame, self._arrived_s = frame, self._clock()
             self._changed.notify_all()
-
-
-class _Stamps:
-    """Finds out when frames were captured, from the time stamps that the camera gives.
-
-    The first frames decide whether these come from the machine's monotonic clock. After that, one that is old, in the
-    future or does not change is a fault of the camera. kind: MONOTONIC or NO_CLOCK; "" before the decision.
-    """
-
-    def __init__(self, clock: Callable[[], float]):
-        self._clock = clock
-        self.kind = ""
-        self._last_s = -math.inf
-        self._first: deque[tuple[float, float]] = deque(maxlen=DECIDING)  # time stamp and age
-
-    def captured_s(self, stamp_s: float | None) -> float | None:
-        """Return when a frame that has just arrived was captured, seconds by `clock`; None before the decision.
-
-        A frame without a time stamp counts as captured when it arrived.
-
-        Raises CameraError for a stamp that cannot be right.
-        """
-        now_s = self._clock()
-        if stamp_s is not None and not self.kind:
-            self._first.append((stamp_s, now_s - stamp_s))
-            if len(self._first) < DECIDING:
-                return None
-            self._decide()
-        if stamp_s is None or self.kind == NO_CLOCK:
-            return now_s
-        stands, self._last_s = stamp_s <= self._last_s, stamp_s
-        _check_stamp(stands, now_s - stamp_s)
-        return min(now_s, stamp_s)
-
-    def _decide(self) -> None:
-        """Decide by the medians of the first frames, because one of them may have come late."""
-        stamps, ages = np.array(self._first).T
-        age_s = float(np.median(ages))
-        if abs(age_s) < NEAR_S:
-            _check_stamp(float(np.median(np.diff(stamps))) <= 0, age_s)
-        self.kind = MONOTONIC if abs(age_s) < NEAR_S else NO_CLOCK
-
-
-def _check_stamp(stands: bool, age_s: float) -> None:
-    if stands or not -AHEAD_S <= age_s <= OLD_S:
-        found = "the same again" if stands else f"one of {abs(age_s):.2f} s {'ago' if age_s > 0 else 'ahead'}"
-        raise CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
 
 
 def path_of(source: str, dev: Path = Path("/dev")) -> Path:
@@ -305,22 +268,19 @@ def _reader(
     if is_csi(source):
         return read_csi(source, size, rate_hz, closing)
     path = path_of(source)
-    source = str(path)
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        what = f"{source}: no such camera ({error.strerror})"
+        what = f"{path}: no such camera ({error.strerror})"
         raise CameraError(what, remedy="'rover doctor' lists those that are") from None
     if stat.S_ISCHR(mode):
-        return _v4l2(source, size, rate_hz)
+        return _v4l2(str(path), size, rate_hz)
     if stat.S_ISFIFO(mode):
         return _fifo(path, closing)
     if stat.S_ISDIR(mode):
         return _folder(path, rate_hz, closing, begun)
-    raise CameraError(
-        f"{source}: neither a camera nor a folder or a FIFO of JPEGs",
-        remedy=f"ffmpeg -i {path.name} -q:v 3 FOLDER/%06d.jpg makes pictures of a video",
-    )
+    remedy = f"ffmpeg -i {path.name} -q:v 3 FOLDER/%06d.jpg makes pictures of a video"
+    raise CameraError(f"{path}: neither a camera nor a folder or a FIFO of JPEGs", remedy=remedy)
 
 
 def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
@@ -350,42 +310,32 @@ def _folder(path: Path, rate_hz: float, closing: threading.Event, begun: threadi
     folder = path / "frames" if (path / "frames").is_dir() else path
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
     if not files:
-        what = f"{folder}: no pictures in it ({', '.join(PICTURES)})"
-        raise CameraError(what, remedy="give /dev/videoN or another folder")
-    return _pace(files, rate_hz, closing, begun)
-
-
-def _pace(files: list[Path], rate_hz: float, closing: threading.Event, begun: threading.Event) -> Reader:
+        raise CameraError(f"{folder}: no JPEGs in it", remedy="give /dev/videoN or another folder")
     last = False
     while not last:
         last, start = begun.is_set(), time.monotonic()
-        for count, path in enumerate(files):
+        for count, file in enumerate(files):
             if closing.wait(max(0.0, start + count / rate_hz - time.monotonic())):
                 return
             if begun.is_set() and not last:
                 break
-            with path.open("rb") as file:
-                yield file.read(MOST_BYTES + 1), None
+            with file.open("rb") as opened:
+                yield opened.read(MOST_BYTES + 1), None
 
 
 def _fifo(path: Path, closing: threading.Event) -> Reader:
     """Yield JPEGs from a FIFO; of several that wait there, only the last. The camera ends when the FIFO does."""
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    began, pending = False, bytearray()
     try:
-        began, pending = False, bytearray()
-        while not closing.is_set():
-            if not select.select([fd], [], [], 0.05)[0]:
-                continue
+        while not closing.wait(0 if select.select([fd], [], [], 0.05)[0] else 0.01):
             try:
                 data = os.read(fd, 1 << 20)
             except BlockingIOError:
                 continue
             if not data and began:
                 return
-            if not data:
-                closing.wait(0.01)  # no writer has opened the FIFO yet
-                continue
-            began = True
+            began = began or bool(data)  # else no writer has opened the FIFO yet
             pending += data
             if jpeg := newest_jpeg(pending)[0]:
                 yield jpeg, None

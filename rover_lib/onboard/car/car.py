@@ -3,9 +3,8 @@
     with ServoLink("/dev/ttyUSB0", this_car()) as link:
         link.send_action(steering=0.2, throttle=0.1)
 
-Without a car.yml, it is the car of the original recordings, with the constants that were checked on them. The Arduino
-is told the same numbers, and refuses any beyond the limits that its firmware was compiled with. This module has the
-same limits (firmware/rover/vehicle.h), so that a file which the Arduino would refuse is refused when it is read.
+Without a car.yml, it is the car of the original recordings. The Arduino is told the same numbers, and refuses any
+beyond the limits that its firmware was compiled with (firmware/rover/vehicle.h), which this module repeats.
 """
 
 import math
@@ -134,10 +133,7 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether actions and pictures mean the same on both cars.
-
-        All must be equal but the name, the cap, the human, and which side is called left.
-        """
+        """Whether both are equal but for the name, the cap, the human, and which side is called left."""
         descriptions = []
         for car in (self, other):
             description = {**car.description(), "name": "", "human": "", "steering": car.steering_us}
@@ -152,17 +148,14 @@ class Car:
 
     def description(self) -> dict[str, Any]:
         """The content of its car.yml, from which Car.of() makes the same car."""
-        steering, throttle = self.pwm.steering, self.pwm.throttle
+        throttle = self.pwm.throttle
+        period_us, *ends_us = self.steering_us
+        right_us, neutral_us, left_us = ends_us if self.positive == "left" else ends_us[::-1]
+        steering = {"period_us": period_us, "left_us": left_us, "neutral_us": neutral_us, "right_us": right_us}
         reverse = {"reverse_us": throttle.pulse_us(throttle.low)} if self.reverses else {}
         return {
             "name": self.name,
-            "steering": {
-                "period_us": round(steering.period_us),
-                "left_us": steering.pulse_us(float(self.left)),
-                "neutral_us": steering.neutral_us,
-                "right_us": steering.pulse_us(-float(self.left)),
-                "positive": self.positive,
-            },
+            "steering": {**steering, "positive": self.positive},
             "throttle": {
                 "period_us": round(throttle.period_us),
                 "neutral_us": throttle.neutral_us,
@@ -179,10 +172,9 @@ class Car:
     def of(cls, content: object, where: str = "car.yml") -> "Car":
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
         top = _section(content, where, TOP)
-        steering, throttle = (
-            _section(top[name], f"{where}: {name}", SECTIONS[name]) for name in ("steering", "throttle")
+        steering, throttle, camera = (
+            _section(top.get(name, {}), f"{where}: {name}", known) for name, known in SECTIONS.items()
         )
-        camera = _section(top.get("camera", {}), f"{where}: camera", SECTIONS["camera"])
         # In files that do not say it, +1 is what they call left; of the recorded car they did not know it (below).
         positive = steering.get("positive", "left")
         ends_us = steering["right_us"], steering["neutral_us"], steering["left_us"]
@@ -190,9 +182,8 @@ class Car:
         given = {
             "name": top.get("name", "no name"),
             "cap_us": throttle.get("cap_us", min(round(CAP * forward_us), CAP_MAX_US)),
-            "human": top.get("human", HUMANS[0]),
+            **{key: top[key] for key in ("wheelbase_m", "human") if key in top},
             **camera,
-            **{key: top[key] for key in ("wheelbase_m",) if key in top},
         }
         pulses_us = throttle.get("reverse_us"), throttle["neutral_us"], throttle["forward_us"]
         try:
@@ -213,9 +204,7 @@ class Car:
 
 _US, _NUMBER = whole(0, 65535, " microseconds"), Rule(is_number, "a number")
 _MAPPING = Rule(lambda value: isinstance(value, Mapping), "a mapping")
-_NAME = Rule(
-    lambda value: isinstance(value, str) and 0 < len(value) <= 60 and value.isprintable(), "1 to 60 characters"
-)
+_NAME = Rule(lambda v: isinstance(v, str) and 0 < len(v) <= 60 and v.isprintable(), "1 to 60 characters")
 # What each section of a car.yml must have, and what it may have
 TOP = (
     {"steering": _MAPPING, "throttle": _MAPPING},
@@ -250,24 +239,17 @@ def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) 
     low_us, neutral_us, high_us = pulses_us
     upwards = high_us > neutral_us
     if high_us == neutral_us or (low_us is not None and (low_us == neutral_us or (low_us < neutral_us) != upwards)):
-        raise CarError(
-            f"{name}'s neutral_us must lie between its two ends",
-            found=f"{low_us}, {neutral_us} and {high_us}",
-            remedy="measure them with `rover calibrate`",
-        )
+        found = f"{low_us}, {neutral_us} and {high_us}"
+        what = f"{name}'s neutral_us must lie between its two ends"
+        raise CarError(what, found=found, remedy="measure them with `rover calibrate`")
     longest = max(neutral_us, high_us, low_us or 0)
     if longest >= period_us:
         raise CarError(f"{name}'s period_us must be longer than its pulses", found=f"{period_us} and {longest}")
-    return Channel(
-        name,
-        period_us,
-        neutral_us / period_us * 100,
-        (high_us - neutral_us) / period_us * 100,
-        0.0 if low_us is None else -1.0,
-        1.0,
-        None if low_us is None else (neutral_us - low_us) / period_us * 100,
-        by_pulse=True,
-    )
+    neutral_pct, high_pct = neutral_us / period_us * 100, (high_us - neutral_us) / period_us * 100
+    if low_us is None:
+        return Channel(name, period_us, neutral_pct, high_pct, 0.0, 1.0, by_pulse=True)
+    low_pct = (neutral_us - low_us) / period_us * 100
+    return Channel(name, period_us, neutral_pct, high_pct, -1.0, 1.0, low_pct, by_pulse=True)
 
 
 _DEFAULT_CAR = Car()
@@ -310,6 +292,5 @@ def yaml_of(car: Car) -> str:
     """The text of a car.yml that describes it."""
     import yaml
 
-    return "# The car, as `rover calibrate` found it; docs/build.md says what each is. Pulses in microseconds.\n" + (
-        yaml.safe_dump(car.description(), sort_keys=False)
-    )
+    head = "# The car, as `rover calibrate` found it; docs/build.md says what each is. Pulses in microseconds.\n"
+    return head + yaml.safe_dump(car.description(), sort_keys=False)

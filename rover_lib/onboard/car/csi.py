@@ -5,6 +5,7 @@ then an empty one. (rpicam-apps: output/output.cpp, and encoder/mjpeg_encoder.cp
 picture has the nth time stamp. SensorTimestamp is in nanoseconds since boot, of the first row's exposure.
 """
 
+import contextlib
 import os
 import re
 import select
@@ -37,9 +38,8 @@ def command(source: str, size: tuple[int, int], rate_hz: float, metadata: str) -
     found = SOURCE.fullmatch(source)
     given = dict(setting.split("=") for setting in (found[2] if found else "").split(",")[1:])
     if not found or set(given) - set(SETTINGS):
-        raise CameraError(
-            f"{source}: not understood", remedy=f"csi, csi:1, or csi,NAME=VALUE with {', '.join(SETTINGS)}"
-        )
+        remedy = f"csi, csi:1, or csi,NAME=VALUE with {', '.join(SETTINGS)}"
+        raise CameraError(f"{source}: not understood", remedy=remedy)
     options: dict[str, object] = {"camera": found[1] or 0, "width": size[0], "height": size[1], "framerate": rate_hz}
     options |= {"timeout": 0, "codec": "mjpeg", "quality": QUALITY, "output": "-", "verbose": 0}
     options |= {"metadata": metadata, "metadata-format": "txt", **DEFAULTS, **given}
@@ -51,35 +51,24 @@ def read_csi(
 ) -> Generator[tuple[bytes, float | None], None, None]:
     """Yield the newest JPEG and its time stamp (s). Raises CameraError without the program, or once it ends."""
     reading, writing = os.pipe()
-    process = None
-    with tempfile.TemporaryFile() as errors:
+    with tempfile.TemporaryFile() as errors, contextlib.ExitStack() as leaving:
+        leaving.callback(os.close, reading)
+        leaving.callback(os.close, writing)
+        line = command(source, size, rate_hz, f"/proc/self/fd/{writing}")
+        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": errors}
         try:
-            line = command(source, size, rate_hz, f"/proc/self/fd/{writing}")
-            try:
-                process = subprocess.Popen(
-                    line, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, pass_fds=[writing]
-                )
-            except OSError as error:
-                remedy = "sudo apt-get install rpicam-apps-lite, on Raspberry Pi OS; is the cable in?"
-                raise CameraError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy=remedy) from None
-            assert process.stdout
-            yield from _pairs(process.stdout.fileno(), reading, closing)
-            if not closing.is_set():
-                code = process.wait(END_S)
-                errors.seek(0)
-                said = errors.read()[-200:].decode(errors="replace").split("\n")
-                why = next((text for text in reversed(said) if text.strip()), f"its status is {code}").strip()
-                raise CameraError(
-                    f"{source}: {PROGRAM} has ended: {why}", remedy="`rpicam-hello --list-cameras` shows what is there"
-                )
-        finally:
-            os.close(reading)
-            os.close(writing)
-            if process:
-                process.kill()
-                process.wait()
-                if process.stdout:
-                    process.stdout.close()
+            process = leaving.enter_context(subprocess.Popen(line, pass_fds=[writing], **pipes))
+        except OSError as error:
+            remedy = "sudo apt-get install rpicam-apps-lite, on Raspberry Pi OS; is the cable in?"
+            raise CameraError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy=remedy) from None
+        leaving.callback(process.kill)
+        yield from _pairs(process.stdout.fileno(), reading, closing)
+        if not closing.is_set():
+            code = process.wait(END_S)
+            errors.seek(0)
+            said = errors.read()[-200:].decode(errors="replace").strip().split("\n")[-1] or f"its status is {code}"
+            remedy = "`rpicam-hello --list-cameras` shows what is there"
+            raise CameraError(f"{source}: {PROGRAM} has ended: {said}", remedy=remedy)
 
 
 def _pairs(pictures: int, entries: int, closing: threading.Event) -> Generator[tuple[bytes, float | None], None, None]:
@@ -109,9 +98,9 @@ def _pairs(pictures: int, entries: int, closing: threading.Event) -> Generator[t
 
 
 def newest_jpeg(pending: bytearray) -> tuple[bytes, int]:
-    """Cut the whole JPEGs from a stream's bytes. Return the last one, b"" if there is none, and how many had begun.
+    """Cut the JPEGs from a stream's bytes. Return the last whole one, or b"", and how many had begun, the cut included.
 
-    One that was cut counts too. Raises CameraError if there is no JPEG's end in many bytes.
+    Raises CameraError if there is no JPEG's end in many bytes.
     """
     jpeg, begun = b"", 0
     while (end := pending.find(END)) >= 0:

@@ -9,7 +9,6 @@ same, so a gamepad without sensors is as silent in a still hand as one whose bat
 The kernel's devices are read directly: PyPI's evdev is compiled where it is installed, and a rover has no compiler.
 """
 
-import array
 import contextlib
 import fcntl
 import logging
@@ -33,15 +32,12 @@ OPEN_S = 1.0  # for its first events
 
 _log = logging.getLogger(__name__)
 
-
 ReadStick = Callable[[int, int], tuple[int, int, int]]  # of a file descriptor and an axis: its value, least and most
 
 
 def read_stick(fd: int, axis: int) -> tuple[int, int, int]:
     """Return an axis's present value and the ends of its range, from the kernel. Raises OSError."""
-    numbers = array.array("i", bytes(24))  # value, minimum, maximum, fuzz, flat, resolution
-    fcntl.ioctl(fd, EVIOCGABS + axis, numbers)
-    value, low, high = numbers[:3]
+    value, low, high, *_ = struct.unpack("6i", fcntl.ioctl(fd, EVIOCGABS + axis, bytes(24)))
     if low >= high:
         raise OSError(22, f"its axis {axis} goes from {low} to {high}")
     return value, low, high
@@ -68,16 +64,16 @@ class Gamepad:
         self._held = False
         self._lost = False  # the kernel dropped events: what it sends up to the next report is a part only
         self._heard_s = float("-inf")
-        self._rest = {pad: b"", motion: b""}
+        self._open = {pad, motion}
         self.gone = ""  # why it can be read no more
         self._ask()
 
     def close(self) -> None:
         """Close both devices; again, it does nothing."""
         self.gone = self.gone or "it was closed"
-        while self._rest:
+        while self._open:
             with contextlib.suppress(OSError):
-                os.close(self._rest.popitem()[0])
+                os.close(self._open.pop())
 
     def sticks(self, now_s: float | None = None) -> tuple[float, float] | None:
         """Return (steering, throttle) as they are now, each in [-1, 1], right and forward positive.
@@ -89,8 +85,8 @@ class Gamepad:
         if self.gone:  # others may have the numbers of its files by now
             return None
         try:
-            for fd in (self._motion, self._pad):
-                self._take_all(fd, now_s)
+            self._take_all(self._motion, now_s)
+            self._take_all(self._pad, now_s)
         except OSError as error:
             _log.warning("the gamepad %s is gone (%s): the car is nobody's", self.name, error.strerror)
             self.gone = str(error.strerror)
@@ -107,8 +103,8 @@ class Gamepad:
 
     def _ask(self) -> None:
         for axis in AXES:
-            value, *ends = self._read_stick(self._pad, axis)
-            self._ranges[axis] = ends[0], ends[1]
+            value, low, high = self._read_stick(self._pad, axis)
+            self._ranges[axis] = low, high
             self._values[axis] = deflection(value, *self._ranges[axis])
 
     def _take_all(self, fd: int, now_s: float) -> None:
@@ -119,10 +115,7 @@ class Gamepad:
                 return
             if not data:
                 raise OSError(19, "no such device")
-            data = self._rest[fd] + data
-            whole = len(data) - len(data) % EVENT.size
-            self._rest[fd] = data[whole:]
-            for seconds, us, kind, code, value in EVENT.iter_unpack(data[:whole]):
+            for seconds, us, kind, code, value in EVENT.iter_unpack(data):  # the kernel gives whole ones
                 at_s = seconds + us / 1e6
                 self._heard_s = max(self._heard_s, min(at_s, now_s))
                 if fd == self._pad:
@@ -170,10 +163,8 @@ class Found:
         except OSError as error:
             for fd in fds:
                 os.close(fd)
-            raise CarError(
-                f"the gamepad {self} cannot be read ({error.strerror})",
-                remedy="is this user in group input? sudo usermod -aG input $USER, and log in again",
-            ) from error
+            remedy = "is this user in group input? sudo usermod -aG input $USER, and log in again"
+            raise CarError(f"the gamepad {self} cannot be read ({error.strerror})", remedy=remedy) from error
 
 
 def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/input")) -> list[Found]:
@@ -211,12 +202,9 @@ def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: G
     found = (list_them or list_gamepads)()
     usable = [pad for pad in found if pad.motion and (not again or pad.identity == again.identity)]
     if len(usable) != 1:
-        connect = f"{again.name} again" if again else "a DualShock 4, DualSense or Switch Pro Controller"
-        raise CarError(
-            "which gamepad is the human's?" if usable else "no gamepad that can be used is connected",
-            found=", ".join(map(str, found)) or "none in /dev/input",
-            remedy="connect only one" if usable else f"connect {connect}",
-        )
+        wanted = f"{again.name} again" if again else "one DualShock 4, DualSense or Switch Pro Controller"
+        listed = ", ".join(map(str, found)) or "none in /dev/input"
+        raise CarError("not one usable gamepad is connected", found=listed, remedy=f"connect {wanted}")
     gamepad = usable[0].open()
     end_s = time.monotonic() + OPEN_S
     while not again and gamepad.silent_s > ALIVE_S:

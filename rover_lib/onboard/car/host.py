@@ -1,14 +1,12 @@
 """The machine's own state: temperature, clock, throttling, memory. A value that it does not report is None, not 0.
 
-The values are read from /proc and /sys. psutil would be a compiled package to pin and hash on every rover, and it knows
-neither a process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
+psutil knows neither a process's peak memory on Linux nor what a Raspberry Pi's firmware throttles.
 """
 
 import errno
 import os
 import re
 import resource
-import shutil
 import socket
 import subprocess
 import sys
@@ -51,25 +49,15 @@ class Host:
         return min((khz / 1000 for f in files if (khz := _number_in(f)) is not None), default=None)
 
     def throttled(self) -> str | None:
-        """Return what `vcgencmd get_throttled` reports on a Raspberry Pi, such as "0x0"; None elsewhere."""
-        return self._get_throttled()[0]
-
-    def vcgencmd_trouble(self) -> str | None:
-        """Return why `vcgencmd` gives no value although it is there, such as "VCHI initialization failed", or None."""
-        return self._get_throttled()[1]
-
-    def _get_throttled(self) -> tuple[str | None, str | None]:
-        if shutil.which(self.vcgencmd) is None:
-            return None, None
+        """Return what `vcgencmd get_throttled` reports, such as "0x0"; None elsewhere than on a Raspberry Pi, or if it
+        fails.
+        """
         try:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
-        except (OSError, subprocess.SubprocessError) as error:
-            return None, f"{self.vcgencmd}: {type(error).__name__}"
+        except (OSError, subprocess.SubprocessError):
+            return None
         name, _, value = found.stdout.strip().partition("=")
-        if found.returncode == 0 and name == "throttled" and THROTTLED_VALUE.fullmatch(value):
-            return value, None
-        said = ascii(" ".join((found.stderr + found.stdout).split()))[1:-1][:160]
-        return None, f"{self.vcgencmd} ended with {found.returncode}: {said or 'no word'}"
+        return value if name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""

@@ -5,9 +5,7 @@
     same = (block_sums(image) == block_sums(before)).mean()
 
 OpenCV and Pillow decode a JPEG that was cut short and closed with an end marker, and only print a warning. simplejpeg
-reports the warning to its caller. It uses libjpeg-turbo too, is as fast (0.98 ms for 640x360, OpenCV 1.05), gives the
-same bits, and lets other threads run meanwhile. It reports one warning only: a picture with filler before its markers
-takes 1.3 ms with 22 restart intervals, 4.7 with 229.
+reports the first warning, is as fast, and gives the same bits.
 """
 
 import math

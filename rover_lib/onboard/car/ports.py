@@ -25,8 +25,6 @@ def find_port(dev: Path = Path("/dev")) -> str:
     if len(ports) == 1:
         return str(next(iter(ports)))
     found = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
-    raise RoverError(
-        "which serial port is the Arduino's?" if ports else "no Arduino is plugged in",
-        found=found or "no /dev/ttyACM* and no /dev/ttyUSB*",
-        remedy=f"say it: --port {next(iter(ports))}" if ports else "plug it in; dmesg | tail says what the kernel saw",
-    )
+    if not ports:
+        raise RoverError("no Arduino is plugged in", remedy="plug it in; dmesg | tail says what the kernel saw")
+    raise RoverError("which port is the Arduino's?", found=found, remedy=f"say it: --port {next(iter(ports))}")

@@ -72,12 +72,11 @@ class Hello:
 class Telemetry:
     """One status of the Arduino. Pulses and periods are whole microseconds; None means "no pulse", and 0 never does.
 
-    host_s: when the whole line had arrived here, by time.monotonic() (or the link's clock). uptime_ms: the Arduino's
-    clock, which wraps at 2^32. sequence: of the last command that it accepted as new. result: what became of the last
-    command, a key of RESULTS. missing: what arming lacks, a key of MISSING. steering_us, throttle_us: the pulses on its
-    pins. cap_us: the pulse of the most throttle that the host gets; with reverse, as far to the other side.
-    receiver_*: the transmitter's pulses. The last four are counters, which stop at 65535: lines that were no command;
-    replayed or late commands, and those for another start; pulses out of range; bytes lost.
+    host_s: when it arrived here, by the link's clock. uptime_ms: the Arduino's clock, which wraps at 2^32. sequence: of
+    the last command that it accepted as new; result: what became of the last command, a key of RESULTS. missing: what
+    arming lacks, a key of MISSING. steering_us, throttle_us: on its pins. cap_us: the pulse of the most throttle that
+    the host gets; with reverse, as far to the other side. receiver_*: the transmitter's. The last four are counters,
+    which stop at 65535; old_commands: replayed or late ones, and those for another start.
     """
 
     host_s: float
@@ -133,10 +132,7 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
     body, star, crc = line.rpartition(b"*")
     if not star or crc != b"%08X" % zlib.crc32(body):
         return None
-    try:
-        text = body.decode("ascii")
-    except UnicodeDecodeError:
-        return None
+    text = body.decode("ascii", "replace")
     if found := _HELLO.fullmatch(text):
         protocol, firmware, boot, sequence, reset, car = found.groups()
         if int(protocol) == PROTOCOL_VERSION and boot is None:

@@ -49,16 +49,13 @@ class Channel:
             _finite(getattr(self, key), f"{self.name} {key}")
         below = _finite(self._span_pct(-1.0), f"{self.name} below_pct")
         if self.period_us <= 0 or self.span_pct * below <= 0 or not self.low <= 0 <= self.high or self.low == self.high:
-            raise CarError(
-                f"{self.name}: period {self.period_us} us, span {self.span_pct} and {below} %, range "
-                f"{self.low} to {self.high} is no servo channel",
-                remedy="the period must be above 0, and both spans other than 0 and of one sign",
-            )
+            found = f"{self.period_us} us, {self.span_pct} and {below} %, {self.low} to {self.high}"
+            what = f"{self.name} must have a period above 0, spans of one sign, and a range that includes 0"
+            raise CarError(what, found=found)
         ends = sorted(self._duty_pct(action) for action in (self.low, self.high))
         if ends[0] <= 0 or ends[1] >= 100:
-            raise CarError(
-                f"{self.name}: its ends must be within a period", found=f"{ends[0]:.2f} % and {ends[1]:.2f} %"
-            )
+            found = f"{ends[0]:.2f} % and {ends[1]:.2f} %"
+            raise CarError(f"{self.name}: its ends must be within a period", found=found)
 
     def _span_pct(self, action: float) -> float:
         return self.span_pct if action >= 0 or self.below_pct is None else self.below_pct
@@ -90,12 +87,11 @@ class Channel:
         return round(self._duty_pct(action) / 100 * self.period_us)
 
     def action(self, pulse_us: float, period_us: float | None = None) -> float | None:
-        """Return the action that a pulse stands for, in [low, high], or None (not 0) if no pulse was measured.
+        """Return the action that a pulse stands for, clipped to [low, high], or None (not 0) if no pulse was measured.
 
         period_us: the measured period; None: the nominal one. A pulse was measured if it is shorter than its period,
-        and that within 25 % of the nominal one: neither 0 nor two periods taken for one. An action beyond an end is
-        clipped to it, as the firmware does (a throttle pulse below 120 us gives 0, "stopped"). Raises CarError for a
-        pulse that is None, and for strings, NaN and infinities.
+        and that within 25 % of the nominal one: neither 0 nor two periods taken for one. Raises CarError for a pulse
+        that is None, and for strings, NaN and infinities.
         """
         pulse_us = _finite(pulse_us, f"{self.name} pulse")
         period_us = _finite(self.period_us if period_us is None else period_us, f"{self.name} period")
@@ -108,10 +104,7 @@ class Channel:
         return min(max(action, self.low), self.high)
 
     def moves(self, pulse_us: float) -> bool:
-        """Return whether a throttle pulse moves the car.
-
-        Neutral does not, nor does a pulse within ARDUINO_STEP_US of it: an Arduino may have measured neutral so.
-        """
+        """Return whether a throttle pulse moves the car: an Arduino measures neutral within ARDUINO_STEP_US."""
         away_us = (pulse_us - self.neutral_us) * math.copysign(1, self.span_pct)
         return away_us > ARDUINO_STEP_US or (self.low < 0 and away_us < -ARDUINO_STEP_US)
 
@@ -147,14 +140,11 @@ class PwmCalibration:
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:
-        """Return the pulses for steering in [-1, 1] and throttle in [0, 1], or from -1 on a car with reverse.
-
-        Raises CarError for anything else.
-        """
+        """Return the pulses for steering in [-1, 1] and throttle in [0, 1] (reverse: -1). Otherwise raises CarError."""
         return Pulses(self.steering.pulse_us(steering), self.throttle.pulse_us(throttle))
 
     def neutral(self) -> Pulses:
-        """Return the pulses for "straight and stopped": 1456 us and 120 us on the user's car."""
+        """Return the pulses for "straight and stopped"."""
         return self.pulses(*NEUTRAL)
 
     def actions_from_pulses(
@@ -164,14 +154,7 @@ class PwmCalibration:
         steering_period_us: float | None = None,
         throttle_period_us: float | None = None,
     ) -> Actions:
-        """Return the actions that two measured pulses stand for. A period that is None stands for the nominal one.
-
-        Otherwise as Channel.action().
-        """
+        """Return the actions that two measured pulses stand for, as Channel.action() does."""
         return Actions(
             self.steering.action(steering_us, steering_period_us), self.throttle.action(throttle_us, throttle_period_us)
         )
-
-    def us_per_unit(self, action_name: str) -> float:
-        """Return the microseconds of pulse per unit of an action."""
-        return self.channel(action_name).us_per_unit

@@ -39,7 +39,7 @@ from rover_lib.onboard.car.protocol import (
 from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.errors import CarError, RoverError
 
-FIRMWARE_VERSION = "4.1.1"  # open() accepts no other; firmware/rover/protocol.h has the same
+FIRMWARE_VERSION = "4.2.0"  # open() accepts no other; firmware/rover/protocol.h has the same
 BAUD = 115200
 BOOT_S = 4.0  # a boot loader starts the sketch after 1 to 2 s
 SILENT_S = 0.3  # nothing may be sent before: while an Arduino resets, its boot loader listens
@@ -86,37 +86,33 @@ class ServoLink:
             while ...:
                 link.send_action(steering, throttle)  # at least every 150 ms
 
-    Any thread may call any method. Nothing is reconnected: when the port fails, each call raises LinkError, the Arduino
-    stops by itself, and the caller may open a new link. With a car whose human has a gamepad, the thread that reads the
-    statuses answers them with its sticks. If the Arduino resets itself, the link goes on with the number of its new
-    start, but the Arduino ignores drive commands until arm().
+    Any thread may call any method. When the port fails, each call raises LinkError, and the Arduino stops by itself.
+    With a car whose human has a gamepad, the thread that reads the statuses answers them with its sticks. If the
+    Arduino resets itself, the link goes on, but the Arduino ignores drive commands until arm().
     """
 
     def __init__(
         self, port: str, *, car: Car | None = None, boot_s: float = BOOT_S, clock: Callable[[], float] = time.monotonic
     ):
         """port: "" means the only Arduino's. car: None means this machine's. Raises RoverError if either is unclear."""
+        self.port, self.car = port or find_port(), car or this_car()
+        self.calibration = self.car.pwm
+        self.boot_s, self._clock = boot_s, clock
         self._gamepad: Gamepad | None = None
         self._relayed_s = 0.0
-        self.port = port or find_port()
-        self.car = car or this_car()
-        self.calibration = self.car.pwm
         self._told_boot: int | None = None  # the start in which the Arduino learned of the car
-        self.boot_s = boot_s
-        self._clock = clock
         self._serial: serial.Serial | None = None
         self._reader: threading.Thread | None = None
         self._closing = threading.Event()
         self._heard = threading.Condition()  # guards the six below
-        self._hello: Hello | None = None
+        self.hello: Hello | None = None  # the newest
+        self.turned: Telemetry | None = None  # the status with which the present state or start of the Arduino began
         self._telemetry: Telemetry | None = None
-        self._turned: Telemetry | None = None
         self._requested: Telemetry | None = None  # the newest status when somebody asked to arm the car
         self._failure: LinkError | None = None
         self._unanswered: deque[tuple[int, float]] = deque(maxlen=256)  # number of a command, and when it was sent
         self._sending = threading.RLock()  # guards the two below, and keeps lines whole; never taken inside _heard
-        self._boot = 0
-        self._sequence = 0
+        self._boot = self._sequence = 0
         self._asked = 0.0
         self.garbled = 0  # lines of the Arduino that were dropped
 
@@ -131,8 +127,8 @@ class ServoLink:
         """Open the port for this program alone, wait for the hello and a first status, and tell the Arduino of the car.
 
         The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it.
-        Raises LinkError if the port cannot be opened, if nothing there says hello within `boot_s` seconds, and for
-        another firmware, or one that refuses this car. Raises CarError as open_gamepad() does.
+        Raises LinkError for a port that cannot be opened, no hello within `boot_s` seconds, another firmware, or one
+        that refuses this car. Raises CarError as open_gamepad() does.
         """
         try:
             self._serial = serial.Serial(self.port, BAUD, timeout=READ_TIMEOUT_S, exclusive=True)
@@ -140,14 +136,12 @@ class ServoLink:
             self._serial.reset_input_buffer()  # drop what came earlier
         except (*PORT_ERRORS, ValueError) as error:
             self._release()
-            raise LinkError(
-                f"{self.port}: cannot be opened ({error})",
-                remedy="is it plugged in, is the user in group dialout, and does no other program have the port?",
-            ) from error
+            remedy = "is it plugged in, is the user in group dialout, and does no other program have the port?"
+            raise LinkError(f"{self.port}: cannot be opened ({error})", remedy=remedy) from error
         self._closing.clear()
         self._gamepad = None
         with self._heard:
-            self._hello = self._telemetry = self._turned = self._requested = self._failure = None
+            self.hello = self._telemetry = self.turned = self._requested = self._failure = None
             self._unanswered.clear()
         self._reader = threading.Thread(target=self._read, args=(self._serial,), name="servo link", daemon=True)
         self._reader.start()
@@ -162,18 +156,12 @@ class ServoLink:
             raise
 
     def _wait_for_hello(self) -> Hello:
-        opened = self._clock()
-        self._asked = opened
-        while True:
-            hello = self._await(lambda: self._hello, REPEAT_S)
-            if hello:
-                break
+        self._asked = opened = self._clock()
+        while not (hello := self._await(lambda: self.hello, REPEAT_S)):
             now, running = self._clock(), self._telemetry
             if now - opened > self.boot_s:
-                raise LinkError(
-                    f"{self.port}: no hello from an Arduino within {self.boot_s:g} s",
-                    remedy=f"is it the rover's, and is the firmware on it (make flash PORT={self.port})?",
-                )
+                remedy = f"is it the rover's, and is the firmware on it (make flash PORT={self.port})?"
+                raise LinkError(f"{self.port}: no hello from an Arduino within {self.boot_s:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
@@ -183,11 +171,9 @@ class ServoLink:
         if self.car.human == "gamepad":
             build, make = f"{build}-gamepad", f"{make} HUMAN=gamepad"
         if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, build):
-            raise LinkError(
-                f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})",
-                found=f"{hello.firmware} (protocol {hello.protocol})",
-                remedy=f"put the matching firmware on it: {make} PORT={self.port}",
-            )
+            what = f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})"
+            found = f"{hello.firmware} (protocol {hello.protocol})"
+            raise LinkError(what, found=found, remedy=f"put the matching firmware on it: {make} PORT={self.port}")
         if not self._await(lambda: self._telemetry, STALE_S):
             raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
@@ -216,8 +202,8 @@ class ServoLink:
                 self._told_boot = telemetry.boot
                 return
             if telemetry.result in "rt":
-                remedy = MISSING["t"] if telemetry.result == "t" else "measure it with `rover calibrate`"
-                raise LinkError(f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml", remedy=remedy)
+                what = f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml ({RESULTS[telemetry.result]})"
+                raise LinkError(what, remedy="let go of the throttle stick, or measure the car with `rover calibrate`")
         raise self._no_answer("being told of the car")
 
     def close(self) -> None:
@@ -239,12 +225,13 @@ class ServoLink:
                 port.cancel_read()
             if self._reader and self._reader is not threading.current_thread():
                 self._reader.join(1.0)
-            with contextlib.suppress(*PORT_ERRORS):
-                port.reset_output_buffer()  # or the kernel would wait up to 30 s for a line that is stuck
-            with contextlib.suppress(*PORT_ERRORS):
-                fcntl.ioctl(port.fileno(), termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
-            with contextlib.suppress(*PORT_ERRORS):
-                port.close()
+            for leave in (
+                port.reset_output_buffer,  # or the kernel would wait up to 30 s for a line that is stuck
+                lambda: fcntl.ioctl(port.fileno(), termios.TIOCNXCL),  # a pseudo-terminal would stay exclusive
+                port.close,
+            ):
+                with contextlib.suppress(*PORT_ERRORS):
+                    leave()
         self._reader = None
         if self._gamepad:
             self._gamepad.close()
@@ -272,8 +259,7 @@ class ServoLink:
             if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
                 continue  # it has just started, and cannot have seen the signals yet
             if telemetry.result in "cestw":
-                start = telemetry.result in "ce"
-                remedy = "start again" if start else f"{self.remedy(telemetry.result)}, then try again"
+                remedy = self.remedy(telemetry.result) if telemetry.result in MISSING else "ask again"
                 raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy=remedy)
         raise self._no_answer("arming")
 
@@ -305,16 +291,14 @@ class ServoLink:
     def lower_cap(self, throttle_us: int) -> Telemetry:
         """Lower the host's throttle limit until the Arduino's next reset. Return the status that confirms it.
 
-        With reverse, the same distance from neutral limits it there. Raises LinkError for a pulse out of range, while
-        the car is armed, or without an answer within 0.5 s.
+        With reverse, the same distance from neutral limits it there. Raises LinkError for a pulse out of range, and
+        without an answer within 0.5 s: the cap is not changed while the car drives.
         """
         most_us = self._whole(self.calibration.throttle, throttle_us)
         neutral_us = self.calibration.throttle.neutral_us
         for telemetry in self._ask(">L", most_us):
             if telemetry.cap_us - neutral_us <= abs(most_us - neutral_us):
                 return telemetry
-            if telemetry.state is State.AUTONOMOUS:
-                raise LinkError(f"{self.port}: the throttle's cap is not changed while the car drives")
         raise self._no_answer("the throttle's cap")
 
     def _ask(self, kind: str, *values: int) -> Iterator[Telemetry]:
@@ -324,8 +308,7 @@ class ServoLink:
         while self._clock() < end:
             number = self._send(kind, *values)
             first = number if first is None else first
-            until = self._clock() + REPEAT_S
-            seen = None
+            until, seen = self._clock() + REPEAT_S, None
             while (left := until - self._clock()) > 0:
                 self._await(lambda: self._telemetry is not seen, left)  # noqa: B023
                 seen = self._telemetry
@@ -347,11 +330,8 @@ class ServoLink:
         low, high = channel.ends_us
         whole_us = int(pulse_us) if isinstance(pulse_us, Integral) and not isinstance(pulse_us, bool) else None
         if whole_us is None or not low <= whole_us <= high:
-            raise LinkError(
-                f"{channel.name} pulse must be whole microseconds from {low} to {high}",
-                found=repr(pulse_us),
-                remedy="it was not sent",
-            )
+            what = f"{channel.name} pulse must be whole microseconds from {low} to {high}"
+            raise LinkError(what, found=repr(pulse_us), remedy="it was not sent")
         return whole_us
 
     def send_action(self, steering: float, throttle: float) -> int:
@@ -371,15 +351,10 @@ class ServoLink:
             raise LinkError(f"{self.port}: the Arduino said nothing for {age:.1f} s", remedy="is it still plugged in?")
         return telemetry
 
-    @property
-    def turned(self) -> Telemetry | None:
-        """The status with which the present state or start of the Arduino began; None before the first status."""
-        return self._turned
-
     def unacknowledged_s(self, now_s: float) -> float:
-        """Return the age in seconds of the oldest command that the Arduino has not acknowledged; 0 if there is none.
+        """Return the age in seconds, by the link's clock, of the oldest command without an answer; 0 if there is none.
 
-        now_s: by the link's clock. Above LATE_S, stop the car: it obeys commands from the past.
+        Above LATE_S, stop the car: it obeys commands from the past.
         """
         with self._heard:
             return now_s - self._unanswered[0][1] if self._unanswered else 0.0
@@ -388,14 +363,9 @@ class ServoLink:
         """Ask for a hello, and return the seconds until it came. Raises LinkError if none comes within 0.5 s."""
         before, start = self.hello, self._clock()
         self._write(frame(">Q"))
-        if not self._await(lambda: self._hello is not before, ANSWER_S):
+        if not self._await(lambda: self.hello is not before, ANSWER_S):
             raise self._no_answer("a question")
         return self._clock() - start
-
-    @property
-    def hello(self) -> Hello | None:
-        """The newest hello."""
-        return self._hello
 
     def _no_answer(self, what: str) -> LinkError:
         last = self._telemetry.why if self._telemetry else "none"
@@ -422,8 +392,7 @@ class ServoLink:
             raise LinkError(f"{self.port}: the link is closed")
         try:
             with self._sending:
-                # Not pyserial's write, which may wait for ever, or with a timeout report a line as failed that went
-                # out whole while this process waited for the processor. The port is non-blocking.
+                # Not pyserial's write, which may wait for ever, or report a line as failed that went out whole.
                 try:
                     taken = os.write(port.fileno(), line)
                 except BlockingIOError:
@@ -489,21 +458,21 @@ class ServoLink:
             return
         if isinstance(message, Hello):
             with self._sending:
-                if not self._hello or message.boot != self._boot:
+                if not self.hello or message.boot != self._boot:
                     self._boot, self._sequence = message.boot, message.sequence
-        elif self._hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
+        elif self.hello and message.boot != self._boot and now - self._asked > HELLO_EVERY_S:
             self._asked = now  # it was reset, and the hello of its new start was lost
             with contextlib.suppress(LinkError):
                 self._write(frame(">Q"))
         with self._heard:
             if isinstance(message, Hello):
-                if self._hello and message.boot != self._hello.boot:
+                if self.hello and message.boot != self.hello.boot:
                     self._unanswered.clear()
-                self._hello = message
+                self.hello = message
             else:
                 before, self._telemetry = self._telemetry, message
                 if not before or (before.boot, before.state) != (message.boot, message.state):
-                    self._turned = message
+                    self.turned = message
                 while self._unanswered and _reached(message, self._unanswered[0][0]):
                     self._unanswered.popleft()
             self._heard.notify_all()

@@ -26,8 +26,8 @@ def arm_when_ready(
 ) -> Telemetry | None:
     """Arm for a human in a terminal: say what is missing, wait for it, and then arm.
 
-    checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked
-    too long ago; None: they ask now. Raises RoverError when told to stop, and what checks and arm() raise.
+    checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked too long ago;
+    None: they ask now. Raises RoverError when told to stop.
     """
     still_wanted = still_wanted or wanted_since(boottime())
     link.request()
@@ -46,22 +46,17 @@ def arm_when_ready(
 
 
 def what_is_missing(link: ServoLink) -> str:
-    """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError as latest() does."""
+    """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError."""
     telemetry = link.latest()
     return link.remedy(telemetry.missing) if telemetry and telemetry.missing != "-" else ""
 
 
 def arm_capped(
-    link: ServoLink,
-    limit: float,
-    notify: Callable[[str], None],
-    still_wanted: Callable[[], object] = lambda: None,
+    link: ServoLink, limit: float, notify: Callable[[str], None], still_wanted: Callable[[], object] = lambda: None
 ) -> Telemetry:
-    """Arm a car, after the Arduino was told to limit the host's throttle to `limit`.
+    """Arm a car, after the Arduino was told to limit the host's throttle to `limit`, in [0, 1].
 
-    limit: the largest throttle that this drive may ask for, in [0, 1]; `notify` is told if the Arduino allows less.
-    still_wanted: raises if nobody wants the car armed any more. Raises what still_wanted raises, and LinkError as
-    lower_cap() and arm() do.
+    notify: told if the Arduino allows less. Raises what still_wanted raises, and LinkError.
     """
     channel = link.calibration.throttle
     directions = (limit, -limit) if channel.low < 0 else (limit,)
@@ -70,9 +65,7 @@ def arm_capped(
     span_us = abs(channel.pulse_us(limit) - channel.neutral_us)
     if cap_us - channel.neutral_us < span_us:
         cap = limit * (cap_us - channel.neutral_us) / span_us
-        notify(
-            f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), and this drive may ask for {limit:.2f}: what "
-            "is above is cut. A cap that another drive has lowered is back after a reset of the Arduino"
-        )
+        what = f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), this drive may ask for {limit:.2f}"
+        notify(f"{what}: what is above is cut; a reset of the Arduino raises a lowered cap")
     still_wanted()
     return link.arm()

@@ -6,7 +6,6 @@ drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev
 
 import contextlib
 import logging
-import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
@@ -36,9 +35,8 @@ def drive_car(
 ) -> None:
     """Drive as the options say, in this process's main thread. Raises as loop.drive() does.
 
-    report: filled during the drive, so that it is complete even after a fault. car: opens a car that is driven instead
-    of the one at the options' camera and port. As a service, this drives each time that a human arms the car, until it
-    is told to stop.
+    report: filled during the drive. car: opens a car that is driven instead of the one at the options' camera and port.
+    As a service, this drives each time that a human arms the car, until it is told to stop.
     """
     settings = Settings.of(params()["drive"], throttle_limit=options.throttle_limit)
     with ExitStack() as stack:
@@ -79,8 +77,7 @@ def drive_car(
         stack.enter_context(planner)
         session = Session(
             options, settings, report, log, feed, link, camera, planner, commanded,
-            rate_hz=policy.rate_hz, mode=policy.manifest["mode"], pids=(os.getpid(), *policy.pids), service=service,
-            terminal=sys.stdin.isatty(),
+            rate_hz=policy.rate_hz, mode=policy.manifest["mode"], service=service, terminal=sys.stdin.isatty(),
         )  # fmt: skip
         session.drive(stop)
         while service and not stop.is_set():

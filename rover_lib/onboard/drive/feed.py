@@ -4,9 +4,8 @@
     drive(..., until=Until(over=feed.over), hooks=Hooks(show=partial(feed.tick, report, camera, pilot)))
 
 The view is another process; on a rover, another user runs it. It listens at a Unix socket that transports whole
-messages, and the drive checks once a second whether a view listens there. Neither side waits for the other: a message
-is dropped while the previous one has not been read, and the next one is complete in itself. So a view that hangs,
-floods or dies costs a drive no more than a failed system call. All messages of the view but STOP are ignored.
+messages. Neither side waits for the other: a message is dropped while the previous one has not been read, so that a
+view that hangs, floods or dies costs a drive no more than a failed system call.
 
 A message is a line of JSON, followed by the camera's newest picture: a JPEG if the camera delivers JPEGs, otherwise
 every nth pixel of every nth row, (h, w, 3) uint8 BGR, whose size is the line's "shape".
@@ -20,14 +19,13 @@ import socket
 import struct
 import termios
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car.camera import Camera, Frame
+from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import REASONS, ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.onboard.drive.loop import Report
@@ -36,7 +34,6 @@ from rover_lib.onboard.errors import RoverError
 
 EVERY_S = 0.1  # between two messages
 AGAIN_S = 1.0  # between two checks whether a view listens
-TOLD_S = 5.0  # between two lines of the log, which a view that comes and goes must not fill
 LAST_S = 0.2  # for delivering the last message of a drive; the car has stopped by then
 ASKED_MOST = 8  # messages of the view that are read at a tick
 STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # with the address that asked
@@ -62,8 +59,7 @@ class Feed:
     ):
         self._place, self._log, self._title, self._clock, self._sleep = place, log, title, clock, sleep
         self._socket: socket.socket | None = None
-        self._look_s = self._due_s = self._tell_s = 0.0  # earliest times: look for a view, send, log a change
-        self._ticks: deque[tuple[float, float]] = deque(maxlen=100)  # when, and how late in milliseconds
+        self._look_s = self._due_s = 0.0  # earliest times: look for a view, send
 
     def close(self) -> None:
         """End the connection to the view."""
@@ -73,7 +69,6 @@ class Feed:
 
     def tick(self, report: Report, camera: Camera, pilot: PolicyPilot, tick: Tick) -> None:
         """Call this after each command that went out."""
-        self._ticks.append((tick.t_s, tick.late_ms))
         if self._due():
             pins = {"pins": [tick.pins_steering_us, tick.pins_throttle_us], "who": tick.state}
             message = {"tick": tick._asdict(), **pins, "why": REASONS.get(tick.reason, "")}
@@ -91,7 +86,6 @@ class Feed:
     def ended(self, report: Report, camera: Camera, link: ServoLink | None) -> None:
         """Call this once after a drive: it shows what the pins do now, and retries up to LAST_S if the view is busy."""
         end_s = self._clock() + LAST_S
-        self._ticks.clear()
         while self._connected() and not self._send(ENDED, report.ended, report, camera, self._pins(link)):
             if self._clock() > end_s:
                 return
@@ -99,16 +93,17 @@ class Feed:
 
     def over(self) -> str | None:
         """Why this drive must end; None if nobody asked for a stop. The loop calls this at each tick."""
-        for _ in range(ASKED_MOST if self._socket else 0):
+        for _ in range(ASKED_MOST):
             try:
-                asked = self._socket.recv(64) if self._socket else b""
+                asked = self._socket.recv(64) if self._socket else None
             except BlockingIOError:
-                break
+                return None
             except OSError:
                 asked = b""
-            if not asked:  # an empty message: the other end has closed the socket
-                self._lost("the view is gone")
-                break
+            if not asked:
+                if self._socket:  # an empty message: the other end has closed it
+                    self._lost("the view is gone")
+                return None
             if stop := STOP.fullmatch(asked):
                 return f"stopped from the view ({stop[1].decode()})"
         return None
@@ -137,9 +132,7 @@ class Feed:
 
     def _lost(self, why: str) -> None:
         self.close()
-        if self._clock() >= self._tell_s:
-            self._tell_s = self._clock() + TOLD_S
-            self._log.event(why)
+        self._log.event(why)
 
     def _pins(self, link: ServoLink | None) -> dict[str, Any]:
         with contextlib.suppress(RoverError):  # whoever needs the link reports that it is gone
@@ -151,17 +144,12 @@ class Feed:
 
     def _send(self, phase: str, text: str, report: Report, camera: Camera, message: dict[str, Any]) -> bool:
         """Send a message with the camera's newest picture; return whether it was sent."""
-        since_s = self._ticks[-1][0] - self._ticks[0][0] if self._ticks else 0.0
         try:
             shown, picture = self._picture(camera)
             events = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
-            rate = {
-                "hz": (len(self._ticks) - 1) / since_s if since_s > 0 else None,
-                "late_most_ms": max((late_ms for _, late_ms in self._ticks), default=None),
-            }
             about = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
             state = {"missed": report.missed, "machine": self._log.machine, "events": events}
-            line = about | state | rate | message | shown
+            line = about | state | message | shown
             return self._put(json.dumps(line).encode() + b"\n", picture)
         except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")
@@ -169,9 +157,10 @@ class Feed:
             return False
 
     def _picture(self, camera: Camera) -> tuple[dict[str, Any], bytes]:
-        frame: Frame | None = None
-        with contextlib.suppress(RoverError):  # whoever needs the camera reports that it is gone
+        try:
             frame = camera.latest()
+        except RoverError:  # whoever needs the camera reports that it is gone
+            frame = None
         if frame is None:
             return {}, b""
         height, width = frame.image.shape[:2]

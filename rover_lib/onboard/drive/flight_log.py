@@ -6,10 +6,7 @@
     flight = read_log(path)
 
 Each file begins with a header, which names the columns of the ticks. A tick is an array of values, null if unknown;
-all else are objects. A line that a power cut or a full disk has cut short is skipped by the reader.
-
-`tick` and `event` only put a row into a bounded queue; one thread reads the machine's state, writes the file and syncs
-it. Events also go to `logging` (logger "rover"), whose handler must not wait: status_line.py has one.
+all else are objects. The reader skips a line that a power cut or a full disk has cut short.
 """
 
 import contextlib
@@ -24,7 +21,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from io import FileIO
 from pathlib import Path
@@ -50,7 +47,6 @@ EVENT_CHARACTERS = 800
 RECENT = 8
 ARMED = "armed"  # the loop's event with which a drive begins
 NAME_A_LOG = "name a file that rover drive wrote"
-MISSING = "ticks are missing before this one"
 
 _log = logging.getLogger("rover")
 
@@ -90,7 +86,7 @@ class Event(NamedTuple):
 
 
 def log_limits() -> tuple[int, int]:
-    """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError if they are not a size and a count."""
+    """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError."""
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
     if not is_number(max_mb, 0.02, FILE_BYTES / 1e6) or not is_whole(keep, 0):
@@ -103,10 +99,9 @@ class FlightLog:
     """The flight log of one drive. It is written inside its context, in which no other drive can write that file.
 
     path: the file, to which the drive is appended. header: what the drive was started with; figures need hz, fade_s and
-    stop_s in it. max_bytes: a file of this size is renamed to path.1, path.1 to path.2 and so on, and only `keep` older
-    files stay. Raises RoverError on entering if another drive writes the file, and nothing later: if the disk is full
-    or gone, this is logged once, and tried again every second. Ticks must come from one thread; events may come from
-    any, and from the handlers of signals.
+    stop_s in it. max_bytes: a file of this size is renamed to path.1, path.1 to path.2 and so on; `keep` older files
+    stay. Raises RoverError on entering if another drive writes the file, and nothing later: a full disk is logged once,
+    and tried again every second. Ticks must come from one thread; events may come from any, and from signals' handlers.
     """
 
     def __init__(
@@ -126,7 +121,6 @@ class FlightLog:
         self._header = {"schema": SCHEMA, "kind": "header", **start, "columns": Tick._fields, "drive": header}
         self._max_bytes, self._keep, self._clock, self._host = max_bytes, keep, clock, host or Host()
         self._rows: deque[Tick | Event] = deque(maxlen=QUEUE_ROWS)
-        self._dropped = 0  # ticks for which the queue had no room
         self._lock: BaseFileLock | None = None
         self._closing = threading.Event()
         self._writer = threading.Thread(target=self._write, name="flight log", daemon=True)
@@ -143,8 +137,7 @@ class FlightLog:
         self.close()
 
     def tick(self, row: Tick) -> None:
-        """Log a tick. Takes a microsecond, waits for nothing, raises nothing."""
-        self._dropped += len(self._rows) == QUEUE_ROWS
+        """Log a tick. Waits for nothing, raises nothing."""
         self._rows.append(row)
 
     def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
@@ -164,17 +157,16 @@ class FlightLog:
 
     def _take_lock(self) -> None:
         """Keep other drives from the file, also while it is renamed. Raises RoverError if one writes it now."""
-        path = self.path
-        with contextlib.suppress(OSError):  # where nothing can be locked, such as beside /dev/null
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = private_lock(path.with_name(f".{path.name}.lock"))
-            try:
-                self._lock.acquire()
-            except Timeout:
-                raise RoverError(f"{path}: another drive writes this log", remedy="name another by --log") from None
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock = private_lock(self.path.with_name(f".{self.path.name}.lock"))
+            self._lock.acquire()
+        except Timeout:
+            raise RoverError(f"{self.path}: another drive writes this log", remedy="name another by --log") from None
+        except OSError:  # where nothing can be locked, such as beside /dev/null
+            pass
 
     def _write(self) -> None:
-        """The thread that writes the file."""
         closing = failed = False
         while not closing:
             closing = self._closing.wait(RETRY_S if failed else SYNC_S)
@@ -199,9 +191,6 @@ class FlightLog:
         bits = self._host.throttled() if vcgencmd else None
         self.machine = {"temperature_c": self._host.temperature_c(), "throttled": bits}
         self._lines.append(_line({"kind": "machine", "t_s": now_s, **self.machine}))
-        if dropped := self._dropped:
-            self._dropped -= dropped
-            self._lines.append(_line(Event(now_s, MISSING, {"ticks": dropped})))
         for _ in range(len(self._rows)):
             self._lines.append(_line(self._rows.popleft()))
 
@@ -228,19 +217,16 @@ class FlightLog:
         self._file = None
 
     def _shift(self) -> FileIO:
-        """Rename the files so that `path` is free, and open a new one."""
-        path = self.path
-        names = [path, *(path.with_name(f"{path.name}.{number}") for number in range(1, self._keep + 1))]
+        names = [self.path, *(self.path.with_name(f"{self.path.name}.{i}") for i in range(1, self._keep + 1))]
         for older, newer in zip(names[:0:-1], names[-2::-1], strict=True):
             with contextlib.suppress(FileNotFoundError):
                 newer.replace(older)
-        path.unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
         self._close_file()
         return self._open()
 
 
 def _line(row: Any) -> bytes:
-    """Return a row as a line: a tick as an array, an event as an object, an object as it is."""
     if isinstance(row, Tick):
         row = [round(value, 4) if isinstance(value, float) else value for value in plain(row)]
     elif isinstance(row, Event):
@@ -257,8 +243,8 @@ class Flight:
 
     header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: an array per field of
     Tick, (n,) float64 with NaN for "not known"; state and reason are text. machine: t_s and temperature_c, (m,)
-    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files, of which
-    `damaged` lines were skipped.
+    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged: lines
+    that were skipped.
     """
 
     path: Path
@@ -272,38 +258,30 @@ class Flight:
 
     @property
     def period_ms(self) -> float | None:
-        """Time between two ticks, by the header's hz; None if it has none."""
         hz = self.header.get("drive", {}).get("hz")
         return 1000 / hz if is_number(hz) and hz > 0 else None
 
     @property
     def car(self) -> Car:
-        """The car that was driven, from the header; if that names none, the car of the original recordings.
-
-        Raises CarError if the header's description is not one of a car.
-        """
+        """The car that was driven, by the header. Raises CarError."""
         described = self.header.get("drive", {}).get("car")
         return Car.of(described, f"{self.path}: its car") if described else Car()
 
     def summary(self) -> dict[str, Any]:
         """Return the drive in figures; a figure is None if nothing was measured.
 
-        jitter: how late commands were. missed: deadlines without a tick; ticks that happened but are missing from the
-        log do not count. plan_age is over the ticks that had a plan, latency over the plans.
+        jitter: how late commands were. missed: deadlines without a tick. plan_age is over the ticks that had a plan,
+        latency over the plans.
         """
         ticks, period_ms = self.ticks, self.period_ms
         t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
         _, first = np.unique(plans, return_index=True)  # the first tick of each plan
         latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
-        durations_s = np.diff(t_s, append=t_s[-1:] + (period_ms or 0) / 1000)
-        states = {s.value: s.name.lower() for s in State} | {"": "not known"}
         throttled = next((v for v in reversed(self.machine["throttled"]) if v is not None), None)
-        not_logged = sum(e.fields.get("ticks", 0) for e in self.events if e.text == MISSING)
         missed = None
         if period_ms:
             passed = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
-            missed = max(0, int(passed[passed > 0].sum()) - not_logged)
-        in_state = [(s, float(durations_s[ticks["state"] == s].sum())) for s in np.unique(ticks["state"])]
+            missed = int(passed[passed > 0].sum())
         return {
             "start": self.header.get("start"),
             "seconds": float(t_s[-1] - t_s[0]) if len(t_s) else 0.0,
@@ -313,32 +291,26 @@ class Flight:
             "plans": len(latency_ms),
             "plan_age_p95_ms": _percentile(ticks["plan_age_ms"], 95),
             **{f"latency_p{q}_ms": _percentile(latency_ms, q) for q in (50, 95)},
-            "seconds_in": {states.get(str(s), str(s)): seconds for s, seconds in in_state},
+            "seconds_in": self._seconds_in(),
             "temperature_max_c": _percentile(self.machine["temperature_c"], 100),
             "throttled": throttled,
             "throttled_means": throttled_means(throttled),
             "events": [{"t_s": e.t_s, "event": e.text, **e.fields} for e in self.events],
-            "ticks_not_logged": not_logged,
             "drive": self.drive,
             "drives": self.drives,
             "damaged_lines": self.damaged,
         }
 
+    def _seconds_in(self) -> dict[str, float]:
+        t_s, states = self.ticks["t_s"], self.ticks["state"]
+        durations_s = np.diff(t_s, append=t_s[-1:] + (self.period_ms or 0) / 1000)
+        names = {s.value: s.name.lower() for s in State} | {"": "not known"}
+        return {names.get(str(s), str(s)): float(durations_s[states == s].sum()) for s in np.unique(states)}
+
 
 def _percentile(values: np.ndarray, q: float) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.percentile(values, q)) if len(values) else None
-
-
-@dataclass
-class _Drive:
-    """One drive while it is read. machine: (t_s, temperature_c, throttled) each."""
-
-    header: dict[str, Any]
-    armed: bool = False
-    ticks: list[list[Any]] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
-    machine: list[tuple[float, float | None, str | None]] = field(default_factory=list)
 
 
 def read_log(path: Path | str, drive: int = -1) -> Flight:
@@ -348,22 +320,22 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     Raises RoverError if the file cannot be read, holds no such drive, or is of another version of the format.
     """
     path = Path(path)
-    drives, damaged = _read_drives(path)
-    if not drives:
-        raise RoverError(f"{path}: no line of a flight log in it, {damaged} of something else", remedy=NAME_A_LOG)
+    rows = [_row(line) for line in _lines_of(path)]
+    drives = _drives_of([row for row in rows if row is not None])
     if not -len(drives) <= drive < len(drives):
-        remedy = f"choose from 0 to {len(drives) - 1}, or -1"
-        raise RoverError(f"{path}: no drive {drive}, it has {len(drives)}", remedy=remedy)
-    chosen = drives[drive]
-    if (schema := chosen.header.get("schema", SCHEMA)) != SCHEMA:
+        raise RoverError(f"{path}: no drive {drive} in it", found=f"{len(drives)} drives", remedy=NAME_A_LOG)
+    header, *chosen = drives[drive]
+    if (schema := header.get("schema", SCHEMA)) != SCHEMA:
         raise RoverError(f"{path}: of version {schema}, this program reads {SCHEMA}", remedy="use the other version's")
-    columns = zip(*chosen.ticks, strict=True) if chosen.ticks else [()] * len(Tick._fields)
-    times_s, temperatures_c, throttled = zip(*chosen.machine, strict=True) if chosen.machine else ((), (), ())
+    ticks = [row for row in chosen if isinstance(row, list)]
+    machine = [row for row in chosen if type(row) is tuple]
+    columns = zip(*ticks, strict=True) if ticks else [()] * len(Tick._fields)
+    times_s, temperatures_c, throttled = zip(*machine, strict=True) if machine else ((), (), ())
     return Flight(
         path=path,
-        header=chosen.header,
+        header=header,
         ticks={n: np.array(c, str if n in _TEXTS else float) for n, c in zip(Tick._fields, columns, strict=True)},
-        events=sorted(chosen.events, key=lambda e: e.t_s),
+        events=sorted((row for row in chosen if isinstance(row, Event)), key=lambda e: e.t_s),
         machine={
             "t_s": np.array(times_s, float),
             "temperature_c": np.array(temperatures_c, float),  # None becomes NaN
@@ -371,35 +343,37 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
         },
         drive=drive % len(drives),
         drives=len(drives),
-        damaged=damaged,
+        damaged=rows.count(None),
     )
 
 
-def _read_drives(path: Path) -> tuple[list[_Drive], int]:
-    """Return the drives of a log and its older files, and how many lines were damaged. Raises RoverError."""
+def _lines_of(path: Path) -> list[bytes]:
+    """Return the lines of a log and its older files, in order. Raises RoverError."""
     older = [p for p in path.parent.glob(f"{glob.escape(path.name)}.*") if p.suffix[1:].isdecimal()]
     files = [*sorted(older, key=lambda p: -int(p.suffix[1:])), path]
     try:
-        lines = [line for file in files for line in read_plain(file).split(b"\n") if line]
+        return [line for file in files for line in read_plain(file).split(b"\n") if line]
     except OSError as error:
         raise RoverError(f"{path}: cannot be read ({error.strerror})", remedy=NAME_A_LOG) from error
-    drives: list[_Drive] = []
-    damaged = 0
-    for row in map(_row, lines):
-        last = drives[-1] if drives else None
-        if row is None:
-            damaged += 1
-        elif isinstance(row, dict):
-            if not last or any(last.header.get(k) != row.get(k) for k in ("start", "start_monotonic_s")):
-                drives.append(_Drive(row))  # and not just the next file of the same drive
-        else:
-            begins = isinstance(row, Event) and row.text == ARMED
-            if not last or (begins and last.armed):
-                drives.append(last := _Drive(last.header if last else {}))
-            last.armed = last.armed or begins
-            rows: Any = {list: last.ticks, Event: last.events, tuple: last.machine}[type(row)]
-            rows.append(row)
-    return drives, damaged
+
+
+def _drives_of(rows: list[Any]) -> list[list[Any]]:
+    """Split rows into drives, each of which begins with its header."""
+    drives: list[list[Any]] = []
+    armed = False
+    for row in rows:
+        if isinstance(row, dict):
+            if not drives or any(drives[-1][0].get(k) != row.get(k) for k in ("start", "start_monotonic_s")):
+                drives.append([row])  # and not just the next file of the same drive
+                armed = False
+            continue
+        begins = isinstance(row, Event) and row.text == ARMED
+        if not drives or (begins and armed):
+            drives.append([drives[-1][0] if drives else {}])
+            armed = False
+        armed = armed or begins
+        drives[-1].append(row)
+    return drives
 
 
 def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | None:
@@ -409,7 +383,7 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
             case list(values):
                 return [_value(name, value) for name, value in zip(Tick._fields, values, strict=True)]
             case {"kind": "event", "t_s": t_s, "event": str(text), "fields": dict(fields)} if is_number(t_s):
-                return Event(float(t_s), text, fields) if text != MISSING or is_whole(fields.get("ticks")) else None
+                return Event(float(t_s), text, fields)
             case {"kind": "machine", "t_s": t_s, "temperature_c": heat, "throttled": bits} if is_number(t_s):
                 known = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
                 return (float(t_s), heat, bits) if known else None
@@ -421,7 +395,6 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
 
 
 def _value(name: str, value: Any) -> Any:
-    """Return a tick's value; NaN for a number that is not known. Raises ValueError for what no log has there."""
     if value is None and name != "t_s":
         return "" if name in _TEXTS else math.nan
     if not (isinstance(value, str) if name in _TEXTS else is_number(value)):

@@ -1,8 +1,7 @@
-"""Plan while the control loop runs: a thread asks the policy for a plan of the newest frame, again and again.
+"""Plan while the control loop runs: a thread asks the policy for a plan of the newest frame again and again.
 
-    with PolicyProcess("policy_static.pt") as policy:
-        with Planner(camera, policy.predict, commanded, policy.rate_hz) as planner:
-            plan = planner.newest()
+    with PolicyProcess("policy_static.pt") as policy, Planner(camera, policy.predict, commanded, 30.0) as planner:
+        plan = planner.newest()
 
 The policy has a process of its own, so that it cannot delay the control loop, and can be killed if it hangs.
 """
@@ -44,9 +43,8 @@ Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint
 class Planner:
     """Plans for the newest frame again and again, in a thread; a context manager.
 
-    predict: returns (chunk, 2) actions, unclipped, for a frame and a state, or raises. rate_hz: actions per
-    second of a plan. rest_s: pause after each plan, except in without_rest(), so that a standing car does not get warm.
-    latency_s: the least time that a plan takes, for comparisons. limits: of the actions, see Plan.
+    predict: returns (chunk, 2) actions, unclipped, or raises. rate_hz: actions per second of a plan. rest_s: pause
+    after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see Plan.
     """
 
     def __init__(
@@ -107,19 +105,17 @@ class Planner:
 
         Raises PolicyError if none comes within FRESH_S, and what newest() raises.
         """
-        plan = self.newest()
-        number = plan.number if plan else 0
-        if plan and self._clock() - plan.captured_s <= age_s:
+        before = self.newest()
+        if before and self._clock() - before.captured_s <= age_s:
             return
-        plan = self.wait(FRESH_S, after=number)
-        if not plan or plan.number == number:
+        if self.wait(FRESH_S, after=before.number if before else 0) is before:
             raise PolicyError(f"no fresh plan within {FRESH_S:g} s", remedy="is this machine too busy?")
 
     @property
     def asking_s(self) -> float:
         """Seconds that the policy has been computing its present answer for; 0 while it is idle."""
-        asked = self._asked_s
-        return 0.0 if asked is None else self._clock() - asked
+        asked_s = self._asked_s
+        return 0.0 if asked_s is None else self._clock() - asked_s
 
     def _run(self) -> None:
         number = frame_number = 0
@@ -151,13 +147,12 @@ class Planner:
 class PolicyProcess:
     """An artifact in a process of its own; a context manager. Only one thread at a time may call predict().
 
-    artifact: a file, or an open Artifact whose manifest need not be read again. threads: of the engine; None: all cores
-    but one, which is left for the loop. Raises PolicyError, with the sentence of the ArtifactError, if the artifact
-    cannot be used here. unconfined: why the kernel cannot confine the process, "" if it does. chunk: number of actions
-    in a plan, of which there are rate_hz per second.
+    artifact: a file, or an open Artifact. threads: of the engine; None: all cores but one, which is left for the loop.
+    Raises PolicyError if the artifact cannot be used here. unconfined: why the kernel cannot confine the process, "" if
+    it does. chunk: number of actions in a plan, of which there are rate_hz per second.
 
-    The artifact is not trusted. So the process is confined (see confine.py), and nothing that it sends is unpickled:
-    its answers are accepted only if they have the shape that the manifest gives, which is read in this process.
+    The artifact is not trusted: the process is confined (confine.py), and nothing that it sends is unpickled. An answer
+    must have the size that the manifest gives, which is read in this process.
     """
 
     loaded: Callable[[Any], None] | None = None  # called with the loaded policy; the laboratory makes it misbehave
@@ -195,7 +190,6 @@ class PolicyProcess:
         self.close()
 
     def close(self) -> None:
-        """End the process, whatever it is doing."""
         self._closing.set()
         if self._process and self._process.pid:
             self._process.terminate()
@@ -215,8 +209,7 @@ class PolicyProcess:
 
         Raises PolicyError with the policy's own error, or if its process has ended.
         """
-        if self._pipe is None:
-            raise PolicyError(f"{self.artifact}: its process was not started", remedy="use it in a `with` statement")
+        assert self._pipe, "it is open"
         frame = np.ascontiguousarray(frame_bgr)
         try:
             self._pipe.send((frame.shape, [float(value) for value in state]))
@@ -236,8 +229,7 @@ class PolicyProcess:
                 if self._closing.is_set():
                     raise PolicyError(f"{self.artifact}: the policy was closed")
                 if end and time.monotonic() > end:
-                    what = f"{self.artifact}: not loaded within {timeout_s:g} s"
-                    raise PolicyError(what, remedy="is the memory full?")
+                    raise PolicyError(f"{self.artifact}: not loaded in time", found=f"{timeout_s:g} s")
             answer = self._pipe.recv_bytes(ANSWER_BYTES)
         except (EOFError, OSError) as error:
             raise self._ended() from error
@@ -256,8 +248,7 @@ class PolicyProcess:
 def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] | None) -> None:
     """Run the policy's process: answer each request until the other side closes the pipe.
 
-    An answer is "=" and bytes, or "!" and an error's sentence. The first says why the process is not confined, all
-    others are chunks.
+    An answer is "=" and bytes, or "!" and an error's sentence. The first says why the process is not confined.
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # a policy that hangs must not outlive the loop
     os.nice(NICE)
@@ -284,25 +275,19 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
 
 
 def _load_confined(artifact: str, threads: int) -> tuple[Any, str]:
-    """Confine this process, and load a policy in it; return it, and why the process is not confined. Raises RoverError.
-
-    Engines are imported here, because the process that drives must load none.
-    """
-    from rover_lib.onboard.policy.confined import load_confined
+    """Confine this process, load a policy, and return it and why the process is not confined. Raises RoverError."""
+    from rover_lib.onboard.policy.confined import load_confined  # here: the process that drives must load no engine
 
     reasons: list[str] = []
     policies, _ = load_confined({"policy": artifact}, threads=threads, notify=reasons.append)
     policy = policies["policy"]
     names = list(policy.state_names), list(policy.action_names)
     if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
-        raise PolicyError(
-            f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}",
-            remedy="this car has one camera, steering and throttle, by these names (rover run: --action-names)",
-        )
+        what = f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}"
+        raise PolicyError(what, remedy="this car has one camera, steering and throttle (rover run: --action-names)")
     return policy, "".join(reasons)
 
 
 def _refusal(what: str, error: Exception) -> bytes:
-    """Return an error as an answer: a RoverError's own sentence, or `what` and what was unexpected."""
     text = str(error) if isinstance(error, RoverError) else f"{what} ({type(error).__name__}: {str(error)[-300:]})"
     return b"!" + " ".join(text.split()).encode()

@@ -3,9 +3,8 @@
     with ServoLink(port) as link:
         report = drive(pilot, link, log, rate_hz=30, until=Until(max_seconds=60))
 
-The loop never drives on after an exception: whatever ends it, the next command is neutral. If that does not get
-through, the Arduino stops the car by itself 150 ms after the last command. drive.py opens all that the loop needs, by
-the options of a drive.
+Whatever ends the loop, the next command is neutral. If that does not get through, the Arduino stops the car by itself
+150 ms after the last command.
 """
 
 import logging
@@ -15,13 +14,13 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
-from rover_lib.onboard.drive.flight_log import ARMED, Tick
+from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick
 from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
 
@@ -30,25 +29,12 @@ KEEP_S = 0.034  # longest time between commands, even if ticks are rarer: to the
 RESEND_S = 0.018  # time to be acknowledged: 3 ms for the command, 7 for a status already on the wire, 7 for its own
 SPARE_S = 0.004  # nothing is sent again so shortly before a deadline
 READ_S = 0.005  # time for the thread that reads the port, after a pause of the whole process
-# The Arduino stops the car after a pause of 150 ms, and after a second one soon after one of 100 ms. Shorter pauses are
-# added up here: within half a second, all of them together may take no longer than a single one.
+# The Arduino notices only pauses of 100 ms. Within half a second, shorter ones together may take no longer than this.
 LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 
 Arm = Callable[[], Telemetry | None]  # arms the car and returns the status that says so; None: no motor is driven
 Warnings = Callable[[], Iterable[str]]  # sentences about what was unusual since the last call
-
-
-class Log(Protocol):
-    """What the loop needs of a flight log. None of its methods waits."""
-
-    start_s: float
-
-    def tick(self, row: Tick) -> None:
-        """Log one control tick."""
-
-    def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
-        """Log something that happened."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +51,9 @@ class Until:
 class Hooks:
     """Functions that the caller adds to the loop.
 
-    arm: called once all is ready; it arms the car, and may first wait for a human. None: the link's arm(), at once.
-    warnings: called once a second; the sentences that it returns are logged. record: called with each command, with
-    the arguments of Recorder.control(). show: called with each tick once its command has been sent, for a view.
+    arm: called once all is ready; it may first wait for a human. None: the link's arm(), at once. warnings: called once
+    a second, for sentences to log. record: called with each command, with the arguments of Recorder.control(). show:
+    called with each tick once its command has been sent.
     """
 
     arm: Arm | None = None
@@ -80,8 +66,8 @@ class Hooks:
 class Report:
     """The outcome of a drive, and its state while it lasts.
 
-    late_ms (the summary's jitter: how long after its deadline a command was sent), plan_age_ms and latency_ms have one
-    value per tick; the last two have none where no plan is followed.
+    late_ms (how long after its deadline a command was sent), plan_age_ms and latency_ms have one value per tick; the
+    last two have none where no plan is followed.
     """
 
     ticks: int = 0
@@ -90,7 +76,6 @@ class Report:
     seconds: float = 0.0
     ended: str = ""
     status: str = "getting ready"  # one line for people
-    memory_mb: float | None = None  # resident, of the loop's process and its children, at the end
     world: dict[str, Any] = field(default_factory=dict)  # figures of a simulated car, added to the summary
     late_ms: array = field(default_factory=lambda: array("f"), repr=False)
     plan_age_ms: array = field(default_factory=lambda: array("f"), repr=False)
@@ -106,16 +91,16 @@ class Report:
         def at(values: array, pct: float) -> float | None:
             return round(float(np.percentile(values, pct)), 3) if len(values) else None
 
+        jitter = {f"jitter_{name}_ms": at(self.late_ms, pct) for name, pct in (("p50", 50), ("p99", 99), ("max", 100))}
         return {
             "ticks": self.ticks,
             "missed": self.missed,
-            **{f"jitter_{name}_ms": at(self.late_ms, pct) for name, pct in (("p50", 50), ("p99", 99), ("max", 100))},
+            **jitter,
             "plan_age_p95_ms": at(self.plan_age_ms, 95),
             "latency_p50_ms": at(self.latency_ms, 50),
             "latency_p95_ms": at(self.latency_ms, 95),
             "resent": self.resent,
             "seconds": round(self.seconds, 3),
-            "memory_mb": self.memory_mb,
             "ended": self.ended,
             **self.world,
         }
@@ -124,7 +109,7 @@ class Report:
 def drive(
     pilot: Pilot,
     link: ServoLink | None,
-    log: Log,
+    log: FlightLog,
     *,
     rate_hz: float,
     until: Until | None = None,
@@ -136,9 +121,8 @@ def drive(
     """Arm the car, then send the pilot's order at each deadline until the drive ends.
 
     link: None: no motor is driven. rate_hz: commands per second, within RATES_HZ. until: None: the drive ends when the
-    pilot has no more orders. report: is filled during the drive, so that it is there after a fault too.
-    Raises RoverError if the drive cannot begin, DriveFault if a fault or the human stopped the car. From
-    arming on, neutral is sent before anything is raised.
+    pilot has no more orders. report: filled during the drive. Raises RoverError if the drive cannot begin, and
+    DriveFault if a fault or the human stopped the car; neutral is sent before that.
     """
     if not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
         raise ParamsError(f"a car is driven at {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz", found=f"{rate_hz:g}")
@@ -172,7 +156,7 @@ def drive(
 class _Loop:
     pilot: Pilot
     link: ServoLink | None
-    log: Log
+    log: FlightLog
     period_s: float
     until: Until
     hooks: Hooks
@@ -190,8 +174,7 @@ class _Loop:
     port_stuck: bool = False  # the port did not take the last command
 
     def arm(self) -> None:
-        arm = self.hooks.arm or (self.link.arm if self.link else lambda: None)
-        telemetry = arm()
+        telemetry = (self.hooks.arm or (self.link.arm if self.link else lambda: None))()
         self.boot = telemetry.boot if telemetry else 0
         self.armed = True
         self.log.event(ARMED if self.link else "dry run: no motor is driven")
@@ -206,7 +189,6 @@ class _Loop:
             return f"neutral was not answered, the Arduino stops by itself: {sentence_of(error)}"
 
     def run(self) -> str:
-        """Run tick after tick until something ends the drive, and return the reason."""
         report, until = self.report, self.until
         self.start_s = start = self.clock()
         n = seconds = 0
@@ -273,10 +255,7 @@ class _Loop:
             self.sleep(left)
 
     def _telemetry(self) -> Telemetry | None:
-        """Return the Arduino's newest status; None without a link.
-
-        Raises DriveFault if that status does not let the host drive, LinkError if the link failed.
-        """
+        """Return the Arduino's newest status, if it lets the host drive. Raises DriveFault, LinkError."""
         if not self.link:
             return None
         telemetry = self.link.latest()
@@ -299,7 +278,6 @@ class _Loop:
         return telemetry
 
     def _check_time(self, now: float, late_s: float) -> None:
-        """Note a tick that is late_s late. Raises DriveFault if such ticks were too late altogether."""
         self.late.append((now, late_s))
         while self.late[0][0] < now - LATE_WITHIN_S:
             self.late.popleft()

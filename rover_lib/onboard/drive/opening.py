@@ -15,7 +15,6 @@ from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.drive.watch import find_unfinished_drive
 from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.status_line import StatusLine
 
@@ -36,11 +35,10 @@ class DriveOptions:
 
     hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
     much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
-    throttle_limit: replaces the value of params.yml. threads: of the policy; None: all cores but
-    one. log_file: None: the user's. service: run as a systemd service, disarmed until a human arms it. film: the camera
-    may be recorded pictures (a folder or a FIFO), which do not show where the car is. latency_ms: make each
-    plan take at least this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when
-    the car was asked for, by boottime().
+    throttle_limit: replaces that of params.yml. threads: of the policy; None: all cores but one. log_file: None: the
+    user's. service: run as a systemd service, disarmed until a human arms it. film: the camera may be recorded pictures
+    (a folder or a FIFO). latency_ms: make each plan take at least this long, for comparisons. view: the socket of a
+    view; None: the user's. asked_s: when the car was asked for, by boottime().
     """
 
     artifact: Path
@@ -66,8 +64,7 @@ def check_no_film(camera: str) -> None:
     """Raise CameraError for pictures that do not come from a camera's device."""
     path = path_of(camera)
     if path.exists() and not path.is_char_device():
-        what = f"{camera}: recorded pictures know nothing of where the car is"
-        raise CameraError(what, remedy="give the camera's /dev/videoN, or --film if this is no real car")
+        raise CameraError(f"{camera}: recorded pictures", remedy="give the camera's /dev/videoN, or --film")
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:
@@ -75,8 +72,7 @@ def another_car(manifest: dict[str, Any], this: Car) -> str:
     meant = car_of(manifest)
     if meant.drives_like(this):
         return ""
-    what = f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}"
-    return f"{what}: it has not seen what this one does; see that the way is free"
+    return f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: see that the way is free"
 
 
 @contextlib.contextmanager
@@ -88,8 +84,5 @@ def open_flight_log(options: DriveOptions, settings: Settings, report: Report) -
         header["car"] = car.description()
     with StatusLine(lambda: report.status, sys.stderr) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status], force=True)
-        unfinished = find_unfinished_drive(path)
         with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
-            if unfinished:
-                log.event(unfinished, level=logging.WARNING)
             yield log

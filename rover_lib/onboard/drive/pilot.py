@@ -15,9 +15,7 @@ from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError
 FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees
 COASTS_S = 0.5  # a car whose throttle is released rolls on for this time
-# A car that is told to go may see the same picture for this time; if it does for longer, it must have stopped 0.2 s
-# after it was told.
-BEGINS_S = 0.12
+BEGINS_S = 0.12  # a car that is told to go may see the same picture for this time: it stops 0.2 s after it was told
 LATE_FRAME_S = 0.2  # six frames of a camera
 # The newest picture may be this old: with a tick of 33 ms, the car stops within 0.2 s of a camera's last picture. A
 # camera at 15 Hz, whose pictures arrive 50 ms late, shows ones of 117 ms.
@@ -33,8 +31,8 @@ HOLE_S = 0.3  # a gap between actions after which another episode has begun
 class Order:
     """What to send at a tick, and where it comes from.
 
-    plan: number of the plan, 0 without one. age_s, latency_s, fade: of that plan, see plan.Command and plan.Plan.
-    frame: number of the camera's newest frame, 0 without one; a plan may have looked at an older one.
+    plan: its number, 0 without one. age_s, latency_s, fade: of that plan. frame: number of the camera's newest frame, 0
+    without one.
     """
 
     steering: float
@@ -135,8 +133,7 @@ class PolicyPilot:
         end = time.monotonic() + FIRST_PLAN_S
         while self._planner.wait(0.1) is None and not stop.is_set():
             if time.monotonic() > end:
-                what = f"no plan within {FIRST_PLAN_S:g} s"
-                raise PolicyError(what, remedy="does 'rover benchmark' run on this artifact?")
+                raise PolicyError(f"no plan within {FIRST_PLAN_S:g} s", remedy="does 'rover benchmark' run on it?")
 
     def order(self, now_s: float) -> Order | None:
         frame = self._camera.latest()
@@ -149,10 +146,8 @@ class PolicyPilot:
             self._follower.add(plan, now_s)
         command = self._follower.command(now_s)
         if command is None:
-            raise DriveFault(
-                f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): "
-                f"the policy has not answered for {self._planner.asking_s:.1f} s"
-            )
+            why = f"the policy has not answered for {self._planner.asking_s:.1f} s"
+            raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
         self._cut = max(self._cut, command.cut)
         pulses = self._calibration.pulses(command.steering, command.throttle)
         return Order(
@@ -172,7 +167,7 @@ class PolicyPilot:
         self._sight.sent(at_s, order.throttle)
 
     def check_sight(self) -> None:
-        """Raise CameraError as Sight.check() does."""
+        """Raise CameraError if nobody may drive by the newest frame."""
         self._sight.check()
 
     def warnings(self) -> Iterator[str]:

@@ -1,10 +1,10 @@
 """Follow an action chunk by time: do what the policy meant for now, although its frame is already 100 ms old.
 
     follower = Follower(settings, rate_hz=30)
-    follower.add(Plan(1, captured_s, ready_s, actions))
+    follower.add(Plan(1, captured_s, ready_s, actions), now_s)
     command = follower.command(now_s)          # at each tick
 
-Nothing here uses a clock, a thread or a device: times come in as arguments, in seconds of one monotonic clock.
+Nothing here uses a clock or a device: times are arguments, in seconds of one monotonic clock.
 """
 
 import math
@@ -43,16 +43,7 @@ RULES = {
 
 @dataclass(frozen=True)
 class Settings:
-    """How plans become commands: the section `drive` of params.yml, which gives the reasons. Raises ParamsError.
-
-    blend_ticks: ticks over which a fresh plan takes over; 0: at once. fade_s: age of a plan, in seconds, from which the
-    throttle fades. stop_s: age at which the car is stopped. compensate: whether to skip the steps of a plan whose
-    time had passed when it arrived. ensemble: LeRobot's coefficient of temporal ensembling; None: off.
-    throttle_limit: largest throttle, in [0, 1]. frozen_frames: this many frames in a row with nothing new in them are a
-    fault of the camera; 0: never. black_frames: the same for frames that are black or without contrast. black_level:
-    a frame with a lower mean is black. flat_level: a frame with a lower contrast shows nothing. Both are grey levels,
-    from 0 to 255.
-    """
+    """How plans become commands: the section `drive` of params.yml, which explains each. Raises ParamsError."""
 
     fade_s: float = 0.5
     stop_s: float = 1.0
@@ -74,7 +65,7 @@ class Settings:
             raise ParamsError("drive: fade_s must not be above stop_s", found=self.fade_s, remedy=remedy)
         if (blind_m := self.blind_s * RECORDED_MPS) > BLIND_M:
             what = f"by one picture the car would go {blind_m:.1f} m at {RECORDED_MPS:g} m/s, and it may {BLIND_M:g}"
-            raise ParamsError(f"drive: {what}", remedy="choose a smaller fade_s and stop_s in params.yml")
+            raise ParamsError(f"drive: {what}", found=(self.fade_s, self.stop_s), remedy=remedy)
 
     @property
     def blind_s(self) -> float:
@@ -95,9 +86,9 @@ class Plan:
     """The action chunk of one inference. actions[i] is meant for captured_s + i / rate.
 
     number: 1, 2, ... captured_s: when the policy's frame was captured. ready_s: when the plan arrived. actions:
-    (chunk, 2) float [steering, throttle], clipped to limits. limits: (2, 2), the lowest and the highest action; for a
-    car without reverse, steering in [-1, 1] and throttle in [0, 1]. Raises PolicyError for actions of another shape,
-    not finite, or beyond an end by more than OVERSHOOT: this is the last boundary before the servos.
+    (chunk, 2) float [steering, throttle], clipped to limits: (2, 2), the lowest and the highest action. Raises
+    PolicyError for actions of another shape, not finite, or beyond an end by more than OVERSHOOT: this is the last
+    boundary before the servos.
     """
 
     number: int
@@ -109,17 +100,12 @@ class Plan:
     def __post_init__(self):
         actions = np.asarray(self.actions, float)
         if actions.ndim != 2 or actions.shape[1] != 2 or len(actions) == 0:
-            raise PolicyError(
-                "a plan must be (chunk, 2) actions", found=actions.shape, remedy="is it a policy of this car?"
-            )
+            raise PolicyError("a plan must be (chunk, 2) actions", found=actions.shape)
         if not np.isfinite(actions).all():
             raise PolicyError(f"plan {self.number} is not finite", remedy="stop the car and quantize again")
         if (actions < self.limits[0] - OVERSHOOT).any() or (actions > self.limits[1] + OVERSHOOT).any():
-            raise PolicyError(
-                f"plan {self.number} has actions from {actions.min(0).round(3).tolist()} to "
-                f"{actions.max(0).round(3).tolist()}, outside the range of a servo",
-                remedy="stop the car",
-            )
+            ends = actions.min(0).round(3).tolist(), actions.max(0).round(3).tolist()
+            raise PolicyError(f"plan {self.number} has actions outside the range of a servo", found=ends)
         object.__setattr__(self, "actions", np.clip(actions, *self.limits))
 
     @property
@@ -128,10 +114,7 @@ class Plan:
         return self.ready_s - self.captured_s
 
     def at(self, step: float) -> np.ndarray:
-        """Return the (2,) [steering, throttle] meant for `step` steps after the first, interpolated between steps.
-
-        Before the first action it is the first, and after the last the last.
-        """
+        """Return the (2,) [steering, throttle] meant for `step` steps after the first, interpolated; it ends held."""
         step = min(max(step, 0.0), len(self.actions) - 1.0)
         i = min(int(step), len(self.actions) - 2) if len(self.actions) > 1 else 0
         share = step - i
@@ -142,8 +125,7 @@ class Plan:
 class Command:
     """What to do at a tick: steering in [-1, 1], throttle in [0, 1], or from -1 on a car with reverse.
 
-    fade: factor that the throttle was multiplied by because of the plan's age, in [0, 1]. cut: the throttle that
-    throttle_limit took away.
+    fade: by how much the plan's age multiplied the throttle, in [0, 1]. cut: the throttle that throttle_limit took.
     """
 
     steering: float
@@ -183,10 +165,7 @@ class Follower:
             self._offset, self._blended = old - self._meant(now_s), 0
 
     def stop_s(self) -> float:
-        """Return the age of the newest plan at which the car is stopped, in seconds; 0 before the first plan.
-
-        It is the settings' stop_s, or the end of the chunk if that is earlier.
-        """
+        """Return the age in seconds at which the newest plan stops the car: the settings', or the chunk's end."""
         return min(self.settings.stop_s, len(self._plans[-1].actions) / self.rate_hz) if self._plans else 0.0
 
     def command(self, now_s: float) -> Command | None:
@@ -211,7 +190,6 @@ class Follower:
         return max(0.0, (stop_s - age_s) / (stop_s - fade_s))
 
     def _wanted(self, now_s: float) -> np.ndarray:
-        """Return the action of the plans, blended with that of the plan before."""
         left = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
         return self._meant(now_s) + self._offset * max(0.0, left)
 
@@ -236,16 +214,13 @@ class Commanded:
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=max(2, int(keep_s * rate_hz)))
 
     def add(self, at_s: float, steering: float, throttle: float) -> None:
-        """Add a command that was really sent, at time `at_s`."""
         self._sent.append((at_s, steering, throttle))
 
     def state(self, captured_s: float, rate_hz: float) -> np.ndarray:
         """Return the policy's state for a frame captured at that time, (2,) float32 [steering, throttle].
 
-        In training, a frame's state is the action of the frame before it, which is the control nearest to that frame
-        in time (episodes.py). So the state is the command nearest to one step before the capture. It is neutral if no
-        command was in force then: the nearest was sent more than a step later, or so early that the Arduino had stopped
-        the car.
+        In training, a frame's state is the action of the frame before it (episodes.py). So it is the command nearest to
+        one step before the capture; neutral if that was sent more than a step later, or is no longer in force.
         """
         before_s = captured_s - 1 / rate_hz
         nearest = min(tuple(self._sent), key=lambda c: abs(c[0] - before_s), default=None)

@@ -1,18 +1,15 @@
 """Drive as a systemd service, which waits disarmed until a human arms the car, and which systemd's watchdog checks.
 
 A human arms the car by `sudo rover arm-car` on the rover, or by `ansible-playbook ansible/drive.yml -e rover_arm=true`.
-Both use a socket that only root may use: they ask the service what the car would drive by, and then send a request to
-arm. The request contains the model's content hash, so that nobody arms a model that another operator has just deployed,
-and a ticket, which changes with each attempt, so that no old request can arm the car later.
+Both use a socket that only root may use. A request contains the content hash of the model that is meant, and a ticket,
+which changes with each attempt, so that no old request can arm the car later.
 
-However a drive ends, also by a takeover, the same process then waits disarmed with the port still open: opening it
-again might reset the Arduino, and take the car from the human. A permanent fault (the camera or the port is gone) ends
-the service; systemd starts it again, disarmed. The status text (systemctl show --property=StatusText) begins with one
-of STATES; deploy.yml restarts the service only while this is "disarmed".
+However a drive ends, the same process then waits disarmed with the port still open: opening it again might reset the
+Arduino, and take the car from the human. The status text (systemctl show --property=StatusText) begins with one of
+STATES; deploy.yml restarts the service only while this is "disarmed".
 
-The watchdog is fed only by work that was really done: ticks of the control loop while the car drives; the checks of
-camera, policy and Arduino while it is disarmed; ticks of the recording while a human who took over is recorded; and for
-a limited time after a drive, while its episode is finished.
+The watchdog is fed only by work that was really done: ticks of the control loop, the checks while the car is disarmed,
+ticks of the recording of a human, and for a limited time after a drive, while its episode is finished.
 """
 
 import contextlib
@@ -26,7 +23,7 @@ import struct
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,6 +50,7 @@ QUESTION_BYTES = 4096
 PERSONS = 1000  # user ids from here on belong to people; the service's own is below
 DISARMED, DRIVING, STOPPING = STATES = ("disarmed", "driving", "stopping")
 WAITING = "waiting for a human to arm it"
+Check = Callable[[], object]  # raises if its device fails
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Request:
 
 
 def check_age(age_s: float, most_s: float | None = None) -> None:
-    """Raise RoverError for a request to arm that is too old: whoever sent it may no longer be watching the car."""
+    """Raise RoverError for a request that is too old: whoever sent it may no longer be watching the car."""
     most_s = REQUEST_S if most_s is None else most_s
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
         what = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
@@ -79,8 +77,7 @@ class Service:
     """Talks to systemd and to operators about a car's drives; a context manager, for the main thread.
 
     report: the drive's report, whose ticks feed the watchdog. stop: ends the waiting. model: content hash of the model
-    that drives. Without systemd (no NOTIFY_SOCKET) no notifications are sent. The operators' socket is in
-    $RUNTIME_DIRECTORY. Raises RoverError if it cannot be made there.
+    that drives. The operators' socket is in $RUNTIME_DIRECTORY. Raises RoverError if it cannot be made there.
     """
 
     def __init__(
@@ -103,7 +100,7 @@ class Service:
             threading.Thread(target=self._feed, name="watchdog", daemon=True),
             threading.Thread(target=self._listen, name="operators", daemon=True),
         ]
-        self._turn = threading.Condition()  # guards the six below
+        self._turn = threading.Condition()  # guards what is below
         self._ticket = ""  # for the next attempt; empty: nobody can ask for one now
         self._request: Request | None = None  # that of the present attempt or drive
         self._asked = False
@@ -141,12 +138,7 @@ class Service:
         self._socket.close()
 
     def wait_for_human(
-        self,
-        arm: "Arm",
-        checks: Iterable[Callable[[], object]] = (),
-        missing: Callable[[], str] = lambda: "",
-        *,
-        said: str = "",
+        self, arm: "Arm", checks: Sequence[Check] = (), missing: Callable[[], str] = lambda: "", *, said: str = ""
     ) -> "Telemetry | None":
         """Report ready, wait until a human arms the car and the Arduino agrees, and return what arm() returned.
 
@@ -154,7 +146,6 @@ class Service:
         each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing. said:
         how the previous drive ended. Raises RoverError when told to stop, and what a check raises.
         """
-        checks = tuple(checks)
         first, self._state, self._text = not self._rounds, DISARMED, ""
         while not self._stop.is_set():
             for check in checks:
@@ -162,13 +153,12 @@ class Service:
             self._rounds += 1
             self._missing = missing()
             self._tell(f"{DISARMED}: {said + '; ' if said else ''}{self._missing or WAITING}")
-            with self._turn:
-                self._ticket = self._ticket or secrets.token_hex(8)
             if first:
                 first = False
                 with contextlib.suppress(OSError):
                     self._systemd.ready()
             with self._turn:
+                self._ticket = self._ticket or secrets.token_hex(8)
                 if not self._turn.wait_for(lambda: self._asked, CHECK_S):
                     continue
             try:
@@ -191,17 +181,17 @@ class Service:
         raise RoverError("told to stop before a human armed the car", kind="not armed")
 
     def check_request(self) -> None:
-        """Call this just before the Arduino is told. Raises if the operator asked too long ago or is gone."""
+        """Raise RoverError if the operator asked too long ago or is gone. For just before the Arduino is told."""
         check_age(self._clock() - self._asked_s)
         if self._hung_up():
             raise RoverError("whoever asked for the car is gone", remedy="ask again", kind="not armed")
 
     def alive(self) -> None:
-        """Tell the watchdog that the work after a drive goes on. Call it again and again during that work."""
+        """Tell the watchdog that the work after a drive goes on."""
         self._rounds += 1
 
     def over(self) -> str | None:
-        """Return why the operator's limits end this drive; None if they do not. The loop calls this at each tick."""
+        """Return why the operator's limits end this drive; None if they do not."""
         request, now = self._request or Request(), self._clock()
         if request.max_seconds is not None and now - self._armed_s >= request.max_seconds:
             return f"{request.max_seconds:g} s, as requested"
@@ -210,7 +200,7 @@ class Service:
         return None
 
     def _reply(self, **answer: Any) -> None:
-        """Answer the request that was tried. A refused request has used up its ticket, so a new one is made at once."""
+        """Answer the request that was tried. A refused one has used up its ticket."""
         with self._turn:
             self._asked, self._answer = False, answer
             self._ticket = "" if answer["armed"] else secrets.token_hex(8)
@@ -233,10 +223,7 @@ class Service:
                     connection.send(json.dumps(answer).encode())
 
     def ask(self, ticket: str, asked_s: float, request: Request, hung_up: Callable[[], bool] = lambda: False) -> str:
-        """Take a request to arm the car in the next attempt. Return why it is not taken, "" if it is.
-
-        asked_s: when it was sent, by the service's clock. hung_up: whether the operator no longer waits for the answer.
-        """
+        """Take a request, sent at asked_s, to arm the car in the next attempt. Return why it is not taken, or ""."""
         with self._turn:
             if not self._ticket:
                 return self._text or "it is not ready"
@@ -250,7 +237,6 @@ class Service:
     def _answer_to(
         self, operator: socket.socket, ask: str, model: str = "", ticket: str = "", asked_s: Any = None, **limits: Any
     ) -> dict[str, Any]:
-        """Return the answer to an operator's question. asked_s: see ask()."""
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
@@ -285,21 +271,19 @@ class Service:
                 self._tell(f"{DRIVING}: {self._report.ended or self._report.status}")
 
     def _stopping(self, why: str) -> None:
-        """Tell systemd that the service stops, so that the watchdog leaves time to end the policy and write files."""
+        """Tell systemd, so that its watchdog leaves time to end the policy and write files."""
         self._state = STOPPING
         self._tell(f"{STOPPING}: {why}", "STOPPING=1")  # the library has no function for this line
 
     def _tell(self, text: str, *more: str) -> None:
         text = " ".join(text.split())
-        if text == self._text and not more:
-            return
-        self._text = text
-        with contextlib.suppress(OSError):
-            self._systemd.status("\n".join([self._text, *more]))
+        if text != self._text or more:
+            self._text = text
+            with contextlib.suppress(OSError):
+                self._systemd.status("\n".join([text, *more]))
 
 
 def _is_closed(connection: socket.socket) -> bool:
-    """Return whether the other end has hung up."""
     try:
         return bool(select.select([connection], [], [], 0)[0]) and not connection.recv(1, socket.MSG_PEEK)
     except OSError:
@@ -307,11 +291,7 @@ def _is_closed(connection: socket.socket) -> bool:
 
 
 def state_of(unit: str = UNIT) -> dict[str, Any]:
-    """Return what systemd knows about the service.
-
-    Keys: installed, active, state (one of STATES, or ""), text, since, restarts, result, at_boot. Raises RoverError
-    if there is no systemd.
-    """
+    """Return what systemd knows about the service: its state is one of STATES, or "". Raises RoverError without one."""
     names = "LoadState,ActiveState,StatusText,ActiveEnterTimestamp,NRestarts,Result,UnitFileState"
     command = ["systemctl", "show", f"--property={names}", unit]
     try:
@@ -338,15 +318,12 @@ def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
         connection.settimeout(ARMED_S)
         try:
             connection.connect(str(_socket_path()))
-        except PermissionError as error:
-            raise RoverError(f"{unit} cannot be asked ({error})", remedy="use sudo") from None
-        except OSError:
+            connection.send(json.dumps(question).encode())
+            return json.loads(connection.recv(QUESTION_BYTES))
+        except (FileNotFoundError, ConnectionRefusedError):
             state = state_of(unit)
             what = f"{unit} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
             raise RoverError(what, remedy=f"sudo systemctl start {unit}") from None
-        try:
-            connection.send(json.dumps(question).encode())
-            return json.loads(connection.recv(QUESTION_BYTES))
         except (OSError, ValueError) as error:
             raise RoverError(f"{unit} gave no answer ({error})", remedy="use sudo") from None
 
@@ -363,7 +340,7 @@ def arm_car(
     """Arm the car whose service waits for it; return what the service then says. Raises RoverError if it refuses.
 
     model: content hash of the model that is meant; "": whichever is loaded. confirm: called with the service's state
-    before arming; may raise. wait_s: how long to wait for what is missing; `notify` is told each such sentence.
+    before arming; may raise. wait_s: how long to wait for what is missing, of which `notify` is told.
     """
     state = ask_service(unit, ask="state")
     if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2

@@ -1,8 +1,5 @@
 """Arm the car and drive, once or again and again, with all that a drive has opened.
 
-    session = Session(options, settings, report, log, feed, link, camera, planner, commanded, rate_hz=30, mode="static")
-    session.drive(stop)
-
 `rover drive` and the laboratory's random drives arm and drive by this code; only what is opened differs.
 """
 
@@ -42,9 +39,8 @@ TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
 class Session:
     """All that a drive has opened.
 
-    link: None: no motor is driven. rate_hz, mode: of the policy. pids: of all processes that drive. service: None:
-    there is one drive, asked for by the options. terminal: whether somebody sees what is missing, and is waited for.
-    boost: what gives this process priority while the car drives. clock, sleep: of the loop; now: boottime().
+    link: None: no motor is driven. rate_hz, mode: of the policy. service: None: there is one drive. terminal: whether
+    somebody sees what is missing, and is waited for. boost: gives priority while the car drives.
     """
 
     options: DriveOptions
@@ -58,7 +54,6 @@ class Session:
     commanded: Commanded
     rate_hz: float
     mode: str
-    pids: tuple[int, ...] = ()
     service: Service | None = None
     terminal: bool = False
     boost: Callable[[FlightLog], AbstractContextManager] = boost_priority
@@ -69,7 +64,7 @@ class Session:
     def drive(self, stop: threading.Event, said: str = "") -> None:
         """Arm the car when somebody asks for it, and drive once. said: how the previous drive ended.
 
-        Raises as loop.drive() does, but a service's drive may end by a fault or a takeover.
+        Raises as loop.drive() does, but for a service no DriveFault.
         """
         options, pilot = self.options, self.make_pilot()
         warnings = self.make_warnings(pilot)
@@ -95,23 +90,19 @@ class Session:
         return self.link.car if self.link else this_car()
 
     def make_pilot(self) -> PolicyPilot:
-        """Return a pilot for one drive."""
         pwm = self.car.pwm
         return PolicyPilot(self.camera, self.planner, self.commanded, self.settings, self.rate_hz, calibration=pwm)
 
     def make_warnings(self, pilot: PolicyPilot) -> Warnings:
-        """Return the sources of what is logged once a second."""
-        health = HealthWatch(self.report, self.link, self.pids)
+        health = HealthWatch(self.report, self.link)
         return lambda: [*pilot.warnings(), *health()]
 
     def make_recorder(self, folder: Path, room: int | None) -> AbstractContextManager[Recorder]:
-        """Return a recorder of one drive. room: the bytes that it may take; None: limited by the disk."""
         port = self.link.port if self.link else ""
         about = About(f"driven by {self.mode}", arduino_port=port, source="rover drive", car=self.car)
         return Recorder(folder, self.camera, about, rate_hz=self.options.hz, most_bytes=room)
 
     def attempt(self, arming: "Arming") -> Telemetry | None:
-        """Arm the car now, or raise."""
         return arming.arm()
 
     def over(self) -> str | None:
@@ -124,16 +115,15 @@ class Session:
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
-        checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest]
-        if self.link:
-            checks.append(self.link.latest)
-        checks.append(partial(self._show_waiting, said))
-        attempt = partial(self.attempt, arming)
-        if self.link and self.service:
-            missing = partial(what_is_missing, self.link)
-            telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)
-        elif self.link and self.terminal:
-            telemetry = arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
+        telemetry, attempt = None, partial(self.attempt, arming)
+        if self.link and (self.service or self.terminal):
+            show = partial(self._show_waiting, said)
+            checks = [self.camera.latest, self.planner.newest, self.link.latest, show]
+            if self.service:
+                missing = partial(what_is_missing, self.link)
+                telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)
+            else:
+                telemetry = arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
         else:
             telemetry = attempt()
         self.camera.begin()  # a film must start with the loop, not while arming waits
@@ -154,10 +144,7 @@ class Session:
 
 
 class Arming:
-    """Prepares a drive and arms the car; a context manager, whose end finishes the episode and lowers the priority.
-
-    If arming is refused, what it began is undone.
-    """
+    """Prepares a drive and arms the car; a context manager, whose end finishes the episode and lowers the priority."""
 
     def __init__(self, session: Session, pilot: PolicyPilot):
         self._session, self._pilot, options = session, pilot, session.options
@@ -186,8 +173,7 @@ class Arming:
     def arm(self) -> Telemetry | None:
         """Arm the car if the newest plan is fresh and the camera sees. Return the status that confirms it.
 
-        Raises PolicyError without a fresh plan, CameraError for a camera that shows nothing, and as arm_capped() does;
-        it may then be called again.
+        If it raises RoverError, what it began is undone, and it may be called again.
         """
         session = self._session
         with ExitStack() as recording, ExitStack() as driving:
@@ -207,15 +193,11 @@ class Arming:
         return self._armed
 
     def record(self, *row: Any, **columns: Any) -> None:
-        """Write a command into the episode, for the loop's hooks."""
         if self._recorder:
             self._recorder.command(*row, **columns)
 
     def record_human(self, stop: threading.Event, over: Callable[[], str | None]) -> None:
-        """After a takeover in a recorded drive, record the human until TakeoverRecorder.human() ends.
-
-        Raises nothing: the human has the car, and opening the port again might take it away from them.
-        """
+        """After a takeover in a recorded drive, record the human. Raises nothing."""
         session = self._session
         if not self._recorder or not session.link:
             return
@@ -223,9 +205,8 @@ class Arming:
         recorder, log = self._recorder.recorder, session.log
         log.event(TAKEN_OVER)
         try:
-            takeover = self._recorder.human(
-                session.link, self._armed, rate_hz=session.options.hz, stop=stop, over=over, clock=session.clock
-            )
+            given: dict[str, Any] = {"rate_hz": session.options.hz, "stop": stop, "over": over, "clock": session.clock}
+            takeover = self._recorder.human(session.link, self._armed, **given)
             recorder.note(takeover=vars(takeover))
             log.event(str(takeover))
             recorder.close(takeover.ended if takeover.fault else None)

@@ -5,11 +5,9 @@
     ...                                              # the loop ends with DriveFault, and the car is disarmed
     takeover = recorder.human(link, armed, rate_hz=30, stop=stop)
 
-After the takeover the human has the car: until they let go, this module only reads and records the Arduino's statuses,
-and sends nothing. Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the
-receiver; if the pins differ from it (the throttle is blocked until it has been at rest once, or the signal was lost),
-the driver is "nobody". The Arduino's first status after the takeover says whether it still took the policy's last
-command; one that it did not take is not recorded.
+After the takeover the human has the car: this module only reads and records the Arduino's statuses, and sends nothing.
+Each control has a column `driver`, one of recording.DRIVERS. A human's pulses are those of the receiver; if the pins
+differ from it (the throttle is blocked, or the signal was lost), the driver is "nobody".
 """
 
 import threading
@@ -33,10 +31,7 @@ IGNORED = "i"  # the Arduino's result for a command that came while the host was
 
 @dataclass(frozen=True)
 class Takeover:
-    """The recording of a human after a takeover.
-
-    controls: how many were recorded, by who drove. ended: why the recording ended. fault: whether a fault ended it.
-    """
+    """The recording of a human. controls: how many, by who drove. ended: why. fault: whether a fault ended it."""
 
     seconds: float
     controls: dict[str, int]
@@ -53,30 +48,20 @@ def driver_by(telemetry: Telemetry) -> str:
     if telemetry.state is State.AUTONOMOUS:
         return POLICY
     pins = telemetry.steering_us, telemetry.throttle_us
-    receiver = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
-    follows = all(
-        us is not None and abs(pin_us - us) <= ARDUINO_STEP_US for pin_us, us in zip(pins, receiver, strict=True)
-    )
+    follows = _sticks_near(telemetry, pins, (ARDUINO_STEP_US, ARDUINO_STEP_US))
     return HUMAN if telemetry.state is State.MANUAL and follows else NOBODY
 
 
 class TakeoverRecorder:
-    """Hands controls to a recorder, and says of each who drove. Only the loop's thread may use it.
-
-    mode: the mode of the artifact that drives.
-    """
+    """Hands controls to a recorder, and says of each who drove. For the loop's thread. mode: of the artifact."""
 
     def __init__(self, recorder: Recorder, mode: str):
-        self.recorder = recorder
-        self._mode = mode
+        self.recorder, self._mode = recorder, mode
         self._waiting: tuple[tuple, dict[str, Any]] | None = None  # the newest command, perhaps not taken
         self._last_s = float("-inf")  # time of the newest control that was handed over
 
     def command(self, *row: Any, **columns: Any) -> None:
-        """Note that a command was sent; a hook of the loop. Never waits, never raises.
-
-        Takes the arguments of Recorder.control().
-        """
+        """Note that a command was sent, with the arguments of Recorder.control(). Never waits, never raises."""
         self.flush()
         self._waiting = row, columns
 
@@ -100,9 +85,8 @@ class TakeoverRecorder:
         """Record the Arduino's newest status at each tick of rate_hz until the human lets go.
 
         armed: the status with which the car was armed, when both sticks were at rest; None takes neutral as rest. stop:
-        ends the recording when it is set. over: called at each tick; may return another reason to end the recording.
-        clock: the clock of the link and the recorder. Sends nothing to the Arduino, and raises nothing if the link
-        fails.
+        ends the recording. over: called at each tick; may return another reason to end it. clock: of the link and the
+        recorder. Sends nothing, and raises nothing if the link fails.
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
@@ -134,7 +118,7 @@ class TakeoverRecorder:
                 self._write(telemetry, driver)
                 if None not in (telemetry.receiver_steering_us, telemetry.receiver_throttle_us):
                     signal_s = heard_s
-                if not _at_rest(telemetry, rest_us):
+                if not _sticks_near(telemetry, rest_us, (STEERING_REST_US, THROTTLE_REST_US)):
                     rest_s = None
                 elif rest_s is None:
                     rest_s = telemetry.host_s
@@ -163,8 +147,7 @@ class TakeoverRecorder:
         self.recorder.control(t.host_s, t.uptime_ms, *sticks, *periods, driver=driver)
 
 
-def _at_rest(telemetry: Telemetry, rest_us: tuple[int, int]) -> bool:
+def _sticks_near(telemetry: Telemetry, at_us: tuple[int, int], bands_us: tuple[float, float]) -> bool:
     sticks_us = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
-    bands_us = STEERING_REST_US, THROTTLE_REST_US
-    near = zip(sticks_us, rest_us, bands_us, strict=True)
-    return all(us is not None and abs(us - at_us) <= band_us for us, at_us, band_us in near)
+    near = zip(sticks_us, at_us, bands_us, strict=True)
+    return all(us is not None and abs(us - middle_us) <= band_us for us, middle_us, band_us in near)

@@ -10,32 +10,29 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.signal_event import SignalEvent, signals
-from rover_lib.onboard.stage import open_plain
 
 SWITCH_S = 0.0005  # after this, other threads give the interpreter back to the loop; Python's default is 5 ms
 PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before that
 LATE_COMMAND_MS = 5.0
 OFTEN = 5  # commands that were sent again within a second
-TAIL_BYTES = 1 << 16  # of a flight log, read for the end of its last drive
 
 
 @contextlib.contextmanager
 def real_time(priority: int) -> Iterator[bool]:
     """Give all threads of this process a real-time priority inside the context. Yields False if the user may not.
 
-    All threads get it, because one that waits for the processor while it holds the interpreter makes the others wait:
-    beside four busy processes on two cores, the loop was 0.7 ms late at p99, with its own thread alone at that priority
-    4 to 9 ms (measured on an x86-64 workstation).
+    All of them: one that waits for the processor while it holds the interpreter makes the loop wait. Beside four busy
+    processes on two cores, it was 0.7 ms late at p99, with its own thread alone at that priority 4 to 9 ms (measured on
+    an x86-64 workstation).
     """
     gc.collect()
     gc.freeze()  # so that garbage collection skips all objects that exist now
@@ -86,8 +83,8 @@ def stop_on_signals(stop: SignalEvent | threading.Event, log: FlightLog) -> Iter
 def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
     """Inside the context, end this process (exit code 3) if its loop has begun, has not ended, and no longer ticks.
 
-    Nobody else would end it, and camera, port and memory would stay in use. Turns are counted instead of time, so that
-    a process that was stopped as a whole gets the time to go on.
+    Otherwise camera, port and memory would stay in use. Turns are counted instead of time, so that a process that was
+    stopped as a whole gets the time to go on.
     """
 
     def watch() -> None:
@@ -109,35 +106,15 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
         done.set()
 
 
-def find_unfinished_drive(log: Path | str) -> str | None:
-    """Return a sentence if the last drive in a flight log was armed but has no end: it was killed, or lost power."""
-    try:
-        with open_plain(log, RoverError(f"{log}: not a regular file")) as file:  # opening a FIFO would wait
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL_BYTES))
-            lines = file.read().splitlines()
-    except (OSError, RoverError):
-        return None
-    for line in reversed(lines):  # back to where the last drive began
-        if b'"event":"neutral' in line or b'"kind":"header"' in line:
-            return None
-        if line.startswith(b"[") or b'"event":"armed' in line:  # a tick, or its beginning
-            return f"{log}: the drive before this one has no end: killed, or without power or disk"
-    return None
-
-
 class HealthWatch:
-    """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call.
+    """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call."""
 
-    link: None if no motor is driven. pids: processes whose memory is noted in the report.
-    """
-
-    def __init__(self, report: Report, link: ServoLink | None, pids: Iterable[int] = ()):
-        self._report, self._link, self._pids = report, link, tuple(pids)
+    def __init__(self, report: Report, link: ServoLink | None):
+        self._report, self._link = report, link
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
 
     def __call__(self) -> Iterator[str]:
-        self._report.memory_mb = memory_mb(self._pids)
         late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
         if late_ms > LATE_COMMAND_MS:
             yield f"commands were up to {late_ms:.1f} ms late"
@@ -145,8 +122,8 @@ class HealthWatch:
             if self._link and (telemetry := self._link.latest()):
                 yield from self._of_the_link(self._link.garbled, telemetry)
 
-    def _of_the_link(self, garbled_lines: int, t: Telemetry) -> Iterator[str]:
-        counted = (self._report.resent, garbled_lines, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+    def _of_the_link(self, garbled: int, t: Telemetry) -> Iterator[str]:
+        counted = (self._report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
         before, self._counted = self._counted or counted, counted
         # An Arduino that was reset counts from 0 again.
         news = (now - then if now >= then else now for now, then in zip(counted, before, strict=True))
@@ -156,12 +133,3 @@ class HealthWatch:
                 f"the link: {again} commands were sent again, {garbled} lines came garbled; the Arduino had {bad} "
                 f"garbled, {old} old and {beyond} out of range, and lost {lost} bytes"
             )
-
-
-def memory_mb(pids: Iterable[int]) -> float | None:
-    """Return the resident memory of processes together, in MB; None if /proc does not tell."""
-    try:
-        pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids)
-    except (OSError, ValueError, IndexError):
-        return None
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 2)

@@ -3,12 +3,9 @@
 episode_YYYYMMDD_HHMMSS/
   episode_data.json   control_data.csv   frame_data.csv   frames/frame_%06d.jpg
 
-"No pulse" is a flag, not a 0. A recording made on the car has two more columns for each control, steering_measured and
-throttle_measured: true or false in JSON, True or False in CSV. If one is false, that channel has no values: its
-normalized, raw_us and period_us are null in JSON and empty in CSV, which pandas reads as NaN and no program mistakes
-for "stopped". Files without the two columns come from the user's recorder (or the balloon world, where no pulse is ever
-lost); in them, a pulse or period of 0 means "not measured". More columns may follow: `driver` says who drove, one of
-DRIVERS. Whether a drive succeeded, one of OUTCOMES, is metadata.outcome, noted afterwards (outcome.py).
+"No pulse" is a flag, not a 0: where steering_measured or throttle_measured is false, that channel's values are null in
+JSON and empty in CSV. Files without these two columns come from the user's recorder or the balloon world; in them, a
+pulse or period of 0 means "not measured". docs/data.md has all columns.
 """
 
 import contextlib
@@ -63,10 +60,9 @@ SIMULATED = "playground"  # the port of the balloon world's Arduino
 class About:
     """The description of a recording.
 
-    label: what was done, e.g. "hit red balloon". fps: the camera's rate. start_time_s, end_time_s: system time at the
-    start and the end; None: that of the first and of the last sample. arduino_port: the port of the Arduino that the
-    controls came through. source: who drove; None: not noted. car: the car that the pulses belong to, described in the
-    metadata if it drives otherwise than the default; None: the default, the car of the first recordings.
+    label: what was done. fps: the camera's rate. start_time_s, end_time_s: system time at start and end; None: that of
+    the first and last sample. source: who drove; None: not noted. car: whose pulses these are, in the metadata if it
+    drives otherwise than the default; None: the default, the car of the first recordings.
     """
 
     label: str = ""
@@ -84,11 +80,9 @@ class EpisodeWriter:
     Until then everything is in a hidden folder beside it, synced about twice a second. After an error, a kill or a
     power cut it stays there for finish_killed(), unless nothing was recorded.
 
-    folder: the folder to make, e.g. episodes/episode_20251007_144013; it must not exist. Its name is the episode's id.
-    resolution: (width, height) of the frames; None: that of the first frame. flags: write the two columns that say what
-    was measured (see above).
-    Raises EpisodeError for an existing folder, frames of another size, times or pulses that are not finite
-    numbers, an episode without a frame or a control, or a disk that takes no more.
+    folder: must not exist; its name is the episode's id. resolution: (width, height) of the frames; None: that of the
+    first. flags: write the two columns that say what was measured. Raises EpisodeError for an existing folder, frames
+    of another size, values that are no numbers, an episode without a frame or a control, or a disk that takes no more.
     """
 
     def __init__(
@@ -141,11 +135,9 @@ class EpisodeWriter:
                 part.mkdir()
                 self._lock = lock_folder(part)
         if self._lock is None:
-            raise EpisodeError(
-                f"{self.folder}: is being recorded, or was when its program was killed",
-                remedy=f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded",
-                kind="exists",
-            )
+            what = f"{self.folder}: is being recorded, or was when its program was killed"
+            remedy = f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded"
+            raise EpisodeError(what, remedy=remedy, kind="exists")
         self._part = part
         try:
             with self._disk():
@@ -178,10 +170,8 @@ class EpisodeWriter:
         self._check_time(t_system_s)
         row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
         row["arduino_timestamp"], row["system_timestamp"] = arduino_ms, float(t_system_s)
-        for name, pulse_us, period_us, flag in (
-            ("steering", steering_us, steering_period_us, FLAG_FIELDS[0]),
-            ("throttle", throttle_us, throttle_period_us, FLAG_FIELDS[1]),
-        ):
+        pulses = ("steering", steering_us, steering_period_us), ("throttle", throttle_us, throttle_period_us)
+        for name, pulse_us, period_us in pulses:
             action = None
             if not (self.flags and (pulse_us is None or period_us is None)):
                 if not is_whole(pulse_us, 0) or not is_whole(period_us, 0):
@@ -192,7 +182,7 @@ class EpisodeWriter:
                 row[f"{name}_normalized"] = round(action or 0.0, 4) + 0.0  # + 0.0: no "-0.0" in the file
                 row[f"{name}_raw_us"], row[f"{name}_period_us"] = pulse_us, period_us
             if self.flags:
-                row[flag] = action is not None
+                row[f"{name}_measured"] = action is not None
         self._extra |= dict.fromkeys(extra)
         self._append("control", plain(extra) | row, t_system_s)
         self.controls += 1
@@ -321,9 +311,8 @@ class EpisodeWriter:
 
     def _refuse_existing(self) -> None:
         if os.path.lexists(self.folder):
-            raise EpisodeError(
-                f"{self.folder}: exists already", remedy="name another folder, or move it away first", kind="exists"
-            )
+            remedy = "name another folder, or move it away first"
+            raise EpisodeError(f"{self.folder}: exists already", remedy=remedy, kind="exists")
 
     def _write(self, part: Path) -> None:
         """Write the three files in the hidden folder."""
@@ -335,6 +324,7 @@ class EpisodeWriter:
         start_s = self._first_s if about.start_time_s is None else about.start_time_s
         end_s = self._last_s if about.end_time_s is None else about.end_time_s
         duration_s = end_s - start_s
+        rates = [count / duration_s if duration_s > 0 else 0 for count in (self.controls, self.frames)]
         head = {
             "episode_id": self.folder.name,
             "action_label": about.label,
@@ -347,15 +337,13 @@ class EpisodeWriter:
                 "arduino_port": about.arduino_port,
                 "total_control_samples": self.controls,
                 "total_frames": self.frames,
-                "avg_control_rate": self.controls / duration_s if duration_s > 0 else 0,
-                "avg_frame_rate": self.frames / duration_s if duration_s > 0 else 0,
+                "avg_control_rate": rates[0],
+                "avg_frame_rate": rates[1],
                 **plain(self.metadata),
             },
         }
-        columns = {
-            "control": (*CONTROL_FIELDS, *(FLAG_FIELDS if self.flags else ()), *self._extra),
-            "frame": FRAME_FIELDS,
-        }
+        controls = (*CONTROL_FIELDS, *(FLAG_FIELDS if self.flags else ()), *self._extra)
+        columns = {"control": controls, "frame": FRAME_FIELDS}
         with atomic_path(part / DATA) as path, path.open("w") as f:
             # As json.dumps(episode, indent=2) would, but a row at a time: a long drive does not fit in memory.
             f.write(json.dumps(head, indent=2, allow_nan=False).removesuffix("\n}"))
@@ -396,16 +384,15 @@ def remove_if_empty(part: Path) -> bool:
 def finish_killed(part: Path) -> Path | None:
     """Make an episode of what a killed recording has left, and return its folder; None, if nothing was recorded.
 
-    A row or a picture that was cut is left out; metadata.fault counts them. Raises EpisodeError, and removes nothing,
-    if there are no controls or no pictures, or if another process is recording or finishing it.
+    What was cut is left out, and metadata.fault counts it. Raises EpisodeError, and removes nothing,
+    without controls or pictures, or if another process is recording or finishing it.
     """
     folder = part.with_name(part.name.removeprefix(".").removesuffix(PART))
     if remove_if_empty(part):
         return None
     if (lock := lock_folder(part)) is None:
-        raise EpisodeError(
-            f"{folder}: is being recorded, or finished by another process", remedy="wait until it is", kind="exists"
-        )
+        what = f"{folder}: is being recorded, or finished by another process"
+        raise EpisodeError(what, remedy="wait until it is", kind="exists")
     try:
         told = json.loads(_data_of(part / ABOUT))
         writer = EpisodeWriter(folder, About(**told["about"]), resolution=None, flags=told["flags"])
@@ -454,20 +441,14 @@ def number_of(value: object) -> float | None:
 
 
 def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
-    """Return whether a row of a recording says that its channel, "steering" or "throttle", was not measured.
-
-    It says so by its flag, or by having no value for the channel.
-    """
+    """Whether a row says, by its flag or by no value, that its channel, "steering" or "throttle", was not measured."""
     flag = row.get(f"{channel}_measured")
     values = (row.get(f"{channel}_{part}") for part in ("normalized", "raw_us", "period_us"))
     return str(flag).strip().lower() in ("false", "0") or all(v is None or v == "" for v in values)
 
 
 def driver_of(row: Mapping[str, Any]) -> str | None:
-    """Return who drove at a row of a recording, one of DRIVERS; None if the row says something else.
-
-    If it says nothing, a policy drove if the row names an artifact's mode, and otherwise a human.
-    """
+    """Return who drove, one of DRIVERS; by default a policy if it names a mode, else a human. None: unknown."""
     said = row.get("driver")
     if said is None or said == "":
         return POLICY if row.get("mode") else HUMAN
@@ -475,10 +456,7 @@ def driver_of(row: Mapping[str, Any]) -> str | None:
 
 
 def arduino_step_s(before_s: float, after_s: float) -> float:
-    """Return the seconds between two readings of the Arduino's clock, also if it wrapped between them.
-
-    Returns NaN if the clock stood still or went back (a reset), or if a reading is NaN.
-    """
+    """Return the seconds between two readings of the Arduino's clock, which may wrap; NaN if it did not go on."""
     step_s, wrap_s = after_s - before_s, ARDUINO_WRAP_MS / 1000
     if before_s < wrap_s and -wrap_s < step_s < -wrap_s / 2:
         step_s += wrap_s
@@ -486,21 +464,14 @@ def arduino_step_s(before_s: float, after_s: float) -> float:
 
 
 def find_backlog(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[bool]:
-    """Return for each control whether the next one arrived so soon after it that both had waited in a buffer.
-
-    The usual interval is the median of the steps of the Arduino's clock. The last control is never late.
-    """
+    """Return for each control whether the next one arrived so soon after it that both had waited in a buffer."""
     steps = [step for a, b in pairwise(arduino_s) if (step := arduino_step_s(a, b)) < 1]
     usual_s = float(np.median(steps)) if steps else 0.033
     return [b - a < BURST_SHARE * usual_s for a, b in pairwise(system_s)] + [False]
 
 
 def read_car_of(folder: Path | str) -> Car:
-    """Return the car whose pulses an episode folder contains, from its metadata.
-
-    If the metadata do not describe one, it is the default, the car of the first recordings. Raises CarError if the
-    description is not that of a car.
-    """
+    """Return the car whose pulses an episode contains, by its metadata, or the default. Raises CarError for no car."""
     try:
         metadata = json.loads(_data_of(Path(folder) / DATA))["metadata"]
         described, said = metadata.get("car"), metadata.get("steering_positive")
@@ -520,10 +491,9 @@ def _data_of(path: Path) -> bytes:
         return b""
 
 
-def json_controls(path: Path, key: str = "control_samples") -> list[dict[str, Any]]:
-    """Return the controls, or what else is under `key`, in an episode_data.json; none if it cannot be read."""
+def json_controls(path: Path) -> list[dict[str, Any]]:
+    """Return the controls in an episode_data.json; none if it cannot be read."""
     try:
-        content = json.loads(_data_of(path))
-        return [row for row in content[key] if isinstance(row, dict)]
+        return [row for row in json.loads(_data_of(path))["control_samples"] if isinstance(row, dict)]
     except (ValueError, RecursionError, TypeError, KeyError):
         return []

@@ -1,10 +1,4 @@
-"""Label recorded drives: whether a drive succeeded is noted afterwards in its episode, and may be changed any time.
-
-    label([Path("episodes/episode_20261007_144013")], "hit")     # or "missed"; "none" takes it back
-
-The outcome is `metadata.outcome` in episode_data.json. It is one of a few values and not free text, because outcomes
-are counted, and LeRobot's `next.success` is yes or no. What the drive was meant to do is the episode's action_label.
-"""
+"""Label recorded drives: whether a drive succeeded is noted afterwards, as `metadata.outcome`, and may be changed."""
 
 import json
 import os
@@ -21,10 +15,10 @@ CHOICES = (HIT, MISSED, NONE)
 
 
 def label(episodes: Sequence[Path], outcome: str) -> None:
-    """Note an outcome, one of CHOICES, in each of these episode folders.
+    """Note an outcome, one of CHOICES, in each of these episode folders; all are read before the first is written.
 
-    All episodes are read before the first is written. Owner and mode of a file stay the same, so that a rover's service
-    can still read it. Raises EpisodeError for one without a complete episode_data.json, or that cannot be written.
+    Owner and mode of a file stay the same, so that a rover's service can still read it. Raises EpisodeError for one
+    without a complete episode_data.json, or that cannot be written.
     """
     for path, text in [_relabelled(episode / DATA, outcome) for episode in episodes]:
         try:

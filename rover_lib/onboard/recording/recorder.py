@@ -1,9 +1,7 @@
 """Record on the car: an episode while the control loop runs, or an episode of a human who drives.
 
-The recorder's own thread takes frames and writes everything to disk; the loop only hands over controls. All times are
-taken from the monotonic clock, which is mapped to the system's clock once, at the start. So it does not matter if NTP
-sets the system's clock meanwhile. A fault of the recorder never stops a drive: it is logged once, and what was recorded
-until then is kept.
+All times are the monotonic clock's, which is mapped to the system's clock once, at the start, as NTP may set that one
+meanwhile. A fault of the recorder never stops a drive: it is logged once, and what was recorded until then is kept.
 """
 
 import contextlib
@@ -40,9 +38,8 @@ class Recorder:
     """Records an episode while a loop runs. The loop hands over controls, and a thread takes frames from the camera.
 
     folder: where the episode appears on close(), named episode_YYYYMMDD_HHMMSS by its start in local time (a second
-    later if that name is taken). about: description of the episode; its fps is set to the lower of rate_hz and the
-    camera's rate. rate_hz: maximum frames per second. most_bytes: size limit of the episode, see room_for(); None:
-    limited by the disk only. Raises EpisodeError if there is no room to record; later faults are in `failure`.
+    later if that name is taken). rate_hz: maximum frames per second. most_bytes: of the episode; None: limited by the
+    disk only. Raises EpisodeError if there is no room to record; later faults are in `failure`.
     """
 
     def __init__(
@@ -104,8 +101,7 @@ class Recorder:
     def close(self, fault: str | None = None, unwanted: bool = False) -> Path | None:
         """End the episode and return its folder; None if there is no usable episode, and `failure` says why.
 
-        fault: the fault that ended it, if there was one. An episode that a fault ended is kept as far as it goes; the
-        fault is noted in its metadata and in `failure`. unwanted: remove all of it.
+        fault: what ended it; the episode is kept as far as it goes, and notes it. unwanted: remove all of it.
         """
         self._unwanted = unwanted
         if fault and not unwanted and not self._closing.is_set():
@@ -118,12 +114,10 @@ class Recorder:
 
     @property
     def controls(self) -> int:
-        """How many controls were written."""
         return self._writer.controls
 
     @property
     def frames(self) -> int:
-        """How many frames were written."""
         return self._writer.frames
 
     def _fail(self, sentence: str) -> None:
@@ -186,8 +180,7 @@ class Recorder:
 def room_for(folder: Path | str, most_mb: float) -> int:
     """Return the bytes that the next episode may take in a folder whose whole content may take most_mb.
 
-    It looks at every file in the folder. The result is at most half of the free disk: an episode is packed on the same
-    disk to be fetched, and a new model needs room as well.
+    At most half of the free disk: an episode is packed on it to be fetched, and a new model needs room as well.
     """
     folder = Path(folder)
     taken = sum(path.lstat().st_size for path in folder.rglob("*"))
@@ -217,8 +210,8 @@ def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
 class RecordReport:
     """What was recorded.
 
-    folder: of the episode, None if there is no usable one. seconds: its duration. not_measured: number of controls
-    without a pulse of steering, and of throttle. fault: what ended it, None if it was asked to end.
+    folder: None if there is no usable episode. not_measured: number of controls without a pulse of steering, and of
+    throttle. fault: what ended it, None if it was asked to end.
     """
 
     folder: Path | None
@@ -251,9 +244,9 @@ def record(
 ) -> RecordReport:
     """Record one episode of a human who drives, until `stop` is set or max_seconds are over.
 
-    At each tick of rate_hz, the Arduino's newest status is recorded as a control, with the time at which it arrived; no
-    status is recorded twice. If something else ends the episode, it is in the report's `fault`, and what was recorded
-    until then is kept. status: a stream for a status line for people. Raises EpisodeError if recording cannot begin.
+    At each tick of rate_hz, the Arduino's newest status is recorded as a control, none twice. If something else ends
+    the episode, it is in the report's `fault`. status: a stream for a status line. Raises EpisodeError if recording
+    cannot begin.
     """
     stop = stop or threading.Event()
     lost = 0, 0
@@ -306,9 +299,8 @@ def record_episodes(
 ) -> Iterator[RecordReport]:
     """Open camera and Arduino, and record one episode after another. Call it in the main thread: it handles signals.
 
-    options: further arguments of record(), for each episode. notify: is called with sentences for people. SIGINT ends
-    an episode. A second SIGINT, or one in the pause before the next episode, ends the recording, as SIGTERM, SIGHUP,
-    SIGQUIT and a fault do. Raises RoverError if recording cannot begin.
+    options: of record(). SIGINT ends an episode; a second one, or one in the pause before the next episode, ends the
+    recording, as SIGTERM, SIGHUP, SIGQUIT and a fault do. Raises RoverError if recording cannot begin.
     """
     stop, leave = SignalEvent(), SignalEvent()
 

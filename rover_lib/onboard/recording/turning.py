@@ -1,11 +1,7 @@
 """Measure to which side a recorded car turns for positive steering, from what its camera shows.
 
-    print(measure_turning("episode_20260101_120000", steering, samples).words())
-
-When a car turns right, the background moves to the left. So steering is correlated with the horizontal shift of the
-pictures' upper part between frames (OpenCV's optical flow, the median of the points that are found again both ways).
-The car follows its steering late, so the delay with the strongest correlation counts. Neighbouring frames say nearly
-the same, so the correlation is judged as one of far fewer, independent frames (Bartlett's formula).
+Steering is correlated with the horizontal shift of the pictures' upper part between frames (optical flow), at the delay
+with the strongest correlation, which is judged as one of far fewer, independent frames (Bartlett's formula).
 """
 
 import math
@@ -42,9 +38,9 @@ class Shot(Protocol):
 
 @dataclass(frozen=True)
 class Turning:
-    """One recording's result. correlation: of steering with the shift of the background to the right, None without any.
+    """correlation: of steering with the shift of the background to the right. sure: its standard errors from 0.
 
-    sure: how many standard errors it is from 0. spread: the standard deviation of its steering, a share of full.
+    spread: the standard deviation of steering, a share of full.
     """
 
     episode: str

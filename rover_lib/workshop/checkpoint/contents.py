@@ -1,28 +1,28 @@
 """What both formats of a checkpoint hold: named weights, checked against what LeRobot builds of the config."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from rover_lib.onboard.checked import is_whole
-from rover_lib.onboard.errors import CheckpointError
-from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, expected_shapes
+from rover_lib.onboard.artifact.manifest import RULES
+from rover_lib.onboard.checked import broken_rule, is_whole
+from rover_lib.onboard.errors import CheckpointError, printable
+from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, lerobot_act
 from rover_lib.workshop.untrusted import quote, quote_all
 
 # Config, weights by LeRobot's names without the leading `model.`, and more for the report.
 Contents = tuple[ActConfig, dict[str, Tensor], dict[str, Any]]
 
 TWO_ACTIONS = ("steering", "throttle")
-# Bounds, each far above what a policy of full size has.
-LARGEST_SIDE_PX = 8192  # the largest picture of a Pi's cameras has 4608 pixels a side
-MOST_NUMBERS = 1000  # actions, and numbers in a state
-
-# The remedies that help most often.
+MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_limits` has seen them all
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
-IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole?"
+MIGRATE = "convert one of before LeRobot 0.4 by its lerobot.processor.migrate_policy_normalization"
+IS_IT_WHOLE = f"is it an ACTPolicy of LeRobot, and whole? {MIGRATE}"
 FIRST_WEIGHT = "backbone.conv1.weight"  # every ACT has it once, so what is before it is before all its names
 
 
@@ -36,10 +36,8 @@ def name_weights(path: Path, state: dict[Any, Any]) -> tuple[dict[str, Tensor], 
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
     state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
     if odd := [k for k, v in state.items() if not isinstance(k, str) or not _is_weight(v)]:
-        raise CheckpointError(
-            f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}",
-            remedy="save policy.state_dict() as it was trained",
-        )
+        what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
+        raise CheckpointError(what, remedy="save policy.state_dict() as it was trained")
     begins = {k.removesuffix(FIRST_WEIGHT) for k in state if k.endswith(FIRST_WEIGHT)}
     prefix = begins.pop() if len(begins) == 1 else "model."
     if outside := [k for k in state if not k.startswith(prefix)]:
@@ -58,6 +56,31 @@ def name_numbers(count: int, stem: str) -> tuple[str, ...]:
     return TWO_ACTIONS if count == 2 else tuple(f"{stem}_{i}" for i in range(count))
 
 
+@contextmanager
+def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
+    """Turn whatever LeRobot, or a reader below it, raises into a CheckpointError of one sentence."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except Exception as e:  # each library raises types of its own
+        reason = printable(" ".join(f"{type(e).__name__}: {e}".split())[:200])
+        raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None
+
+
+def check_limits(path: Path, c: ActConfig) -> None:
+    """Raise CheckpointError for sizes, names or a rate that no artifact's manifest may hold.
+
+    Plans of a million steps, from a file of a few megabytes, would fill the memory with the samples of a drive.
+    """
+    cameras = [{"name": n, "height": h, "width": w} for n, (h, w) in zip(c.cameras, c.image_sizes, strict=True)]
+    names = {"state_names": list(c.state_names), "action_names": list(c.action_names)}
+    values = {"cameras": cameras, **names, "chunk": c.chunk, "rate_hz": c.rate_hz}
+    if broken := broken_rule(values, {name: RULES[name] for name in values}):
+        name, must, found = broken
+        raise CheckpointError(f"{path}: {name} must be {must}", found=found, remedy=CORRECT_IT)
+
+
 def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor]) -> None:
     """Raise CheckpointError unless LeRobot's ACT of this config has exactly these weights, and all are finite.
 
@@ -65,38 +88,21 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor]) -> None:
     """
     for key, value, known in (("backbone", c.backbone, BACKBONES), ("activation", c.activation, ACTIVATIONS)):
         if not isinstance(value, str) or value not in known:
-            raise CheckpointError(
-                f"{path}: {key} {quote(value)} is not known here", remedy=f"known are {', '.join(sorted(known))}"
-            )
+            what = f"{path}: {key} {quote(value)} is not known here"
+            raise CheckpointError(what, remedy=f"known are {', '.join(sorted(known))}")
     sizes = (c.chunk, c.dim, c.heads, c.feedforward, c.encoder_layers, c.decoder_layers)
     positions = tuple(weights["decoder_pos_embed.weight"].shape) if "decoder_pos_embed.weight" in weights else None
     whole = all(is_whole(size, 1) for size in sizes)  # LeRobot 0.6 lets None pass
-    if not whole or positions != (c.chunk, c.dim) or c.encoder_layers + c.decoder_layers > len(weights):
-        raise CheckpointError(
-            f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)",
-            found=f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}",
-            remedy=CORRECT_IT,
-        )
-    if c.dim % 4:
-        raise CheckpointError(f"{path}: a width of {c.dim} has no 2-d positions", remedy="use a multiple of 4")
-    try:
-        expected = expected_shapes(c)
-    except Exception as e:  # torch, torchvision and LeRobot raise types of their own
-        raise CheckpointError(f"{path}: LeRobot cannot build it ({quote(str(e))})", remedy=CORRECT_IT) from None
-    shapes = {name: tuple(w.shape) for name, w in weights.items()}
-    problems = {
-        "missing": sorted(expected.keys() - shapes.keys()),
-        "unknown": sorted(shapes.keys() - expected.keys()),
-        "of another shape": [
-            f"{k} is {shapes[k]}, not {expected[k]}" for k in expected if shapes.get(k, expected[k]) != expected[k]
-        ],
-    }
-    if said := [f"{what}: {quote_all(names)}" for what, names in problems.items() if names]:
-        raise CheckpointError(f"{path}: config and weights do not agree ({'; '.join(said)})", remedy=CORRECT_IT)
+    deep = not whole or c.encoder_layers + c.decoder_layers > len(weights)
+    if deep or positions != (c.chunk, c.dim) or c.dim % 4:  # a quarter of the width for each sine and cosine
+        what = f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)"
+        found = f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}"
+        raise CheckpointError(what, found=found, remedy=CORRECT_IT)
+    with as_checkpoint_error(path, CORRECT_IT):
+        lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
-        raise CheckpointError(
-            f"{path}: NaN or Inf in {quote_all(bad)}", remedy="training diverged, take an earlier checkpoint"
-        )
+        what = f"{path}: NaN or Inf in {quote_all(bad)}"
+        raise CheckpointError(what, remedy="training diverged, take an earlier checkpoint")
 
 
 def tensor_bytes(value: Any) -> int:

@@ -1,7 +1,6 @@
 """Checkpoints out: a policy's weights as the trainer's best_model.pth, and as LeRobot's pretrained_model/ folder.
 
-`checkpoint` reads both again. `origin` goes into both: where the weights come from, as plain JSON. In LeRobot's folder
-it also says how many steps of a plan make a second, for which neither format has a place.
+`origin`, plain JSON, says where the weights come from; in LeRobot's folder also how many steps of a plan make a second.
 """
 
 import json
@@ -19,8 +18,7 @@ from rover_lib.workshop.act import ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
 
 Weights = dict[str, Tensor]
-# Settings of the user's trainer, which its checkpoints name:
-DROPOUT = 0.1  # LeRobot's default
+DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too
 KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)
@@ -29,9 +27,7 @@ EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 
 
 def trainer_can_hold(config: ActConfig) -> bool:
-    """Whether the trainer's format has a place for this policy: 30 steps a second, ImageNet's normalisation of one
-    camera, no other.
-    """
+    """Whether the trainer's format can hold it: 30 steps a second, ImageNet's normalisation of one camera, no other."""
     normal = config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
     return normal and config.rate_hz == RATE_HZ
 
@@ -39,17 +35,14 @@ def trainer_can_hold(config: ActConfig) -> bool:
 def write_trainer(
     path: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
 ) -> None:
-    """One file in the format of the user's trainer. weights: LeRobot's names without the leading `model.`. settings: of
-    its training, as `trainer_config` wants them.
+    """One file in the format of the user's trainer, without an optimizer's state, which was of another loss.
 
-    No optimizer state: it was of another loss. Raises CheckpointError for a policy whose rate or normalisation that
-    format cannot hold: it knows ImageNet's for the picture, and none for states and actions; and as `atomic_path`.
+    weights: by LeRobot's names without the leading `model.`. settings: as `trainer_config` wants them. Raises
+    CheckpointError unless `trainer_can_hold`, and as `atomic_path`.
     """
     if not trainer_can_hold(config):
-        raise CheckpointError(
-            f"{path}: the trainer's format cannot hold this policy's normalisation or rate",
-            remedy="use LeRobot's folder",
-        )
+        what = f"{path}: the trainer's format cannot hold this policy's normalisation or rate"
+        raise CheckpointError(what, remedy="use LeRobot's folder")
     content = {
         "epoch": 0,
         "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},
@@ -62,9 +55,9 @@ def write_trainer(
 
 
 def save_torch(path: Path, content: Any) -> None:
-    """Write what torch.load reads, atomically. The same content gives the same bytes: torch would name it by the file.
+    """Write what torch.load reads, the same bytes for the same content: torch would name it by the file.
 
-    Raises as `atomic_path`.
+    Atomically; raises as `atomic_path`.
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         torch.save(content, file)
@@ -105,8 +98,9 @@ def write_lerobot(folder: Path, config: ActConfig, weights: Weights, origin: dic
 def write_both(
     folder: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
 ) -> dict[str, str]:
-    """pretrained_model/ in a folder, and best_model.pth where the trainer's format can hold the policy. Arguments as of
-    `write_trainer`. Returns sha256 by name: of the weights' file of the one, and of the other.
+    """pretrained_model/ in a folder, and best_model.pth where `trainer_can_hold`. Arguments as of `write_trainer`.
+
+    Returns sha256 by name: of the weights' file of the one, and of the other.
     """
     files = {"model.safetensors": folder / "pretrained_model" / "model.safetensors"}
     write_lerobot(folder / "pretrained_model", config, weights, origin)
@@ -131,9 +125,8 @@ def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
 def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
     """Return the config of the user's trainer as a plain dict, key for key.
 
-    known: learning_rate, batch_size, data_dir, output_dir, device and seed, and rate_hz, the steps per second of its
-    plans, which is written if it is not the trainer's 30. Give folders by their name only, because a checkpoint is
-    shown to others.
+    known: learning_rate, batch_size, data_dir and output_dir (by name only: a checkpoint is shown to others), device,
+    seed, and rate_hz, written if it is not the trainer's 30.
     """
     ((height, width),) = size.image_sizes
     rate_hz = known.pop("rate_hz", RATE_HZ)

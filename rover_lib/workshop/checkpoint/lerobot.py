@@ -4,9 +4,7 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
-import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,21 +13,20 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from rover_lib.onboard.checked import is_number, is_whole
+from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
-from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import (
-    COPY_AGAIN,
-    LARGEST_SIDE_PX,
-    MOST_NUMBERS,
+    MIGRATE,
+    MOST,
     Contents,
+    as_checkpoint_error,
     name_numbers,
     name_weights,
 )
 from rover_lib.workshop.recordings.samples import camera_names
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -37,48 +34,36 @@ if TYPE_CHECKING:
 
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
-PRETRAINED, ADAPTER = "pretrained_model", "adapter_config.json"
+PRETRAINED = "pretrained_model"
 ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
-# Each processor's file, its step that normalises, and how its statistics were named among the weights before 0.4.
-INNER = "policy_preprocessor.json", "normalizer_processor", "normalize_inputs.buffer_"
-OUTER = "policy_postprocessor.json", "unnormalizer_processor", "unnormalize_outputs.buffer_"
-BUFFERS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
+# Each processor's file, and its step that normalises.
+INNER = "policy_preprocessor.json", "normalizer_processor"
+OUTER = "policy_postprocessor.json", "unnormalizer_processor"
 HARMLESS = ("rename_observations_processor", "to_batch_processor", "device_processor")  # they change no number
 
 
-def lerobot_folder(path: Path) -> tuple[Path, list[str]] | None:
-    """Find the folder with a policy's config: `path` itself, or one inside, as `lerobot-train` arranges them.
+def lerobot_folder(path: Path) -> Path:
+    """Return the folder with a policy's config: `path` itself, or one inside, as `lerobot-train` arranges them.
 
-    Return it with a note if it is another than the last. None if there is none. Raises CheckpointError for an output
-    folder that has several checkpoints, but no link to the last.
+    Raises CheckpointError if there is none, or no link to the last of several.
     """
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
-        if any((path / inner / name).exists() for name in ("config.json", ADAPTER)):
-            return path / inner, []
-    for steps in (path / "checkpoints", path):
-        if found := sorted(p.parent.name for p in steps.glob(f"*/{PRETRAINED}")):
-            if len(found) == 1:
-                return steps / found[0] / PRETRAINED, [f"'last' leads nowhere: taken is {found[0]}, the only one there"]
-            raise CheckpointError(
-                f"{steps}: it does not say which of its checkpoints is the last",
-                found=quote_all(found),
-                remedy=f"give one of them, as in {steps / found[-1]}",
-            )
-    return None
+        if (path / inner / "config.json").exists():
+            return path / inner
+    found = sorted(p.parent.name for steps in (path, path / "checkpoints") for p in steps.glob(f"*/{PRETRAINED}"))
+    what = f"{path}: no config.json, nor a link to the last checkpoint"
+    remedy = "give best_model.pth, or one pretrained_model folder with config.json; merge an adapter before"
+    raise CheckpointError(what, found=quote_all(found) or "none", remedy=remedy)
 
 
 def read_lerobot(folder: Path) -> Contents:
     """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
-    _refuse_pieces(folder)
     said, notes = _act_config(folder)
-    state, buffers = _read_safetensors(folder / "model.safetensors"), {}
-    for name in list(state):  # also inside of what torch.compile puts around a policy, see name_weights
-        if begin := next((b for b in BUFFERS if name.startswith(b) or f".{b}" in name), None):
-            buffers[name[name.index(begin) :]] = state.pop(name)
-    weights, more = name_weights(folder, state)
-    inner, outer = Normaliser(folder, *INNER, said, buffers), Normaliser(folder, *OUTER, said, buffers)
+    weights, more = name_weights(folder, _read_safetensors(folder / "model.safetensors"))
+    inner, outer = Normaliser(folder, *INNER, said), Normaliser(folder, *OUTER, said)
+    origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
-    with _as_checkpoint_error(folder):
+    with as_checkpoint_error(folder):
         config = ActConfig(
             cameras=tuple(camera_names(inner.recorded_cameras(images))),
             image_sizes=tuple((f.shape[1], f.shape[2]) for f in images.values()),
@@ -96,7 +81,7 @@ def read_lerobot(folder: Path) -> Contents:
             dilation=bool(said.replace_final_stride_with_dilation),
             pre_norm=said.pre_norm,
             activation=said.feedforward_activation,
-            rate_hz=_own_rate_hz(folder),
+            rate_hz=float(origin.get("rate_hz", RATE_HZ)),
             image_norm=tuple(
                 inner.affine(key, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for key in images
             ),
@@ -104,26 +89,20 @@ def read_lerobot(folder: Path) -> Contents:
             sees_state=numbers is not None,
             action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
         )
-    sources = {"in": inner.source, "out": outer.source}
-    written = (folder / ORIGIN).exists()
-    extra = {"optimizer_mb": 0.0, "normalisation_from": sources, "written_here": written, "notes": more + notes}
-    return config, weights, extra
+    return config, weights, {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": more + notes}
 
 
 def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
     """Return the config as LeRobot reads it, and notes on what it asks for beyond the network.
 
-    Raises CheckpointError for one that LeRobot refuses, and for features that a car with cameras does not have.
+    Raises CheckpointError.
     """
     path = folder / "config.json"
     raw = _read_json(path)
     if raw.get("type") != "act":
-        raise CheckpointError(
-            f"{path}: policy type is {quote(raw.get('type'))}",
-            remedy="only 'act' is known here; convert one of before 2025 by LeRobot's "
-            "lerobot.processor.migrate_policy_normalization",
-        )
-    with _as_checkpoint_error(path):
+        what = f"{path}: policy type is {quote(raw.get('type'))}"
+        raise CheckpointError(what, remedy=f"only 'act' is known; {MIGRATE}")
+    with as_checkpoint_error(path):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
 
@@ -132,26 +111,17 @@ def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
         said = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in known} | {"device": "cpu"})
         cameras = [tuple(camera.shape) for camera in said.image_features.values()]
         rows = [tuple(row.shape) for row in (said.robot_state_feature, said.action_feature) if row]
-        whole = all(is_whole(n, 1, LARGEST_SIDE_PX) for shape in (*cameras, *rows) for n in shape)
+        whole = all(is_whole(n, 1, MOST) for shape in (*cameras, *rows) for n in shape)
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
-    if (
-        not (cameras and said.action_feature and whole and right)
-        or said.env_state_feature
-        or max(rows)[0] > MOST_NUMBERS
-    ):
+    if not (cameras and said.action_feature and whole and right) or said.env_state_feature:
         features = {**said.input_features, **said.output_features}
-        raise CheckpointError(
-            f"{folder}: its features are not a car's: cameras (3, height, width), numbers in 'observation.state' or "
-            "none, and in 'action'",
-            found=quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items()),
-            remedy="train a policy of these",
-        )
+        found = quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items())
+        remedy = "train with cameras (3, height, width), numbers in 'action', and in 'observation.state' or none"
+        raise CheckpointError(f"{folder}: its features are not a car's", found=found, remedy=remedy)
     notes = []
     if said.temporal_ensemble_coeff is not None:
-        notes.append(
-            f"temporal_ensemble_coeff is {said.temporal_ensemble_coeff}: LeRobot would drive by averages of plans; "
-            "here the car drives by the newest plan alone"
-        )
+        coefficient = f"temporal_ensemble_coeff is {said.temporal_ensemble_coeff}"
+        notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
     if unknown := sorted(set(raw) - known - {"type", "pretrained_revision"}):
         notes.append(f"config.json has what no ACT of LeRobot 0.4 or 0.6 has, not used: {quote_all(unknown)}")
     return said, notes
@@ -160,39 +130,27 @@ def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
 class Normaliser:
     """Says how LeRobot normalises each input, or each output, as an Affine.
 
-    A processor's file has it; before LeRobot 0.4 the config and buffers beside the weights had it. A feature that has
-    no statistics and whose mode is not IDENTITY is refused: LeRobot silently leaves it as it is, and an output in
-    standard deviations would become a servo's pulse.
-
-    file, step, prefix: INNER or OUTER. said: the policy's config. buffers: the weights' file's, by names of BUFFERS.
+    LeRobot silently leaves a feature without statistics as it is, and an output in standard deviations would become a
+    servo's pulse. file, step: INNER or OUTER. said: the policy's config, whose modes hold where there is no file.
     """
 
-    def __init__(
-        self, folder: Path, file: str, step: str, prefix: str, said: "ACTConfig", buffers: Mapping[str, Tensor]
-    ):
+    def __init__(self, folder: Path, file: str, step: str, said: "ACTConfig"):
         from lerobot.processor.normalize_processor import NormalizerProcessorStep
 
-        self.where, self.source = folder / file, f"{file}, LeRobot's processor"
+        self.where = folder / file
         self.renames: dict[str, str] = {}  # what the recordings call an observation: what the policy calls it
         if self.where.exists():
             self.step = self._read_step(folder, step)
-            return
-        self.where = folder / "config.json"
-        features = {**said.input_features, **said.output_features}
-        stats: dict[str, Tensor] = {}
-        for key in features:
-            begin = f"{prefix}{key.replace('.', '_')}."
-            stats |= {f"{key}.{k.removeprefix(begin)}": v for k, v in buffers.items() if k.startswith(begin)}
-        self.step = NormalizerProcessorStep(features, said.normalization_mapping)
-        self.step.load_state_dict(stats)
-        self.source = "the weights' file, as LeRobot did before 0.4" if stats else "config.json: IDENTITY"
+        else:
+            features = {**said.input_features, **said.output_features}
+            self.step = NormalizerProcessorStep(features, said.normalization_mapping)
 
     def _read_step(self, folder: Path, normalises: str) -> "NormalizerProcessorStep":
         """Return the step that normalises, as LeRobot reads it. Raises CheckpointError for a step that is unknown."""
         from lerobot.processor.normalize_processor import NormalizerProcessorStep
 
         content, read = _read_json(self.where), []
-        with _as_checkpoint_error(self.where):
+        with as_checkpoint_error(self.where):
             for step in content["steps"]:
                 name, config = step["registry_name"], step.get("config") or {}
                 if name == normalises:
@@ -200,34 +158,28 @@ class Normaliser:
                     if file := step.get("state_file"):
                         read[-1].load_state_dict(_read_safetensors(folder / Path(file).name))
                 elif name not in HARMLESS:
-                    raise CheckpointError(
-                        f"{self.where}: has a processor step that is not known here: {quote(name)}",
-                        remedy="train without it, or do in the recordings what it does",
-                    )
+                    what = f"{self.where}: has a processor step that is not known here: {quote(name)}"
+                    raise CheckpointError(what, remedy="train without it, or do in the recordings what it does")
                 self.renames |= config.get("rename_map", {})
         if len(read) != 1 or read[0].normalize_observation_keys is not None:
-            raise CheckpointError(
-                f"{self.where}: normalises {len(read)} times, or some of the observations only",
-                remedy="copy the whole folder again, or train with LeRobot's own single step",
-            )
+            what = f"{self.where}: normalises {len(read)} times, or some of the observations only"
+            raise CheckpointError(what, remedy="copy the folder again, or train with LeRobot's own single step")
         return read[0]
 
     def recorded_cameras(self, images: Mapping[str, Any]) -> list[str]:
         """Return each of the policy's cameras by its key in the recordings, as --rename_map was given in training."""
         sources = {new: old for old, new in self.renames.items()}
         if not sources.keys() <= images.keys() or len(sources) < len(self.renames):
-            raise CheckpointError(
-                f"{self.where}: renames other observations than cameras",
-                found=f"{quote_all(f'{old} to {new}' for old, new in self.renames.items())}, of {quote_all(images)}",
-                remedy="rename them in the dataset, in meta/info.json and the tables, and train without --rename_map",
-            )
+            found = quote_all(f"{old} to {new}" for old, new in self.renames.items())
+            remedy = "rename them in the dataset, in meta/info.json and the tables, and train without --rename_map"
+            raise CheckpointError(f"{self.where}: renames other observations than cameras", found=found, remedy=remedy)
         return [sources.get(key, key) for key in images]
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.
 
-        key: the feature's name. kind: its type, for which the step has a mode. shape: of one value of it. inverse: undo
-        the normalisation, as for an output. Raises CheckpointError for missing or wrong statistics.
+        key, kind, shape: the feature's. inverse: undo the normalisation, as for an output. Raises CheckpointError for
+        missing or wrong statistics.
         """
         step, own = self.step, self.step.features.get(key)
         if own and not inverse:
@@ -237,22 +189,16 @@ class Normaliser:
             return None
         stats = [name for name in step.state_dict() if name.startswith(f"{key}.")]
         if mode is None or not stats or not (inverse or (own and kind != "ACTION")):
-            raise CheckpointError(
-                f"{self.where}: '{key}' would be left as it is, not normalised",
-                found=f"mode {quote(mode)}, statistics {quote_all(stats) or 'none'}",
-                remedy="copy the folder again from where it was trained, with all policy_preprocessor* and "
-                "policy_postprocessor* files, or say IDENTITY where it was trained on raw values",
-            )
+            found = f"mode {quote(mode)}, statistics {quote_all(stats) or 'none'}"
+            remedy = "copy all policy_preprocessor* and policy_postprocessor* files, or say IDENTITY for raw values"
+            raise CheckpointError(f"{self.where}: '{key}' would not be normalised", found=found, remedy=remedy)
         x = torch.stack([torch.zeros(shape), torch.ones(shape)]).double()
         y = step._normalize_action(x, True) if inverse else step._normalize_observation({key: x}, False)[key]
         shift, scale = y[0].flatten(), (y[1] - y[0]).flatten()
         finite = torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()  # used as float32
         if y.shape != x.shape or not finite or (scale < 0).any() or not (inverse or scale.all()):
-            raise CheckpointError(
-                f"{self.where}: statistics of '{key}' have another shape, are not finite, or would turn it around",
-                found=f"scales {scale.tolist()[:3]}",
-                remedy="compute them again",
-            )
+            what = f"{self.where}: statistics of '{key}' have another shape, are not finite, or would turn it around"
+            raise CheckpointError(what, found=f"scales {scale.tolist()[:3]}", remedy="compute them again")
         if not inverse:
             # LeRobot subtracts first, so a feature that never changes becomes -1, or 0. With scale and shift that is
             # only so while the last digit of x * scale in float32 is far below 1; a larger scale was off by up to 16.
@@ -263,68 +209,16 @@ class Normaliser:
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
 
-def read_origin(folder: Path) -> dict[str, Any]:
-    """Return what we noted in a folder of LeRobot's format that we wrote; {} for any other. Raises CheckpointError."""
-    return _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}
-
-
-def _own_rate_hz(folder: Path) -> float:
-    """Return the steps of a plan in a second: what we noted in a folder that we wrote, else RATE_HZ."""
-    rate_hz = read_origin(folder).get("rate_hz", RATE_HZ)
-    if not is_number(rate_hz, 0, 1000) or not rate_hz:
-        raise CheckpointError(
-            f"{folder / ORIGIN}: 'rate_hz' must be above 0 and at most 1000", found=quote(rate_hz), remedy=COPY_AGAIN
-        )
-    return float(rate_hz)
-
-
-def _refuse_pieces(folder: Path) -> None:
-    """Raise CheckpointError for an adapter, and for weights in pieces: torch's DCP, or an index of safetensors."""
-    if (folder / ADAPTER).exists():
-        raise CheckpointError(
-            f"{folder}: a PEFT adapter, which holds changes to another policy's weights and no policy",
-            remedy="merge it into its policy (PEFT's merge_and_unload) and save that",
-        )
-    around = folder.parent if folder.name == PRETRAINED else folder
-    pieces = [*folder.glob("*.index.json"), *around.glob("*.distcp"), *around.glob("*/*.distcp")]
-    if pieces and not (folder / "model.safetensors").exists():
-        raise CheckpointError(
-            f"{folder}: a sharded checkpoint, and no model.safetensors",
-            found=pieces[0].name,
-            remedy="merge them where it was trained, and save the policy by its save_pretrained",
-        )
-
-
-@contextmanager
-def _as_checkpoint_error(path: Path) -> Iterator[None]:
-    """Turn whatever LeRobot, or a reader below it, raises for a file into a CheckpointError of one sentence."""
-    try:
-        yield
-    except CheckpointError:
-        raise
-    except Exception as e:  # each library raises types of its own
-        reason = " ".join(f"{type(e).__name__}: {e}".split())[:160]
-        raise CheckpointError(f"{path}: LeRobot cannot read it ({reason})", remedy=COPY_AGAIN) from None
-
-
 def _read_json(path: Path) -> dict[str, Any]:
     refuse_pointer(path, CheckpointError)
-    try:
-        content = json.loads(read_plain(path, JSON_BYTES))
-    except (ValueError, OSError, RecursionError) as e:  # RecursionError comes from brackets nested too deep
-        reason = e.strerror if isinstance(e, OSError) else f"not JSON: {e}"
-        raise CheckpointError(f"{path}: cannot be read ({reason})", remedy=COPY_AGAIN) from None
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{path}: expected a JSON object", found=type(content).__name__, remedy=COPY_AGAIN)
-    return content
+    with as_checkpoint_error(path):
+        return dict(read_json(path, JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     refuse_pointer(path, CheckpointError)
     if not path.is_file():
-        what = "not a file" if path.exists() else "not found"
-        raise CheckpointError(
-            f"{printable(str(path))}: {what}", remedy="a LeRobot folder has config.json and model.safetensors"
-        )
-    with _as_checkpoint_error(path):
+        what = f"{printable(str(path))}: not found, or not a file"
+        raise CheckpointError(what, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
+    with as_checkpoint_error(path):
         return load_file(path)

@@ -20,9 +20,9 @@ from rover_lib.workshop.checkpoint.contents import (
     COPY_AGAIN,
     CORRECT_IT,
     IS_IT_WHOLE,
-    LARGEST_SIDE_PX,
-    MOST_NUMBERS,
+    MOST,
     Contents,
+    as_checkpoint_error,
     name_numbers,
     name_weights,
     tensor_bytes,
@@ -37,17 +37,17 @@ def read_trainer(path: Path) -> Contents:
     content = _read_pickle(path)
     for key in ("config", "model_state_dict"):
         if not isinstance(content, dict) or not isinstance(content.get(key), dict):
-            raise CheckpointError(
-                f"{path}: no '{key}' in it",
-                found=quote_all(content) if isinstance(content, dict) else type(content).__name__,
-                remedy="is this a trainer checkpoint, or only its weights?",
-            )
+            found = quote_all(content) if isinstance(content, dict) else type(content).__name__
+            remedy = "is this a trainer checkpoint, or only its weights?"
+            raise CheckpointError(f"{path}: no '{key}' in it", found=found, remedy=remedy)
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
     weights, notes = name_weights(path, content["model_state_dict"])
+    loss = content.get("best_val_loss")  # NaN if the training had diverged
+    with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
+        loss = None if loss is None else float(loss)
     extra = {
-        "normalisation_from": {"in": "ImageNet's, as the trainer does", "out": "none, as the trainer does"},
         "epoch": plain(content.get("epoch")),
-        "best_val_loss": _loss(path, content.get("best_val_loss")),
+        "best_val_loss": loss,
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
         "trainer_config": plain(raw),
         "notes": notes,
@@ -58,26 +58,24 @@ def read_trainer(path: Path) -> Contents:
 def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor]) -> ActConfig:
     """Make the config from what the trainer's says, and from what only the shapes of the weights say."""
 
-    def whole(key: str, most: int = 1_000_000, default: int | None = None) -> int:
-        if not is_whole(value := raw.get(key, default), 1, most):
-            raise CheckpointError(
-                f"{path}: config '{key}' must be a whole number of at least 1", found=quote(value), remedy=CORRECT_IT
-            )
+    def whole(key: str, default: int | None = None) -> int:
+        if not is_whole(value := raw.get(key, default), 1, 1_000_000):
+            what = f"{path}: config '{key}' must be a whole number from 1 to a million"
+            raise CheckpointError(what, found=quote(value), remedy=CORRECT_IT)
         return value
 
     def last(name: str) -> int:
         shape = tuple(weights[name].shape) if name in weights else ()
-        if not shape or not 1 <= shape[-1] <= MOST_NUMBERS:
+        if not shape or not 1 <= shape[-1] <= MOST:
             raise CheckpointError(f"{path}: no weight '{name}' of a known shape", found=shape, remedy=IS_IT_WHOLE)
         return shape[-1]
 
     if raw.get("n_obs_steps", 1) != 1:
-        raise CheckpointError(
-            f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}", remedy="ACT acts on one observation, train with 1"
-        )
+        what = f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}"
+        raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
     return ActConfig(
         cameras=(TRAINER_CAMERA,),
-        image_sizes=((whole("image_height", LARGEST_SIDE_PX), whole("image_width", LARGEST_SIDE_PX)),),
+        image_sizes=((whole("image_height"), whole("image_width")),),
         backbone=raw.get("vision_encoder", ""),
         rate_hz=float(whole("rate_hz", default=30)),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
@@ -92,16 +90,6 @@ def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor]) -> ActC
         encoder_layers=whole("n_encoder_layers"),
         decoder_layers=whole("n_decoder_layers"),
     )
-
-
-def _loss(path: Path, value: Any) -> float | None:
-    """A loss as a number, also of a tensor of one: None if there is none, NaN if the training had diverged."""
-    try:
-        return None if value is None else float(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError):
-        raise CheckpointError(
-            f"{path}: best_val_loss is not a number", found=quote(value), remedy="save it as one, or leave it out"
-        ) from None
 
 
 def _numpy_scalars() -> list[Any]:
@@ -127,13 +115,9 @@ def _read_pickle(path: Path) -> Any:
         raise
     except Exception as e:  # zipfile and torch say in many types that a file is damaged
         if wanted := re.search(r"GLOBAL ([\w.]+)", str(e)):
-            raise CheckpointError(
-                f"{path}: refused, reading it would run code (it asks for '{wanted[1]}')",
-                remedy="save only tensors, numbers and strings in a checkpoint",
-            ) from None
+            what = f"{path}: refused, reading it would run code (it asks for '{wanted[1]}')"
+            raise CheckpointError(what, remedy="save only tensors, numbers and strings in a checkpoint") from None
         # torch puts advice before it, to read it unsafely
         reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
-        raise CheckpointError(
-            f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})",
-            remedy=COPY_AGAIN,
-        ) from None
+        what = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
+        raise CheckpointError(what, remedy=COPY_AGAIN) from None

@@ -114,7 +114,7 @@ class Fidelity:
     def us(self, action: str) -> float:
         """Microseconds of the car's pulse per unit of an action; NaN for an action that is no servo's."""
         try:
-            return self.car.pwm.us_per_unit(action)
+            return self.car.pwm.channel(action).us_per_unit
         except CarError:
             return math.nan
 

@@ -45,9 +45,7 @@ class Faults:
 
 @dataclass(frozen=True)
 class Control:
-    """One reading. arduino_s is NaN if that clock was no number; an action is None if nothing was measured, and its
-    pulse, in microseconds, then is NaN.
-    """
+    """One reading. arduino_s may be NaN. Where nothing was measured, an action is None and its pulse is NaN."""
 
     system_s: float
     arduino_s: float
@@ -57,8 +55,7 @@ class Control:
 
 
 def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -> tuple[list[Control], dict]:
-    """Return the usable readings, ordered by system time, and by channel the formula that its actions followed, if it
-    was another than the car's, and they were recomputed.
+    """Return the usable readings, by system time, and by channel the older formula that its actions had followed.
 
     Raises EpisodeError if a channel's actions follow no formula of its pulses.
     """
@@ -106,10 +103,9 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
 def _read_actions(
     channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
 ) -> tuple[dict[int, float], dict[int, float], Formula | None]:
-    """Return one channel's recorded actions by the number of their control, those that their pulses mean, and the
-    older formula that the recorded ones follow, if they do. Those that were not measured are left out.
+    """Return one channel's measured actions by the number of their control, as recorded and as their pulses mean them.
 
-    Raises EpisodeError if they follow neither that one nor the car's.
+    And the older formula that the recorded ones follow, if they do. Raises EpisodeError if they follow none.
     """
     name, old = channel.name, OLD[channel.name]
     recorded, meant, duties_pct = {}, {}, {}
@@ -125,7 +121,7 @@ def _read_actions(
             continue
         recorded[i], meant[i] = action, expected
         duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
-    _refuse_other_pulses(channel, rows, duties_pct)
+    _refuse_other_pulses(channel, duties_pct)
     # Firmware may have been changed within a recording, so only what disagrees must follow the older formula.
     wrong = [i for i in recorded if abs(recorded[i] - meant[i]) > EXACT]
     follows_old = old.is_followed(np.array([recorded[i] for i in wrong]), np.array([duties_pct[i] for i in wrong]))
@@ -134,47 +130,43 @@ def _read_actions(
         return recorded, meant, None
     seen = f"control {wrong[0]}: {recorded[wrong[0]]:g} recorded, its pulse says {meant[wrong[0]]:.4f}"
     if not follows_old:
-        raise EpisodeError(
-            f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither {old} nor "
-            f"{Formula.of(channel)}, this car's",
-            found=seen,
-            remedy="correct them, say in metadata.car which car it is, or record again",
-        )
+        what = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither {old} nor "
+        remedy = "correct them, say in metadata.car which car it is, or record again"
+        raise EpisodeError(f"{what}{Formula.of(channel)}, this car's", found=seen, remedy=remedy)
     note = f"recorded as {old} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
     faults.add(path, f"{name}_recomputed", note, len(wrong))
     return meant, meant, old
 
 
-def _refuse_other_pulses(channel: Channel, rows: dict[int, dict[str, float]], duties_pct: dict[int, float]) -> None:
+def _refuse_other_pulses(channel: Channel, duties_pct: dict[int, float]) -> None:
     """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
     (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
     pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
     if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        row = rows[far[0]]
-        raise EpisodeError(
-            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us",
-            found=f"control {far[0]}: {row[f'{channel.name}_raw_us']:g} us of {row[f'{channel.name}_period_us']:g} us",
-            remedy="write pulses and periods in microseconds, or say which car it is in metadata.car",
+        what = (
+            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us"
         )
+        remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
+        raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
 
 
 def _take(
     channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
 ) -> dict[int, float]:
-    """Return the actions of one channel, as recorded, or where pulses deny them, as these mean them if `recompute`."""
-    name = channel.name
+    """Return one channel's actions as recorded, or, if `recompute`, as their pulses mean them where these deny them."""
     for i, action in list(recorded.items()):
-        if recompute and abs(action - meant[i]) > EXACT:
-            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; recomputed from the pulses"
-            faults.add(path, f"{name}_recomputed", note)
+        kind = None
+        if abs(action - meant[i]) > EXACT:
+            kind = "recomputed" if recompute else "disagrees_with_pulse"
+        if kind == "recomputed":
             recorded[i] = meant[i]
         elif not channel.low <= action <= channel.high:
-            faults.add(path, f"{name}_out_of_range", f"control {i}: {action:g}")
+            kind = "out_of_range"
             del recorded[i]
-        elif abs(action - meant[i]) > EXACT:
-            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}; taken as recorded"
-            faults.add(path, f"{name}_disagrees_with_pulse", note)
+        if kind:
+            note = f"control {i}: {action:g} recorded, its pulse says {meant[i]:.4f}"
+            faults.add(path, f"{channel.name}_{kind}", note)
     return recorded
 
 
@@ -205,18 +197,17 @@ def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Co
             farthest_s = max(farthest_s, control.system_s - time_s)
             placed.append(replace(control, system_s=time_s))
             moved += 1
-    faults.add(
-        path, "serial_burst", f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived", moved
-    )
+    note = f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived"
+    faults.add(path, "serial_burst", note, moved)
     faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
     return sorted(placed, key=lambda c: c.system_s)
 
 
 def in_order(timed: list[tuple[float, Item]], went_on: list[bool], path: Path, what: str, faults: Faults) -> list[Item]:
-    """Sort the items by time, keeping the order of equal times, and count the steps back in time.
+    """Sort the items by time; if the clock was set back, everything from there on is left out.
 
-    If the clock was set back, everything from there on is left out. timed: (time in seconds, item), in the file's
-    order. went_on: for each item but the first, whether it was made after the one before it, whatever their times say.
+    timed: (time in seconds, item), in the file's order. went_on: for each item but the first, whether it was made after
+    the one before it, whatever their times say.
     """
     times_s = [time_s for time_s, _ in timed]
     end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
@@ -228,8 +219,5 @@ def in_order(timed: list[tuple[float, Item]], went_on: list[bool], path: Path, w
 
 
 def _was_set_back(times_s: list[float], i: int) -> bool:
-    """Whether the two times before `i` are both later than those at `i` and `i + 1`.
-
-    A single wrong time does not mean that the clock was set back.
-    """
+    """Whether the two times before `i` are later than those at `i` and `i + 1`: one wrong time is no clock set back."""
     return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])

@@ -4,32 +4,13 @@
     parts = split(recordings)
     samples, note = choose_calibration(parts.calibration, 200, seed=0)
 
-How a recording becomes samples:
-- A control measures a channel only if the firmware saw a pulse there (`pwm.Channel.measured`). If it saw none, the file
-  has a flag and no value, or the old recorder's 0 (onboard/recording/episode.py): here that is missing, never 0.
-  A frame takes its throttle and its steering each from the nearest *measured* control within `sync_s`. So one lost
-  reading between two good ones costs nothing (controls come every 33 ms), and a longer hole leaves its frames without
-  an action.
-- Controls that waited in the serial buffer arrive in one burst, so their system times say nothing. They get the times
-  of the Arduino's clock, counted back from the first control after them that arrived live (backwards and from close by,
-  because that clock drifts). Those that the clock cannot place are dropped.
-- If the system's clock was set back in the middle of a drive, which shows because the frames' numbers and the Arduino's
-  clock go on, everything after that is left out. Its times belong to other moments of the same drive, and it would be
-  given their actions.
-- A frame's action is its control. Its state is the previous frame's action. Its chunk is its own action and those of
-  the following frames (LeRobot's delta indices range(chunk)), padded at the end with the last one and masked.
-- A picture that is missing or damaged costs only its own sample: that frame's time and action are known, so its
-  neighbours keep their state and chunk. A frame without an action, or a hole in time, ends the chunks before it, and
-  the frame after it is no sample, because its state would be invented. Only an episode's first frame starts neutral.
-- If nobody drove, the pulses are those of a human whose car did something else, because it was held. Such frames are
-  samples with that driver, but no chunk and no state reaches from them to frames at which somebody drove, or back.
-- Actions that follow another formula of the pulses than this car's, as older firmware wrote them, are recomputed from
-  the pulses (see `formula`). If they follow none, the recording is left out.
-- A drive that failed is as good a recording as any other: its outcome is noted, and nothing is left out because of it.
+docs/data.md has the table of faults. A frame's action is the nearest *measured* control's within `sync_s`; what was not
+measured is missing, never 0. Its state is the previous frame's action. Its chunk is its own action and the following
+ones, padded at the end with the last one and masked. A damaged picture costs only its own sample. A frame without an
+action, a hole in time, and a change to or from nobody driving end the chunks before them, and the frame after it is no
+sample, because its state would be invented.
 """
 
-import csv
-import json
 import math
 import os
 import stat
@@ -38,7 +19,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import simplejpeg
@@ -47,8 +27,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.recording.episode import (
-    CONTROL_FIELDS,
-    DATA_BYTES,
+    DATA,
     FRAME_FIELDS,
     NOBODY,
     OUTCOMES,
@@ -62,14 +41,12 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import JSON_BYTES, parse_json, quote, quote_all
 
-DATA_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
+TABLES = ("control_data.csv", "frame_data.csv")  # the same as in DATA; nothing here reads them
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
-# Faults of which one is enough to leave a recording out, and those that follow from another.
-FOLLOWING = ("absent", "nothing_usable")
-DECISIVE = ("no_formula", "no_car", "no_overlap", "wrong_header", "broken_json")
+DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 JPEG_HEAD = 1024  # in which most cameras say how large the picture is
 JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 
@@ -78,8 +55,7 @@ JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 class Split:
     """Three parts that share no episode, or, if `note` says so, no moment in time.
 
-    calibration: for the observers. choosing: to pick observers and mixed blocks. held_out: to judge the result; it must
-    be used for nothing else. episodes: the ids of each part's episodes.
+    choosing: to pick observers and mixed blocks. held_out: judges, and nothing else. episodes: ids of each part's.
     """
 
     calibration: tuple[Sample, ...]
@@ -115,46 +91,35 @@ def load_recordings(
     if lerobot_dataset.is_dataset(root):
         return lerobot_dataset.load_dataset(source, chunk, progress)
     if source.action_names not in ((), ACTION_NAMES):
-        raise EpisodeError(
-            f"{root}: recordings of this project name their actions themselves",
-            found=f"--action-names {','.join(source.action_names)}",
-            remedy="leave it out",
-        )
+        what, found = f"{root}: our recordings name their actions", f"--action-names {','.join(source.action_names)}"
+        raise EpisodeError(what, found=found, remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
-        if any((root / name).exists() for name in DATA_FILES):
+        if (root / DATA).exists():
             root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
         else:
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
     except OSError as e:
-        raise EpisodeError(
-            f"{root}: no folder of episodes ({e.strerror})",
-            remedy="give the folder with episode_* in it, a LeRobotDataset's (with meta/info.json), or "
-            "user/name@revision of the Hub",
-        ) from None
+        remedy = "give the folder that holds episode_*, a LeRobotDataset's, or user/name@revision of the Hub"
+        raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
     if {"data", "meta"} <= {p.name for p in folders}:
         raise EpisodeError(f"{root}: a LeRobotDataset without meta/info.json", remedy=lerobot_dataset.COPY_AGAIN)
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
-        remedy = finish if killed else "give the folder that holds episode_YYYYMMDD_HHMMSS"
-        raise EpisodeError(
-            f"{root}: no episode folders in it", found=f"{len(killed)} killed ones" if killed else None, remedy=remedy
-        )
+        remedy = finish if killed else "give the folder that holds episode_*"
+        many = f"{len(killed)} killed ones" if killed else None
+        raise EpisodeError(f"{root}: no episode folders in it", found=many, remedy=remedy)
     faults = Faults(root)
     for part in killed:
         faults.add(part, "killed_recording", finish)
-    read = (
-        _load_episode(folder, chunk, sync_s, faults)
-        for folder in progress(folders, desc="reading episodes", total=len(folders))
-    )
-    episodes = tuple(episode for episode in read if episode)
+    listed = progress(folders, desc="reading episodes", total=len(folders))
+    episodes = tuple(episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults)))
     if not episodes:
-        raise nothing_usable(
-            f"{root}: no usable sample in {len(folders)} episode folder(s)",
-            faults.listed(),
-            "record again, or copy the whole folders, frames included",
-        )
+        remedy = "record again, or copy the whole folders, frames included"
+        if any(map(lerobot_dataset.is_dataset, folders)):
+            remedy = "give one LeRobotDataset of those in it"
+        raise nothing_usable(f"{root}: no usable sample in {len(folders)} folder(s)", faults.listed(), remedy)
     return Recordings(root, episodes, faults.listed(), source)
 
 
@@ -166,7 +131,7 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
         if fault.handled == "left out":
             kinds[fault.kind] += fault.count
             first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
-    most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind in FOLLOWING, -kinds[kind], kind))[:6]
+    most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
     worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
     found = first[most[0]] if most else ""
     return EpisodeError(f"{what} ({worst or 'empty'})", found=found or None, remedy="" if "; " in found else remedy)
@@ -174,121 +139,48 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
+    path = folder / DATA
     try:
-        present = any((folder / name).exists() for name in DATA_FILES)
-    except OSError as e:
-        faults.add(folder, "unreadable", e.strerror or type(e).__name__)
+        content = parse_json(read_plain(path, JSON_BYTES))
+        control_rows, frame_rows = content["control_samples"], content["frame_samples"]
+        metadata, label = content.get("metadata") or {}, content.get("action_label")
+        outcome = metadata.get("outcome")
+        if not isinstance(control_rows, list) or not isinstance(frame_rows, list):
+            raise TypeError("its samples are no lists")
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
+        faults.add(path, "unreadable", f"not an episode's JSON: {quote(str(e))}")
         return None
-    if not present:
-        faults.add(folder, "no_data", f"none of {', '.join(DATA_FILES)} is there")
-        return None
+    if outcome is not None and outcome not in OUTCOMES:
+        faults.add(path, "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
+        outcome = None
     try:
         car = read_car_of(folder)
-    except CarError as e:
-        faults.add(folder, "no_car", str(e))
+        controls, formulas = read_controls(path, control_rows, car.pwm, faults)
+    except (CarError, EpisodeError) as e:
+        faults.add(folder, "no_car" if isinstance(e, CarError) else "no_formula", str(e))
         return None
-    (label, outcome), tables = _read_tables(folder, faults)
-    try:
-        controls, formulas = read_controls(*tables["control_samples"], car.pwm, faults)
-    except EpisodeError as e:
-        faults.add(folder, "no_formula", str(e))
-        return None
-    frames = _read_frames(folder, *tables["frame_samples"], faults)
-    if not controls or not frames:
-        faults.add(folder, "nothing_usable", f"{len(controls)} usable controls and {len(frames)} usable frame entries")
-        return None
-    source = tables["control_samples"][0]
-    controls = place_bursts(controls, source, faults)
-    samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
+    frames = _read_frames(folder, path, frame_rows, faults)
+    samples: tuple[Sample, ...] = ()
+    if controls and frames:
+        controls = place_bursts(controls, path, faults)
+        samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        faults.add(folder, "nothing_usable", "no frame with a picture, an action and a known state")
+        faults.add(
+            folder, "nothing_usable", f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        )
         return None
     return Episode(
         id=folder.name,
         path=folder,
-        label=label,
+        label=label if isinstance(label, str) else "",
         duration_s=frames[-1].time_s - frames[0].time_s,
-        frames=len(tables["frame_samples"][1]),
-        controls=len(tables["control_samples"][1]),
+        frames=len(frame_rows),
+        controls=len(control_rows),
         samples=samples,
-        files=tuple(p for name in DATA_FILES if (p := folder / name).is_file()),
+        files=tuple(p for name in (DATA, *TABLES) if (p := folder / name).is_file()),
         outcome=outcome,
         formulas=formulas,
     )
-
-
-def _read_tables(folder: Path, faults: Faults) -> tuple[tuple[str, str | None], dict[str, tuple[Path, list]]]:
-    """Return (label, outcome), and for controls and frames the file that they came from and its rows.
-
-    The rows are those of the JSON file if it has any, else those of the CSV file.
-    """
-    content = _read_json(folder / "episode_data.json", faults)
-    label = content.get("action_label", "")
-    metadata = content.get("metadata")
-    outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
-    if outcome is not None and outcome not in OUTCOMES:
-        faults.add(folder / "episode_data.json", "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
-        outcome = None
-    tables = {}
-    for key, name, fields in (
-        ("control_samples", "control_data.csv", CONTROL_FIELDS),
-        ("frame_samples", "frame_data.csv", FRAME_FIELDS),
-    ):
-        rows = content.get(key, [])
-        if not isinstance(rows, list):
-            faults.add(folder / "episode_data.json", "wrong_type", f"{key} is a {type(rows).__name__}, not a list")
-            rows = []
-        if rows:
-            tables[key] = folder / "episode_data.json", rows
-        else:
-            tables[key] = folder / name, _read_csv(folder / name, fields, faults)
-    return (label if isinstance(label, str) else "", outcome), tables
-
-
-def _read_bytes(path: Path, faults: Faults) -> bytes:
-    """Return a data file's bytes; none, with a fault, if it is absent, empty, unreadable or too large."""
-    try:
-        if data := read_plain(path, DATA_BYTES).strip():
-            return data
-        faults.add(path, "empty", "nothing in it")
-    except FileNotFoundError:
-        faults.add(path, "absent", "not there")
-    except OSError as e:
-        faults.add(path, "unreadable", e.strerror or type(e).__name__)
-    return b""
-
-
-def _read_json(path: Path, faults: Faults) -> dict[str, Any]:
-    if not (data := _read_bytes(path, faults)):
-        return {}
-    try:
-        if isinstance(content := json.loads(data), dict):
-            return content
-        faults.add(path, "wrong_type", f"holds a {type(content).__name__}, not an object")
-    except (ValueError, RecursionError) as e:  # bad syntax or encoding, or brackets nested without end
-        faults.add(path, "broken_json", quote(str(e)))
-    return {}
-
-
-def _read_csv(path: Path, fields: tuple[str, ...], faults: Faults) -> list[dict[str, Any]]:
-    if not (data := _read_bytes(path, faults)):
-        return []
-    # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
-    table = csv.DictReader(data.decode("utf-8-sig", errors="replace").splitlines(), restval="missing")
-    rows: list[dict[str, Any]] = []
-    try:
-        if missing := [name for name in fields if name not in (table.fieldnames or ())]:
-            begins = quote(data[:80].decode(errors="replace"))
-            faults.add(path, "wrong_header", f"no column {missing[0]} in its first line, {begins}")
-            return []
-        rows.extend(table)
-    except csv.Error as e:
-        faults.add(path, "broken_csv", quote(str(e)))
-    return rows
-
-
-def _inside(path: Path, folder: Path) -> bool:
-    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
@@ -299,12 +191,11 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
-        number, time_s, name = (number_of(row.get("frame_id")), number_of(row.get("timestamp")), row.get("image_path"))
-        if number is None or time_s is None or not isinstance(name, str) or not name:
-            faults.add(path, "wrong_type", f"frame {i}: {quote_all(row.get(name) for name in FRAME_FIELDS)}")
-            continue
-        if math.isnan(number) or math.isnan(time_s):
-            faults.add(path, "not_finite", f"frame {i}: {quote(row.get('timestamp'))}")
+        number, time_s, name = number_of(row.get("frame_id")), number_of(row.get("timestamp")), row.get("image_path")
+        nan = math.isnan(number or 0) or math.isnan(time_s or 0)
+        if nan or number is None or time_s is None or not isinstance(name, str) or not name:
+            said = quote_all(row.get(name) for name in FRAME_FIELDS)
+            faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {said}")
             continue
         if number in numbers:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
@@ -331,28 +222,26 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
 
 
 def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
-    """Return the height and width of a listed picture, (0, 0) where it says them late; None if it is not there, inside
-    the episode's folder, and whole. Only its two ends are read.
+    """Return a listed picture's (height, width), (0, 0) where it says them late; None unless it is there and whole.
+
+    Only its two ends are read.
     """
     try:
-        if Path(name).is_absolute() or not _inside(picture, folder):
+        if Path(name).is_absolute() or not picture.resolve().is_relative_to(folder.resolve()):
             faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
             return None
         if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
-            faults.add(path, "frame_missing", f"{quote(name)} is no file")
-            return None
+            raise ValueError
         with picture.open("rb") as f:
             head = f.read(JPEG_HEAD)
             f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
             tail = f.read()
-    except (OSError, ValueError):  # not there, unreadable, a name too long, or with a zero byte in it
+    except (OSError, ValueError, RuntimeError):  # not there, unreadable, a name too long, a zero byte, a loop of links
         faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
         return None
     # cv2 would only warn of a file that was cut short, and return a picture.
     if not head.startswith(b"\xff\xd8") or not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
-        faults.add(
-            picture, "broken_jpeg", f"not a whole JPEG: it begins with {quote(head[:12])}, ends {quote(tail[-4:])}"
-        )
+        faults.add(picture, "broken_jpeg", f"not a whole JPEG: begins with {quote(head[:12])}, ends {quote(tail[-4:])}")
         return None
     try:
         return simplejpeg.decode_jpeg_header(head)[:2]
@@ -455,12 +344,10 @@ def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
-    """Split the samples by whole episodes, drawn at random with `seed`. Half of the held-out share is for choosing, the
-    other half judges.
+    """Split the samples by whole episodes, drawn at random with `seed`; half of the held-out share is for choosing.
 
-    With fewer than three episodes, each is split along its time instead, calibration first, with a gap of one chunk
-    between the parts, so that no action is in two of them; `note` says so. Raises EpisodeError for a share outside
-    (0, 1), and for recordings too short to be split.
+    With fewer than three episodes, each is split along its time instead, with a gap of one chunk between the parts;
+    `note` says so. Raises EpisodeError for a share outside (0, 1), and for recordings too short to be split.
     """
     if not 0 < held_out_share < 1:
         raise EpisodeError("held_out_share must be between 0 and 1", found=held_out_share)
@@ -474,9 +361,8 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
         "choosing": sorted(order[: count // 2]),
         "held_out": sorted(order[count // 2 : count]),
     }
-    note = None
-    if abs(count / len(episodes) - held_out_share) > 0.1:
-        note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}"
+    far = abs(count / len(episodes) - held_out_share) > 0.1
+    note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}" if far else None
     return Split(
         **{part: tuple(s for i in indices for s in episodes[i].samples) for part, indices in parts.items()},
         note=note,
@@ -498,11 +384,8 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
         parts["choosing"] += samples[first + gap : first + gap + second]
         parts["held_out"] += samples[first + gap + second + gap :]
     if not parts["held_out"]:
-        lengths = ", ".join(f"{e.id}: {len(e.samples)}" for e in episodes)
-        raise EpisodeError(
-            f"{len(episodes)} episode(s) are too short to be parted (samples: {lengths})",
-            remedy="record at least three episodes, or a longer one",
-        )
+        what = f"{len(episodes)} episode(s) are too short to be parted"
+        raise EpisodeError(what, remedy="record at least three episodes, or a longer one")
     return Split(
         **{part: tuple(samples) for part, samples in parts.items()},
         note=f"only {len(episodes)} episode(s): parted along time, with a gap of one chunk between",
@@ -515,15 +398,13 @@ def choose_calibration(
 ) -> tuple[tuple[Sample, ...], str | None]:
     """Choose at most `count` samples that cover the recorded actions, in the given order; the same for the same seed.
 
-    One half is chosen by farthest points over (state, four actions along the chunk), each action divided by its own
-    spread, because an observer must see the extremes, and throttle's are a tenth of steering's. The other half is drawn
-    at random from the rest, because an observer must also see what is usual. The second value returned is a note if
-    there were fewer than asked for, else None. Raises EpisodeError for no samples or a count below 1.
+    One half, so that observers see the extremes, is chosen by farthest points over (state, four actions along the
+    chunk), each action divided by its spread; the other half at random from the rest. Also returns a note if there were
+    fewer than asked for, else None. Raises EpisodeError for no samples or a count below 1.
     """
     if not samples or count < 1:
-        raise EpisodeError(
-            f"cannot choose {count} of {len(samples)} samples for calibration", remedy="record more episodes"
-        )
+        what = f"cannot choose {count} of {len(samples)} samples for calibration"
+        raise EpisodeError(what, remedy="record more episodes")
     if len(samples) <= count:
         fewer = len(samples) < count
         note = f"asked for {count} calibration samples, found only {len(samples)}: all are used" if fewer else None

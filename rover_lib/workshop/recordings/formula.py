@@ -1,7 +1,6 @@
 """The formulas by which firmware has computed actions from pulses: this car's, and an older one.
 
-Older firmware computed them in another way than this project does: a stopped car, 120 us, is 0.1687 there. The pulses
-are right in all recordings, so they give the actions. The duty is the pulse's share of its period.
+The pulses are right in all recordings, so they give the actions. The duty is the pulse's share of its period.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,8 @@
 """Read a LeRobotDataset v3, with images or video, by LeRobot's own loader, and check it before it is used.
 
-    recordings = load_dataset(Source(Path("my_dataset"), ("throttle", "steering")), chunk=32)
-
-The meaning of its numbers is read from the names of its features, or given by the user if they have no names. It is
-never guessed: if throttle and steering were swapped, training, calibration and comparison would not notice.
+What its numbers mean is read from the names of its features, or said by the user, and never guessed.
 """
 
-import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -22,11 +18,11 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import HIT, HUMAN, MISSED, POLICY
-from rover_lib.onboard.stage import read_plain
+from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.workshop import hub
 from rover_lib.workshop.lerobot_moved import conversion
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.limits import check_encoded, check_inside, check_table, check_video, limited_memory
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -37,20 +33,20 @@ from rover_lib.workshop.recordings.samples import (
     Source,
     camera_names,
 )
-from rover_lib.workshop.untrusted import quote, quote_all
+from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
+MOST_FEATURES = 200  # an arm with six cameras has 20
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
-SUCCESS = "next.success"
 REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
-DRIVEN_BY, OUTCOMES = ("driven_by", "outcomes")  # who drove where nobody intervened; what the drive came to, or null
+DRIVEN_BY = "driven_by"  # who drove where nobody intervened
 CAR = "car"  # and of them all, the content of their car.yml
 COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
@@ -58,7 +54,7 @@ UNEVEN = 0.1  # the time between two frames may differ by this share
 
 def _broken(what: str, found: object = None) -> EpisodeError:
     """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
-    return EpisodeError(what, found=found, remedy=COPY_AGAIN)
+    return EpisodeError(f"{what}: a broken dataset", found=found, remedy=COPY_AGAIN)
 
 
 def is_dataset(root: Path) -> bool:
@@ -70,10 +66,11 @@ def is_dataset(root: Path) -> bool:
 class LerobotSample(Sample):
     """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera).
 
-    dataset: opened once for all samples. cameras: by the policy's name of each, the dataset's, and (height, width).
+    encoded: all rows' pictures as they lie in the table. cameras: by the policy's name, the key and (height, width).
     """
 
     dataset: "LeRobotDataset" = field(kw_only=True)
+    encoded: Any = field(kw_only=True)
     cameras: Mapping[str, tuple[str, tuple[int, int]]] = field(kw_only=True)
 
     @property
@@ -86,18 +83,17 @@ class LerobotSample(Sample):
         Raises EpisodeError if it cannot be decoded, or has another size than the others.
         """
         frames = {}
-        with _as_episode_error(self.frame_path, f"its frame {self.row} cannot be decoded"), warnings.catch_warnings():
+        where = f"{self.frame_path}: its frame {self.row}"
+        with _as_episode_error(f"{where} cannot be decoded"), limited_memory(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision warns of the decoder that LeRobot has chosen
+            for key, encoded in self.encoded[self.row].items():  # LeRobot decodes all, also those of no policy
+                check_encoded(f"{where} of '{key}'", encoded, _size_of(self.dataset.meta.features[key]))
             item = self.dataset[self.row]
             for name, (key, size) in self.cameras.items():
                 # (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
                 rgb = (item[key] * 255).round().byte().permute(1, 2, 0).numpy()
                 if rgb.shape != (*size, 3):
-                    raise EpisodeError(
-                        f"{self.frame_path}: its frame {self.row} of '{key}' has another shape than {size} in {INFO}",
-                        found=rgb.shape,
-                        remedy="record pictures of one size, in colour, in one dataset",
-                    )
+                    raise _broken(f"{where} of '{key}' has another shape than {size} in {INFO}", rgb.shape)
                 frames[name] = np.ascontiguousarray(rgb[..., ::-1])
         return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
 
@@ -106,77 +102,58 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     """Read a LeRobotDataset v3 folder.
 
     chunk: actions per sample, padded at an episode's end with its last one. Each frame is a sample, with the state that
-    was recorded with it. If the dataset marks interventions, a human drove in the marked frames and a policy in all
-    others, unless our own export says otherwise; if it marks none, a human drove. Raises EpisodeError, in one sentence,
-    for another version, for damaged or missing files, for numbers that no rover can have, and if nothing says which
-    camera and which numbers are the car's.
+    was recorded with it. A human drove; if the dataset marks interventions, in the marked frames, and a policy in all
+    others, unless our own export says otherwise. Raises EpisodeError for another version, damaged or missing files,
+    numbers that no rover can have, and if nothing says which camera and which numbers are the car's.
     """
     root = source.path
     info = _read_info(root)
     layout, cameras = _layout(root, info, source)
-    keys = [key for key, _ in cameras.values()]
-    _check_files(root, info["features"], keys)
-    dataset = _open_local(root)
-    columns = _columns(root, dataset, layout)
-    starts = _check_frames(root, dataset, columns)
-    for key in (key for key in keys if key in dataset.meta.video_keys):
-        _check_video_times(root, dataset.meta, key)
-    exported, faults = _read_export(root, len(starts), INTERVENTION in columns)
-    _check_numbers(root, columns, layout, exported.car)
+    import lerobot.datasets.lerobot_dataset  # noqa: F401, takes seconds, and memory beside what is limited below
+
+    with limited_memory():
+        _check_files(root, info["features"], [key for key, _ in cameras.values()])
+    tables = sum(path.stat().st_size for path in root.rglob("*.parquet"))
+    with _as_episode_error(f"{root}: LeRobot cannot read it"), limited_memory(3 * tables):
+        dataset = _open_local(root)
+        columns = _columns(root, dataset, layout)
+        starts = _check_frames(root, dataset, columns)
+        for key in dataset.meta.video_keys:
+            _check_videos(root, dataset.meta, key)
+        encoded = _encoded(dataset)
+    drivers, car, faults = _read_export(root, len(starts), INTERVENTION in columns)
+    _check_numbers(root, columns, layout, car)
     episodes = []
     parts = np.split(np.arange(len(columns["index"])), starts[1:])
     for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
-        episodes.append(_episode(dataset, cameras, columns, rows, chunk, exported, i))
+        episodes.append(_episode(dataset, encoded, cameras, columns, rows, chunk, drivers[i], car))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
     return Recordings(root, tuple(episodes), faults, source, layout)
 
 
-@dataclass(frozen=True)
-class _Exported:
-    """What our own export says of a dataset.
+def _read_export(root: Path, episodes: int, marked: bool) -> tuple[list[str], Car, tuple[Fault, ...]]:
+    """Return who drove in each episode where nobody intervened, whose car, and a fault if REPORT is of other episodes.
 
-    drivers: for each episode, who drove where nobody intervened. outcomes: for each episode, None if not labelled.
-    car: the car whose actions the dataset has.
+    marked: whether the dataset marks interventions.
     """
-
-    drivers: list[str]
-    outcomes: list[str | None]
-    car: Car
-
-
-def _read_export(root: Path, episodes: int, marked: bool) -> tuple[_Exported, tuple[Fault, ...]]:
-    """Read our own export's REPORT. Return what it says, and a fault if it is of other episodes.
-
-    Without a REPORT it is what is known then; LeRobot's datasets do not say which car they are of, so it is this
-    machine's. marked: whether the dataset marks interventions.
-    """
-    default = _Exported([POLICY if marked else HUMAN] * episodes, [None] * episodes, this_car())
-    path = root / REPORT
-    if not path.is_file():
-        return default, ()
+    drivers, car = [POLICY if marked else HUMAN] * episodes, this_car()
+    if not (root / REPORT).is_file():
+        return drivers, car, ()
     try:
-        report = json.loads(read_plain(path, INFO_BYTES))
-        if CAR in report:  # right also if somebody has removed episodes since, with LeRobot's tools
-            default = replace(default, car=Car.of(report[CAR], "the exported car"))
-        if DRIVEN_BY not in report:  # of before there were takeovers
-            return default, ()
-        driven_by, outcomes = report[DRIVEN_BY], report[OUTCOMES]
-        if not len(driven_by) == len(outcomes) == episodes:
-            raise ValueError(f"it is of {len(driven_by)} episodes, here are {episodes}")
-        if not set(driven_by) <= {POLICY, HUMAN} or not set(outcomes) <= {None, HIT, MISSED}:
-            raise ValueError("it names who drove, or what it came to, by unknown words")
-    except (OSError, ValueError, RecursionError, TypeError, KeyError, CarError) as e:
-        return default, (Fault(REPORT, "another_export", 1, f"not used: {quote(str(e))}"),)
-    return replace(default, drivers=driven_by, outcomes=outcomes), ()
+        report = read_json(root / REPORT, INFO_BYTES)
+        car = Car.of(report[CAR], "the exported car")  # right also if somebody has removed episodes since
+        said = report[DRIVEN_BY]
+        if len(said) != episodes or not set(said) <= {POLICY, HUMAN}:
+            raise ValueError(f"it is of {len(said)} episodes, here are {episodes}, or has unknown words")
+    except (OSError, ValueError, TypeError, KeyError, CarError) as e:
+        return drivers, car, (Fault(REPORT, "another_export", 1, f"not used: {quote(str(e))}"),)
+    return said, car, ()
 
 
 def fetch_dataset(source: Source) -> Source:
-    """Fetch a dataset of the Hub, and return the same source with its local folder.
-
-    The version is checked first, before gigabytes are fetched.
-    """
+    """Fetch a dataset of the Hub, its version first, and return the same source with its local folder."""
     given = source.path, "dataset", EpisodeError
     _read_info(hub.fetch(*given, files=("meta/*",)), hub_id=str(source.path).partition("@")[0])
     return replace(source, path=hub.fetch(*given))
@@ -187,28 +164,26 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     path = root / INFO
     refuse_pointer(path, EpisodeError)
     try:
-        info = json.loads(read_plain(path, INFO_BYTES))
-    except (OSError, ValueError, RecursionError) as e:
+        info = read_json(path, INFO_BYTES)
+    except (OSError, ValueError) as e:
         raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = info.get("codebase_version") if isinstance(info, dict) else None
-    if str(version).startswith("v2.1"):
-        where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
-        raise EpisodeError(
-            f"{root}: a LeRobotDataset v2.1, only v3 is read",
-            remedy=f"convert it once by LeRobot's own `{conversion(root, hub_id)}`{where}",
-        )
     if not str(version).startswith("v3"):
-        raise EpisodeError(
-            f"{root}: a LeRobotDataset {quote(version)}, only v3 is read",
-            remedy="convert it to v2.1 by a LeRobot of that time, or use a newer version of this",
-        )
+        remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
+        if str(version).startswith("v2.1"):
+            where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
+            remedy = f"convert it once by LeRobot's own `{conversion(root, hub_id)}`{where}"
+        raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is read", remedy=remedy)
     features, fps = info.get("features"), info.get("fps")
     try:
-        right = all(is_whole(n, 1, 10_000) for feature in features.values() for n in [1, *feature["shape"]])
+        right = len(features) <= MOST_FEATURES and not any("/" in name for name in features)
+        right = right and all(is_whole(n, 1, 10_000) for feature in features.values() for n in feature["shape"])
+        paths = [Path(str(info.get(name))) for name in ("data_path", "video_path")]
+        right = right and not any(path.is_absolute() or ".." in path.parts for path in paths)
     except (AttributeError, TypeError, KeyError):
         right = False
     if not right or not is_number(fps, 0, 1000) or not fps:
-        raise _broken(f"{path}: lacks frames per second, or features with a dtype and a shape", quote(fps))
+        raise _broken(f"{path}: lacks frames per second, or plain features with a dtype and a shape", quote(fps))
     return info
 
 
@@ -228,10 +203,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     for key in (STATE, ACTION):
         row = features.get(key, {})  # LeRobot makes 1 of 0.3 where it says bool
         if len(row.get("shape", ())) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
-            found = f"{row['dtype']} of shape {row['shape']}" if row else quote_all(features)
-            raise EpisodeError(
-                f"{root}: its '{key}' is missing or not a row of numbers", found=found, remedy="record one"
-            )
+            what = f"{root}: its '{key}' is missing or not a row of numbers"
+            raise EpisodeError(what, found=quote_all(features), remedy="record one")
     actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
     states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
     sizes = {name: size for name, (_, size) in cameras.items()}
@@ -239,10 +212,7 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
 
 
 def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the state's own names.
-
-    If it has none, or the same as the dataset gives its actions, return the user's names of the actions.
-    """
+    """Return the state's own names; the user's names of the actions if it has none, or the same as the actions."""
     own = _names(features[STATE])
     if own and not (said and own == _names(features[ACTION])):
         return own
@@ -260,16 +230,12 @@ def _name_numbers(
     names = said or _names(features[key])
     if not names:
         example = ACTION_NAMES if size == len(ACTION_NAMES) else [f"joint_{i}" for i in range(1, size + 1)]
-        raise EpisodeError(
-            f"{root}: '{key}' does not name its {size} numbers",
-            found=quote(features[key].get("names")),
-            remedy=f"name them in the order of the numbers: --action-names {','.join(example)}",
-        )
+        remedy = f"name them in the order of the numbers: --action-names {','.join(example)}"
+        found = quote(features[key].get("names"))
+        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
     if len(names) != size or len(set(names)) != size:
-        raise EpisodeError(
-            f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}",
-            remedy="name each once: --action-names with commas between",
-        )
+        what = f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}"
+        raise EpisodeError(what, remedy="name each once: --action-names with commas between")
     if set(names) == set(ACTION_NAMES):
         return ACTION_NAMES, tuple(names.index(name) for name in ACTION_NAMES)
     return names, tuple(range(size))
@@ -292,40 +258,51 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
     shape, kind = list(feature["shape"]), feature.get("info")
-    if isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map")):
-        shape = [*shape[:2], "distances"]
-    elif len(shape) == 3 and 3 in (shape[0], shape[2]):
-        return (shape[0], shape[1]) if shape[2] == 3 else (shape[1], shape[2])
-    raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy="choose another: --camera NAME")
+    depth = isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map"))
+    if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
+        remedy = "choose another: --camera NAME"
+        raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
+    return _size_of(feature)
+
+
+def _size_of(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Height and width of a camera, whose shape has its colours last or first."""
+    first, second, last = feature["shape"]
+    return (second, last) if first <= 4 < last else (first, second)
 
 
 def _check_files(root: Path, features: Mapping[str, Any], cameras: list[str]) -> None:
     """Raise EpisodeError for what Git LFS left in place of files, and for tables without a column that is read.
 
-    LeRobot would look for missing tables on the Hub, and fill such a column with nothing, so that, for example, an
-    intervention would lose its mark.
+    LeRobot would look for missing tables on the Hub, and fill such a column with nothing.
     """
-    from pyarrow import parquet  # imported here, so that our own recordings do not wait for it
-
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not list(root.glob(pattern)):
             raise _broken(f"{root}: has no {pattern}")
-    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*.*")):
+    for path in (path for folder in ("meta", "data", "videos") for path in (root / folder).rglob("*")):
+        check_inside(root, path)
         refuse_pointer(path, EpisodeError)
-    read = {*NUMBERS, INTERVENTION, SUCCESS, *cameras}
-    wanted = [name for name, feature in features.items() if name in read and feature.get("dtype") != "video"]
-    for path in sorted(root.glob("data/*/*.parquet")):
-        with _as_episode_error(path, "LeRobot cannot read it"):
-            columns = parquet.read_schema(path).names
-        if missing := [name for name in wanted if name not in columns]:
-            raise _broken(f"{path}: has no column {quote_all(missing)}", quote_all(columns))
-        if unknown := [name for name in columns if name not in features]:
-            raise _broken(f"{path}: has columns that {INFO} does not know: {quote_all(unknown)}")
+    read = {*NUMBERS, INTERVENTION, *cameras}
+    wanted = {name for name, feature in features.items() if name in read and feature.get("dtype") != "video"}
+    for path in sorted(root.rglob("*.parquet")):
+        with _as_episode_error(f"{path}: LeRobot cannot read it"):
+            columns = check_table(path)
+        odd = {*(wanted - {*columns}), *({*columns} - features.keys())}
+        if odd and path.is_relative_to(root / "data"):
+            raise _broken(f"{path}: its columns are not those of {INFO}", quote_all(sorted(odd)))
+
+
+def _encoded(dataset: "LeRobotDataset") -> Any:
+    """The rows' pictures as they lie in the table, of all cameras that are no video."""
+    keys = [key for key, feature in dataset.meta.features.items() if feature["dtype"] == "image"]
+    rows = dataset.hf_dataset.with_format(None).select_columns(keys or ["index"])
+    for key in keys:
+        rows = rows.cast_column(key, replace(rows.features[key], decode=False))
+    return rows if keys else [{}] * len(rows)
 
 
 def _open_local(root: Path) -> "LeRobotDataset":
     """Open a local folder by LeRobot's own loader, which would fetch missing files; here they are an error."""
-    # Imported here, because it takes seconds, and our own recordings do not need it.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     class Local(LeRobotDataset):
@@ -334,35 +311,36 @@ def _open_local(root: Path) -> "LeRobotDataset":
 
         _download = download  # as LeRobot 0.6 calls it
 
-    with _as_episode_error(root, "LeRobot cannot read it"):
+    with _as_episode_error(f"{root}: LeRobot cannot read it"):
         return Local(f"local/{root.resolve().name}", root, revision="local", video_backend=BACKEND)
 
 
-def _check_video_times(root: Path, meta: Any, key: str) -> None:
-    """Raise EpisodeError unless each episode has a part of a video of its own, as long as the episode.
+def _check_videos(root: Path, meta: Any, key: str) -> None:
+    """Raise EpisodeError unless each video has the camera's size, and each episode a part of its own, of its length.
 
     The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
     """
     names = ("length", *(f"videos/{key}/{name}" for name in ("from_timestamp", "to_timestamp")))
-    with _as_episode_error(root, "where its pictures lie cannot be read"):
+    with _as_episode_error(f"{root}: where its pictures lie cannot be read"):
         lengths, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
         files = [meta.get_video_file_path(number, key) for number in range(len(lengths))]
-    wrong = {int(n): "is not as long as it" for n in np.flatnonzero(abs((last_s - first_s) * meta.fps - lengths) >= 1)}
+    for file in sorted(set(files)):
+        check_inside(root, root / file)
+        with _as_episode_error(f"{root / file}: cannot be decoded"):
+            check_video(root / file, _size_of(meta.features[key]))
+    wrong = set(np.flatnonzero(abs((last_s - first_s) * meta.fps - lengths) >= 1).tolist())
     order = sorted(range(len(lengths)), key=lambda number: (files[number], first_s[number]))
     for number, after in pairwise(order):
         if files[number] == files[after] and last_s[number] > first_s[after] + 0.5 / meta.fps:
-            wrong[after] = f"overlaps that of episode {number}"
+            wrong.add(after)
     if wrong:
-        number, what = min(wrong.items())
-        raise EpisodeError(
-            f"{root}: meta/episodes does not fit the videos of {quote(key)}",
-            found=f"{len(wrong)} of {len(lengths)} episodes; the part of episode {number} {what}",
-            remedy="merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again",
-        )
+        found = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
+        remedy = "merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again"
+        raise EpisodeError(f"{root}: meta/episodes does not fit the videos", found=found, remedy=remedy)
 
 
 @contextmanager
-def _as_episode_error(path: Path, what: str) -> Iterator[None]:
+def _as_episode_error(what: str) -> Iterator[None]:
     """Turn any error of a loader inside the block into an EpisodeError of one sentence. what: what went wrong."""
     try:
         yield
@@ -370,15 +348,13 @@ def _as_episode_error(path: Path, what: str) -> Iterator[None]:
         raise
     except Exception as e:  # parquet, mp4, datasets and LeRobot each raise types of their own
         cause = e.__cause__ or e  # datasets wraps pyarrow's error
-        reason = " ".join(str(cause).split())[:160]
-        text = f"{type(cause).__name__}: {reason}" if reason else type(cause).__name__
-        raise _broken(f"{path}: {what} ({text})") from None
+        raise _broken(f"{what} ({type(cause).__name__}: {' '.join(str(cause).split())[:160]})") from None
 
 
 def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
-    marks = [key for key in (INTERVENTION, SUCCESS) if key in dataset.meta.features]
-    with _as_episode_error(root, "its numbers cannot be read"):
+    marks = [INTERVENTION] if INTERVENTION in dataset.meta.features else []
+    with _as_episode_error(f"{root}: its numbers cannot be read"):
         columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
         for key in marks:
             columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
@@ -399,66 +375,52 @@ def _check_numbers(root: Path, columns: Mapping[str, np.ndarray], layout: Layout
             # written so that NaN is wrong
             wrong = np.flatnonzero(~(np.isfinite(values) & (values >= low) & (values <= high)))
             if len(wrong):
-                reverse = name == "throttle" and low == 0 and values.min() >= -1 and values.max() <= high
-                raise EpisodeError(
-                    f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in frame {wrong[0]} and {len(wrong) - 1} more, "
-                    f"a rover's lies from {low:g} to {high:g}",
-                    remedy="if that car reverses, say so in a car.yml (reverse_us, docs/build.md) and put it here"
-                    if reverse
-                    else "are the names in the right order (--action-names), and the numbers in our units?",
-                )
+                what = f"{root}: {name} of '{key}' is {values[wrong[0]]:g} in {len(wrong)} frames from {wrong[0]} on"
+                remedy = "are names (--action-names) and units right? if the car reverses, say reverse_us in car.yml"
+                raise EpisodeError(f"{what}, a rover's lies from {low:g} to {high:g}", remedy=remedy)
 
 
 def _check_frames(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the row at which each episode starts.
 
-    Raises EpisodeError for rows that are not the frames in their order, each once, as the table of episodes says:
-    LeRobot finds a frame, and an episode's pictures, by its row. And for frames that do not come `fps` times a second
-    from 0 s on: it finds a picture in a video by its time, and a plan's steps would last another time.
+    Raises EpisodeError for rows that are not the frames in their order, each once, as the table of episodes says, by
+    which LeRobot finds them, and for frames that do not come `fps` times a second from 0 s on.
     """
     number, times_s = columns["episode_index"], columns["timestamp"].astype(np.float64)
     starts, rows = np.flatnonzero(np.diff(number, prepend=-1)), np.arange(len(number))
     lengths = np.diff([*starts, len(number)])
-    with _as_episode_error(root, "its table of episodes cannot be read"):
+    with _as_episode_error(f"{root}: its table of episodes cannot be read"):
         names = ("episode_index", "dataset_from_index", "dataset_to_index")
         table = np.stack([np.asarray(dataset.meta.episodes[name]) for name in names], 1)
     episodes = np.stack([np.arange(len(starts)), starts, starts + lengths], 1)
-    if not np.array_equal(number[starts], episodes[:, 0]) or not np.array_equal(table, episodes):
-        raise _broken(
-            f"{root}: meta/episodes and the frames in data do not belong together",
-            f"{len(table)} episodes of {table[-1:, 2].sum()} frames beside {len(starts)} of {len(number)}",
-        )
     within = rows - np.repeat(starts, lengths)
-    for key, right in (("index", rows), ("frame_index", within)):
-        if len(wrong := np.flatnonzero(columns[key] != right)):
-            raise _broken(
-                f"{root}: its frames are not in their order", f"{key} {columns[key][wrong[0]]} in row {wrong[0]}"
-            )
+    ordered = np.array_equal(columns["index"], rows) and np.array_equal(columns["frame_index"], within)
+    if not ordered or not np.array_equal(number[starts], episodes[:, 0]) or not np.array_equal(table, episodes):
+        raise _broken(f"{root}: meta/episodes and the frames in data, or their order, do not belong together")
     fps = dataset.meta.fps
     steps = np.where(within > 0, np.diff(times_s, prepend=0.0), times_s + 1 / fps) * fps  # of a first frame, from 0 s
     if len(odd := steps[~(np.abs(steps - 1) <= np.where(within > 0, UNEVEN, 1))]):  # so that NaN counts as odd
-        raise EpisodeError(
-            f"{root}: {INFO} says {fps:g} frames a second, but {len(odd)} frames come at another rate",
-            found=f"{odd[0] / fps:.4f} s after the one before",
-            remedy="correct the rate, or record again",
-        )
+        what = f"{root}: {INFO} says {fps:g} frames a second, but {len(odd)} frames come at another rate"
+        found = f"{odd[0] / fps:.4f} s after the one before"
+        raise EpisodeError(what, found=found, remedy="correct the rate, or record again")
     return starts
 
 
 def _episode(
     dataset: "LeRobotDataset",
+    encoded: Any,
     cameras: Mapping[str, Any],
     columns: Mapping[str, np.ndarray],
     rows: np.ndarray,
     chunk: int,
-    exported: _Exported,
-    number: int,
+    driver: str,
+    car: Car,
 ) -> Episode:
-    """rows: of the whole dataset, those of episode `number`."""
+    """rows: of the whole dataset, those of this episode."""
     root, meta, first, n = dataset.root, dataset.meta, int(rows[0]), len(rows)
-    driver, outcome = exported.drivers[number], exported.outcomes[number]
+    number = int(columns["episode_index"][first])
     name, keys = f"episode_{number:06d}", [key for key, _ in cameras.values()]
-    with _as_episode_error(root, f"where the files of episode {number} lie cannot be read"):
+    with _as_episode_error(f"{root}: where the files of episode {number} lie cannot be read"):
         data = root / meta.get_data_file_path(number)
         files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
         if not data.is_file():
@@ -468,8 +430,6 @@ def _episode(
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]
     taken_over = columns[INTERVENTION][rows] if INTERVENTION in columns else np.zeros(n, bool)
-    if outcome is None and SUCCESS in columns:
-        outcome = HIT if columns[SUCCESS][rows].any() else MISSED
     samples = tuple(
         LerobotSample(
             episode=name,
@@ -479,10 +439,11 @@ def _episode(
             chunk=chunks[k].copy(),
             is_pad=pads[k].copy(),
             dataset=dataset,
+            encoded=encoded,
             cameras=cameras,
             row=int(row),
             driver=HUMAN if taken_over[k] else driver,
-            car=exported.car,
+            car=car,
         )
         for k, row in enumerate(rows)
     )
@@ -496,7 +457,6 @@ def _episode(
         samples=samples,
         files=(root / INFO, data, *files[1:]),
         corrects=bool(taken_over.any()),
-        outcome=outcome,
     )
 
 

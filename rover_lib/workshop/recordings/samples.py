@@ -1,8 +1,4 @@
-"""The common form of recordings: the samples of each episode, the files that they came from, and what was wrong.
-
-`episodes` reads our own recordings and `lerobot_dataset` reads LeRobot's. Code that uses the result need not know which
-of the two it was.
-"""
+"""The common form of our recordings and LeRobot's: samples of each episode, their files, and what was wrong."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,10 +39,7 @@ class Source:
 
     @classmethod
     def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
-        """Make a source from a path and the texts of a command line, whose names are separated by commas.
-
-        A Source as `path` is returned unchanged.
-        """
+        """Make a source from a path and a command line's comma-separated names; a Source is returned unchanged."""
         if isinstance(path, Source):
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
@@ -54,10 +47,7 @@ class Source:
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
-        """The recordings that a run loaded, or those `elsewhere`, to be read with the same names and cameras.
-
-        given: the params in the run's load.json.
-        """
+        """The recordings that a run loaded, by load.json's params, or those `elsewhere`, with the same names."""
         return cls.of(elsewhere or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
 
 
@@ -65,9 +55,8 @@ class Source:
 class Layout:
     """Which cameras and which numbers the samples have.
 
-    rate_hz: frames a second; None if the recordings do not state it. image_sizes: (height, width) of each camera's
-    pictures, where the recordings state them. state_order, action_order: for each name, its
-    column in the file. A car's names are always [steering, throttle] here, in whatever order they were recorded.
+    rate_hz, and image_sizes, (height, width) of each camera: None and empty where the recordings do not state them.
+    state_order, action_order: for each name, its column in the file. A car's names are always [steering, throttle].
     """
 
     cameras: tuple[str, ...] = ("the car's",)
@@ -93,10 +82,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong in a recording: `kind` happened `count` times in `file`, and `note` describes the first time.
-
-    file: relative to the root of the recordings.
-    """
+    """Something wrong: `kind` happened `count` times in `file` (relative to the root); `note` describes the first."""
 
     file: str
     kind: str
@@ -137,7 +123,6 @@ class Sample:
 
     @property
     def frame_name(self) -> str:
-        """The picture's name within its episode."""
         return self.frame_path.name
 
     def turned(self, frame: np.ndarray) -> np.ndarray:
@@ -145,10 +130,7 @@ class Sample:
         return np.ascontiguousarray(frame[:, ::-1]) if self.mirrored else frame
 
     def frame_bgr(self) -> np.ndarray:
-        """Read the picture: (h, w, 3) uint8 BGR.
-
-        Raises EpisodeError if the file is gone, or is not a whole JPEG of a size that a camera gives.
-        """
+        """Read the picture: (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone or not a whole JPEG."""
         try:
             return self.turned(read_jpeg(self.frame_path))
         except OSError as e:
@@ -159,10 +141,7 @@ class Sample:
 
 
 def car_of(samples: Iterable[Any]) -> Car:
-    """The car that samples were recorded with; Car() for observations that come from no recording.
-
-    Raises EpisodeError for samples of cars that drive differently: the same action means another pulse on each.
-    """
+    """The car of recorded samples; Car() for other observations. Raises EpisodeError if it is several."""
     cars: list[Car] = []
     for car in {id(s.car): s.car for s in samples if isinstance(s, Sample)}.values():  # an episode's samples share one
         if not any(car.drives_like(other) for other in cars):
@@ -174,10 +153,7 @@ def car_of(samples: Iterable[Any]) -> Car:
 
 
 def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
-    """Return one episode's frames per second, from the median time between two neighbouring frames.
-
-    None for fewer than two samples, or if time does not advance between them.
-    """
+    """Return one episode's frames per second, by the median step; None without two samples at two times."""
     if len(samples) < 2:
         return None
     step_s = float(np.median(np.diff([s.time_s for s in samples]) / np.diff([s.row for s in samples])))
@@ -185,11 +161,7 @@ def frame_rate_hz(samples: Sequence[Sample]) -> float | None:
 
 
 def is_another_rate(found_hz: float | None, rate_hz: float) -> bool:
-    """Whether an episode with found_hz frames a second was recorded at another rate than rate_hz.
-
-    Each step of a plan is one frame. If a policy learned from 15 frames a second, a car that takes 30 steps a second
-    would do in half the time what the human did.
-    """
+    """Whether an episode with found_hz frames a second has another rate than rate_hz: a plan's step is a frame."""
     return found_hz is not None and abs(rate_hz / found_hz - 1) > OTHER_RATE
 
 
@@ -198,8 +170,7 @@ class Episode:
     """One drive.
 
     duration_s: from the first to the last frame. frames, controls: how many the recording lists. outcome: one of
-    onboard.recording.OUTCOMES, None if none was noted. formulas: by channel, the formula that its actions followed
-    before they were recomputed from the pulses.
+    OUTCOMES or None. formulas: by channel, that of its actions before they were recomputed from the pulses.
     """
 
     id: str
@@ -247,11 +218,9 @@ class Recordings:
         changed = [e for e in self.episodes if e.formulas]
         if not changed:
             return ""
-        found = sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()})
-        return (
-            f"the actions of {len(changed)} of {len(self.episodes)} episodes were recomputed from their pulses, "
-            f"as they follow another formula: {', '.join(found)}"
-        )
+        found = ", ".join(sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()}))
+        count = f"{len(changed)} of {len(self.episodes)} episodes"
+        return f"the actions of {count} were recomputed from their pulses, as they follow another formula: {found}"
 
     def faults_by_kind(self) -> dict[str, dict[str, int]]:
         """How often each kind of fault was found, by what was done about it, one of HANDLED."""
@@ -260,16 +229,8 @@ class Recordings:
             counted[fault.handled][fault.kind] += fault.count
         return {handled: dict(kinds.most_common()) for handled, kinds in counted.items() if kinds}
 
-    def driven_by_pct(self) -> dict[str, float]:
-        """The percentage of samples at which each of `episode.DRIVERS` drove, without those who never did."""
-        counted = _counted(s.driver for s in self.samples)
-        return {who: round(100 * n / len(self.samples), 1) for who, n in counted.items()}
-
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of every file that the samples came from, keyed by its path relative to `root`.
-
-        Raises EpisodeError if one cannot be read any more.
-        """
+        """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
         files = dict.fromkeys(path for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples)))
         try:
             return {relative(path, self.root): sha256_of(path) for path in files}
@@ -278,6 +239,7 @@ class Recordings:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
+        drivers = _counted(s.driver for s in self.samples)
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -287,7 +249,7 @@ class Recordings:
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
             "outcomes": _counted(e.outcome or "not labelled" for e in self.episodes),
-            "driven_by_pct": self.driven_by_pct(),
+            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
@@ -300,10 +262,9 @@ def _counted(words: Iterable[str]) -> dict[str, int]:
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:
-    """Map the name that a policy gives to each camera to the key of its LeRobot feature.
+    """Map a policy's name of each camera, the key without its prefix, to the key of its LeRobot feature.
 
-    The name is the key without its prefix, `observation.images.` or `observation.`. If two cameras would then have the
-    same name, as observation.image and observation.images.image, all keep their whole key.
+    All keep their whole key if two would have the same name, as observation.image and observation.images.image.
     """
     keys = list(keys)
     # Only one prefix is removed: in a policy that we wrote, a camera may itself be called observation.image.
@@ -313,10 +274,7 @@ def camera_names(keys: Iterable[str]) -> dict[str, str]:
 
 def relative(path: Path, root: Path) -> str:
     """Return a file's path as reports show it: relative to `root`, or only its name if it lies elsewhere."""
-    try:
-        return path.relative_to(root).as_posix()
-    except ValueError:
-        return path.name
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
 
 def pick_evenly(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:

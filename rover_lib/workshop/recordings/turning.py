@@ -1,7 +1,4 @@
-"""Which way the cars of recordings steer, episode by episode, and which pictures are mirrored.
-
-print(measure_sides(recordings).words())
-"""
+"""Which way the cars of recordings steer, episode by episode, and which pictures are mirrored."""
 
 import math
 import os
@@ -49,10 +46,8 @@ class Sides:
         if self.side is None:
             names = {side: ", ".join(t.episode for t in self.turnings if t.side == side) for side in ("right", "left")}
             if all(names.values()):
-                return (
-                    "the pictures disagree on which side positive steering turns to: right in {right}; left in {left}: "
-                    "some are mirrored"
-                ).format(**names)
+                where = "right in {right}; left in {left}: some are mirrored".format(**names)
+                return f"the pictures disagree on which side positive steering turns to: {where}"
             return f"which side positive steering turns to: {len(self.turnings)} episodes show too little to be sure"
         text = f"positive steering turns {self.side}, as the pictures of {agree} of {len(self.turnings)} episodes show"
         if self.denied:
@@ -61,11 +56,7 @@ class Sides:
 
 
 def measure_sides(recordings: Recordings, progress: Progress = silent, most: int | None = None) -> Sides:
-    """Measure each episode, or at most `most` of them, evenly chosen.
-
-    One of which nothing can be told, as a picture is damaged or nothing moves, has no side; nor has any of a robot
-    that does not steer, or has several cameras.
-    """
+    """Measure each episode, or at most `most` of them, evenly chosen; none of what is no car with one camera."""
     layout = recordings.layout
     if layout.action_names != ACTION_NAMES or len(layout.cameras) > 1:
         return Sides(())

@@ -6,7 +6,6 @@ The copy is a run like any other: `rover report runs/try1` judges it again, and 
 """
 
 import os
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -24,27 +23,21 @@ def copy_run(name: str, copy: str = "", runs_dir: Path | str = "runs") -> Path:
     such run, or if the copy would be the run itself or is a folder of something else.
     """
     source, folder = (run_folder(runs_dir, n, RoverError) for n in (name, copy or f"{name}-copy"))
-    if not (source / f"{NAMES[0]}.ipynb").is_file():
+    first = f"{NAMES[0]}.ipynb"
+    if not (source / first).is_file():
         raise RoverError(f"there is no run {source}", remedy="rover inspect shows the runs that there are")
-    if folder == source:
-        raise RoverError(f"{folder}: is the run itself", remedy="give the copy another name: AS=try1")
-    if (folder / f"{NAMES[0]}.ipynb").is_file():
-        return folder
-    if folder.exists():
-        raise RoverError(f"{folder}: is there, and no copy of a run", remedy="give the copy another name: AS=try1")
-    with build_folder(folder) as new:
-        for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
-            (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
-        for path in new.glob("*.ipynb"):  # earlier versions wrote the run's own folder into them
-            path.write_text(re.sub(r'run_dir = \\"/.*?\\"', r"run_dir = \".\"", path.read_text()))
+    if folder == source or (folder.exists() and not (folder / first).is_file()):
+        what = f"{folder}: is the run itself, or no copy of one"
+        raise RoverError(what, remedy="give the copy another name: AS=try1")
+    if not folder.exists():
+        with build_folder(folder) as new:
+            for path in {*files_of_a_run(source), *source.glob("benchmark-*.json")}:
+                (shutil.copytree if path.is_dir() else shutil.copy2)(path, new / path.name)
     return folder
 
 
 def main() -> None:
-    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named.
-
-    It opens the first notebook, as JupyterLab's launcher shows neither the folder's question nor its figures.
-    """
+    """Replace this process by JupyterLab on the copy of a run, or on the repository's notebooks if no run is named."""
     name, copy = (*sys.argv[1:], "", "")[:2]
     try:
         folder = copy_run(name, copy) if name else NOTEBOOKS

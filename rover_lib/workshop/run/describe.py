@@ -2,15 +2,20 @@
 
 import json
 import shlex
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
+from rover_lib.onboard.cli import describe_artifact
+from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.turning import measure_sides
 
 FIRST = "make demo, or rover run, makes the first"
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
@@ -30,14 +35,10 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         if path == Path("runs"):
             raise RoverError(f"{path}: no run in it", remedy=FIRST)
     if kind == "artifact":
-        from rover_lib.onboard.cli import describe_artifact
-
         return describe_artifact(path)
     if kind == "run":
         return {"run": _run(path)}
     if kind == "flight log":
-        from rover_lib.onboard.drive.flight_log import read_log
-
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
     if kind == "calibration":
         return {"calibration": _calibration(path)}
@@ -46,15 +47,10 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "tub":
         check_kind(path, "recordings")  # says what to do with it
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
-        from rover_lib.workshop.recordings.episodes import load_recordings
-        from rover_lib.workshop.recordings.turning import measure_sides
-
         recordings = load_recordings(source, progress=progress)
         sides = measure_sides(recordings, progress)
-        steers = (
-            {"steering": sides.words(), "by_episode": [t.words() for t in sides.turnings]} if sides.turnings else {}
-        )
-        return {"recordings": recordings.summary() | steers}
+        words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
+        return {"recordings": recordings.summary() | (words if sides.turnings else {})}
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(path)
@@ -73,12 +69,8 @@ def _calibration(path: Path) -> dict[str, Any]:
     from rover_lib.workshop.int8.observe import Calibration
 
     found = Calibration.load(path)
-    return {
-        "samples": found.samples,
-        "smooth": found.smooth,
-        "checkpoint_sha256": found.checkpoint,
-        "ranges": len(found.ranges),
-    }
+    described = {"samples": found.samples, "smooth": found.smooth, "ranges": len(found.ranges)}
+    return described | {"checkpoint_sha256": found.checkpoint}
 
 
 def _report(path: Path) -> dict[str, Any]:
@@ -102,23 +94,14 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
     return [{"name": p.name, "verdict": verdict_of(p)} for p in paths if set(kinds_of(p)) & {"run", "pretrained"}]
 
 
-def _changed(path: Path, sha256: str) -> bool:
-    return path.is_file() and sha256_of(path) != sha256
-
-
 def verdict_of(run_dir: Path) -> str:
-    """A run's verdict in one line; if it has none yet, the command that makes one."""
-    if (run_dir / "run.json").is_file():
-        try:
-            judged = read_stage(run_dir / "run.json", "run")
-            if changed := [name for name, sha256 in judged["inputs"].items() if _changed(run_dir / name, sha256)]:
-                return f"{', '.join(changed)} made again since its verdict: rover report {run_dir}"
+    """A run's verdict in one line; if it has none of the files that are there, the command that makes one."""
+    with suppress(RoverError, KeyError):  # there is none yet, or it cannot be used
+        judged = read_stage(run_dir / "run.json", "run")
+        there = {run_dir / name: sha256 for name, sha256 in judged["inputs"].items() if (run_dir / name).is_file()}
+        if all(sha256_of(path) == sha256 for path, sha256 in there.items()):
             return str(judged["metrics"]["headline"])
-        except (RoverError, KeyError):
-            return f"its run.json cannot be used: rover report {run_dir}"
     if (run_dir / "compare.json").is_file():
-        return f"no verdict yet: rover report {run_dir}"
-    made = run_dir / "best_model.pth" if (run_dir / "best_model.pth").is_file() else run_dir
-    if made != run_dir or "pretrained" in kinds_of(run_dir):
-        return f"a checkpoint: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
-    return "not whole: rover run makes it again"
+        return f"no verdict of its files: rover report {run_dir}"
+    made = next((p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT")
+    return f"no run yet: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"

@@ -7,8 +7,7 @@
     policy = quantize(loaded.checkpoint, recipe.scheme, calibration)
     export_policies("runs/mine", loaded.checkpoint, {"static": policy}, calibration, samples, recipe.parity)
 
-The steps themselves are in `observe`, `quantize`, `choose` and `export`. Here is what the notebooks, the command line
-and the laboratory share: which frames, which options, which files.
+The steps are in `observe`, `quantize`, `choose` and `export`; here, which frames, which options, which files.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from rover_lib.workshop.int8.export import Exporter, Parity, export
 from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
-from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
+from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
@@ -36,37 +35,30 @@ from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
-# Odd frames need more: their errors are far apart, and on 16 frames ranges were chosen that were half as bad again on
-# others. The 64 also tell what share is odd: training knows the frames that calibrate, and only a quarter as many were.
+# Odd frames need more: ranges chosen on 16 were half as bad again on others. The 64 also tell what share is odd.
 ODD_CHOOSING_FRAMES = 64
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What params.yml says of making artifacts.
+    """What params.yml says of making artifacts."""
 
-    samples: at most this many frames calibrate. seed: of their choice. scheme: static INT8, before its observer is
-    chosen. parity: what an artifact must answer where it is loaded. observers: to choose from.
-    """
-
-    samples: int
-    seed: int
-    scheme: Scheme
-    parity: Parity
-    observers: tuple[str, ...] = OBSERVERS
+    samples: int  # at most this many frames calibrate
+    seed: int  # of their choice
+    scheme: Scheme  # static INT8, before its observer is chosen
+    parity: Parity  # what an artifact must answer where it is loaded
+    observers: tuple[str, ...]  # to choose from
 
     @classmethod
     def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
         """The recipe of params.yml. p: its content. samples: how many calibrate, None for what it says."""
-        quantization, parity = p["quantization"], p["parity"]
+        said, parity = p["quantization"], p["parity"]
         return cls(
             samples=samples or p["calibration"]["samples"],
             seed=p["calibration"]["seed"],
-            scheme=Scheme(
-                kind=quantization["scheme"], smooth=quantization["smooth"], percentile=quantization["percentile"]
-            ),
+            scheme=Scheme(kind=said["scheme"], smooth=said["smooth"], percentile=said["percentile"]),
             parity=Parity(parity["fp32"], parity["int8_errors"], parity["vectors"]),
-            observers=tuple(quantization["observers"]),
+            observers=tuple(said["observers"]),
         )
 
     def choose(self, samples: tuple[Sample, ...]) -> tuple[tuple[Sample, ...], str | None]:
@@ -77,10 +69,7 @@ class Recipe:
 def prepare_chooser(
     checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
 ) -> Chooser:
-    """A chooser on this many frames that calibration has not seen.
-
-    If calibration met odd ones, on some of those and on ODD_CHOOSING_FRAMES instead.
-    """
+    """A chooser on this many frames that calibration has not seen; on more, and odd ones, if calibration met any."""
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
     few = pick_evenly(parts.choosing or parts.calibration, ODD_CHOOSING_FRAMES if odd else frames)
@@ -88,10 +77,7 @@ def prepare_chooser(
 
 
 def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
-    """params.yml's content with a notebook's parameters in it: turn_params(calibration={"samples": 50}).
-
-    A parameter that is None leaves what params.yml says.
-    """
+    """params.yml's content with a notebook's parameters in it: turn_params(calibration={"samples": 50})."""
     p = params()
     for section, turned in sections.items():
         p[section] |= {key: value for key, value in turned.items() if value is not None}
@@ -99,10 +85,7 @@ def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
-    """The schemes of a run's artifacts beside FP32, by name: static, which all others are held against, and `modes`.
-
-    modes: None means all. Raises ArtifactError for an unknown one.
-    """
+    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all. Raises ArtifactError."""
     dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
     schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
     if unknown := [mode for mode in modes or () if mode not in schemes]:
@@ -111,18 +94,15 @@ def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None
 
 
 def make_artifact(
-    loaded: Opened, path: Path | str, recipe: Recipe, *, fp32: bool = False, progress: Progress = silent
+    loaded: Opened, path: Path | str, recipe: Recipe, *, progress: Progress = silent
 ) -> tuple[str, list[str]]:
     """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
 
-    Where there are odd frames, which one scale may not serve, the ranges are chosen first; else that saves its time.
-    fp32: exported as it is. Returns its content hash, and warnings. Raises ArtifactError, in `calibrate`, `quantize`
-    and `export`.
+    Where there are odd frames, which one scale may not serve, the ranges are chosen first. Returns its content hash,
+    and warnings. Raises ArtifactError.
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
     samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
-    if fp32:
-        return export(ACT(checkpoint.config, checkpoint.weights), checkpoint, path, samples, parity=recipe.parity), []
     chosen, note = recipe.choose(parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
     scheme = recipe.scheme
@@ -141,9 +121,7 @@ def export_policies(
     samples: Sequence[Sample],
     parity: Parity,
 ) -> dict[str, dict[str, Any]]:
-    """Write policy_<name>.pt of each policy into `folder`, and remove those of other modes, which would be of an
-    earlier scheme. Returns what quantize.json says of each.
-    """
+    """Write policy_<name>.pt of each policy into `folder`, without other modes' of before; what quantize.json says."""
     described = {}
     for mode in set(ARTIFACTS) - policies.keys():
         (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
@@ -160,10 +138,7 @@ def export_policies(
 
 
 def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
-    """The policy that a run's policy_static.pt was exported from, made again from the run's calibration.
-
-    Raises ArtifactError if the run's files are not those that the artifact was made from.
-    """
+    """The policy of a run's policy_static.pt, made again. Raises ArtifactError unless all are of one quantize.json."""
     run_dir = Path(run_dir)
     stage = read_stage(run_dir / "quantize.json", "quantize")
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
@@ -177,8 +152,7 @@ def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
 def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
     """policy_fp32 and policy_static of a run once more, for ONNX Runtime: {file's name: content hash}.
 
-    The same weights, calibration and scheme, so that the two engines compute the same policy. Raises ArtifactError as
-    `requantized` and `export` do, RoverError if the run's checkpoint or recordings have changed.
+    Raises ArtifactError as `requantize` and `export` do, RoverError if the run's checkpoint or recordings have changed.
     """
     run_dir = Path(run_dir)
     again = open_run(run_dir, progress)
@@ -198,9 +172,6 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     return hashes
 
 
-# --- what the stages of a run leave -----------------------------------------------------------------------------------
-
-
 def write_load(
     run_dir: Path | str,
     loaded: Opened,
@@ -208,9 +179,7 @@ def write_load(
     fit: Mapping[str, Any] | None = None,
     sides: Sides | None = None,
 ) -> None:
-    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`. sides:
-    which way the recordings' car steers.
-    """
+    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`."""
     checkpoint, recordings = loaded.checkpoint, loaded.recordings
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
@@ -224,12 +193,8 @@ def write_load(
     if fit:
         metrics["fit"] = fit
     if sides and sides.turnings:
-        metrics["steering"] = {
-            "side": sides.side,
-            "mirrored": sides.mirrored,
-            "denied": sides.denied,
-            "words": sides.words(),
-        }
+        found = {name: getattr(sides, name) for name in ("side", "mirrored", "denied")}
+        metrics["steering"] = found | {"words": sides.words()}
     source = recordings.source
     given = {
         "checkpoint": checkpoint.path.resolve(),
@@ -269,14 +234,7 @@ def write_calibrate(
 def write_quantize(
     run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any], given: Mapping[str, Any] | None = None
 ) -> None:
-    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing. given: the parameters, None
-    for those of params.yml.
-    """
+    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing. given: the parameters."""
     inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
-    write_stage(
-        Path(run_dir) / "quantize.json",
-        "quantize",
-        params=dict(given or params()["quantization"]),
-        metrics=metrics,
-        inputs=inputs,
-    )
+    said = dict(given or params()["quantization"])
+    write_stage(Path(run_dir) / "quantize.json", "quantize", params=said, metrics=metrics, inputs=inputs)

@@ -22,6 +22,7 @@ import nbformat
 from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 
+from rover_lib.onboard import errors
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.durable import ASKED, build_folder, sync_disk
 from rover_lib.onboard.errors import RoverError, of_system
@@ -54,8 +55,6 @@ KERNEL_ENVIRONMENT = {
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
-
-
 LINE = re.compile(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", re.M)  # of a parameters cell
 
 
@@ -70,7 +69,7 @@ class ThisPython(AsyncKernelManager):
 
 def parameters_of(notebook: Path) -> set[str]:
     """Return the names that the notebook's `parameters` cell sets."""
-    return {name for name, *_ in parameters_in(notebook)}
+    return {name for name, _, _ in parameters_in(notebook)}
 
 
 def parameters_in(notebook: Path) -> list[tuple[str, str, str]]:
@@ -98,27 +97,20 @@ def run(
 ) -> Path:
     """Execute the five notebooks in order, and return the run's folder.
 
-    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. progress: called like
-    tqdm.tqdm(iterable, desc=, total=). timed: False leaves out the last notebook, the benchmark, so that it can be
-    executed at another time.
+    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. timed: False leaves out the
+    last notebook, the benchmark, so that it can be executed at another time.
 
-    The new run is made in .<name>.new beside the old one of that name, and its files replace the old one's when it is
-    complete: a run that fails at its third notebook shall not destroy the policies of the last good one. Only a run's
-    own files (`files_of_a_run`) are replaced; recordings, a checkpoint and benchmarks of other hosts stay.
+    The new run is made in .<name>.new beside the old one of that name, and its files (`files_of_a_run`) replace the old
+    one's when it is complete; recordings, a checkpoint and benchmarks of other hosts stay.
 
-    Raises RoverError, in one sentence with the notebook, the cell and its error; then, as after Ctrl-C or kill -9,
-    the old run is as it was, and what the finished notebooks made waits in .<name>.new: the same command continues.
-    Raises ArtifactError at once for root, who may not load artifacts, and RoverError while another process makes a run
-    of that name.
+    Raises RoverError, in one sentence with the notebook, the cell and its error, or while another process makes a run
+    of that name; then, as after Ctrl-C or kill -9, the old run is as it was, and what the finished notebooks made waits
+    in .<name>.new: the same command continues. Raises ArtifactError for root, who may not load artifacts.
     """
     refuse_root()
     folder = run_folder(runs_dir, name, RoverError)
     sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
-    if missing := [s.name for s in sources if not s.is_file()]:
-        raise RoverError(f"{notebooks}: no {missing[0]} in it", remedy="run from a checkout of the project")
-    known = set().union(*(parameters_of(s) for s in sources))
-    if unknown := sorted(set(overrides) - known):
-        raise RoverError(f"no notebook has a parameter {unknown}", remedy=f"known are {sorted(known)}")
+    _refuse_unknown(sources, overrides)
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
@@ -149,7 +141,7 @@ def files_of_a_run(folder: Path) -> list[Path]:
 
 
 def find_notebook(asked: str) -> str:
-    """The name of the notebook that begins like `asked`, such as 04. Raises RoverError if there is none."""
+    """The name of the notebook that begins like `asked`, such as 04. Raises RoverError."""
     found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
     if len(found) != 1:
         raise RoverError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
@@ -159,24 +151,28 @@ def find_notebook(asked: str) -> str:
 def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises RoverError for an unknown parameter, before anything runs; then in one sentence with the notebook, the
-    cell and its error. An earlier executed one then stays.
+    Raises RoverError for an unknown parameter, or with the cell and its error; an earlier executed one then stays.
     """
     folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
-    if not source.is_file() or not folder.is_dir():
-        missing = folder if source.is_file() else source
-        raise RoverError(f"{missing}: not found", remedy="run from a checkout, on a run of it")
-    if unknown := sorted(set(overrides) - parameters_of(source)):
-        known = sorted(parameters_of(source) - {"run_dir"})
-        raise RoverError(f"{source.name} has no parameter {', '.join(unknown)}", remedy=f"known are {known}")
+    if not folder.is_dir():
+        raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
+    _refuse_unknown([source], overrides)
     _execute(source, folder, overrides, False)
     return folder / source.name
 
 
+def _refuse_unknown(notebooks: list[Path], given: Mapping[str, Any]) -> None:
+    """Raise RoverError for parameters that none of the notebooks has, and for notebooks that are not there."""
+    if missing := [path for path in notebooks if not path.is_file()]:
+        raise RoverError(f"{missing[0]}: not found", remedy="run from a checkout of the project")
+    known = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
+    if unknown := sorted(given.keys() - known):
+        raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(known)}")
+
+
 def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -> None:
     """Execute a notebook in a run's folder. given: what its parameters are, instead of params.yml's and its own."""
-    # Imported here, because it takes a second, and the kernels import this module too and do not need it.
-    import papermill
+    import papermill  # here, because it takes a second that the kernels, which import this module too, do not need
     from nbclient.exceptions import DeadKernelError
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
@@ -193,10 +189,7 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
 
 def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
-    """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml.
-
-    A parameter that is turned there acts, in whichever folder the notebook lies: its run is where it is executed.
-    """
+    """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml."""
     values, p = {"run_dir": ".", **given}, params()
     notebook, cell = _parameters_cell(source)
     lines = []
@@ -214,16 +207,14 @@ def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
 @contextmanager
 def set_environment(values: dict[str, str]) -> Iterator[None]:
     """Set these values in os.environ, which a kernel inherits, and restore the old ones afterwards."""
-    before = {k: os.environ.get(k) for k in values}
+    before = {key: os.environ[key] for key in values.keys() & os.environ.keys()}
     os.environ.update(values)
     try:
         yield
     finally:
-        for key, value in before.items():
-            if value is None:
-                os.environ.pop(key, None)
-            else:
-                os.environ[key] = value
+        for key in values:
+            del os.environ[key]
+        os.environ.update(before)
 
 
 def _place_of(stream: Any) -> dict[str, str]:
@@ -241,12 +232,5 @@ def _sentence(error: Any) -> str:
     text = " ".join(str(error.evalue).split())
     if system := re.fullmatch(r"\[Errno (\d+)\] [^:]*(?:: '(.*)')?", text):
         return str(of_system(OSError(int(system[1]), "", system[2] or None)))
-    ours = {c.__name__ for c in _subclasses(RoverError)} | {RoverError.__name__}
-    if error.ename in ours:
-        return text
-    return f"{error.ename}: {text}; 'rover --debug run' shows the traceback"
-
-
-def _subclasses(kind: type[RoverError]) -> set[type[RoverError]]:
-    direct: list[type[RoverError]] = kind.__subclasses__()
-    return set(direct).union(*(_subclasses(c) for c in direct))
+    ours = hasattr(errors, error.ename)  # papermill has only the name of its class
+    return text if ours else f"{error.ename}: {text}; 'rover --debug run' shows the traceback"

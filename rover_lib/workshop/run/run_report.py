@@ -44,9 +44,8 @@ FIGURES = {  # of the run's folder, with what each shows
 def write(run_dir: Path | str) -> dict[str, Any]:
     """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
 
-    Made anew of what is there, so that `make count` and `rover world students` count once they were made. Raises
-    RoverError where a stage is missing, is of other artifacts or lacks what is to be judged, and where an artifact is
-    another one than was compared.
+    Made anew of what is there, with what `make count` and `rover world students` added. Raises RoverError where a stage
+    is missing, is of other artifacts or lacks what is to be judged, and for an artifact that was not compared.
     """
     folder, p = Path(run_dir), params()
     files = _files(folder)
@@ -55,7 +54,7 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         made = contents["quantize"]["metrics"]["modes"]
         _refuse_other_artifacts(folder, made, contents["compare"]["inputs"])
         if (timed := benchmark_of(folder, made)) is None:
-            raise RoverError(f"{folder}: no benchmark of its artifacts, only of others", remedy=AGAIN)
+            raise RoverError(f"{folder}: no benchmark of its artifacts", remedy=AGAIN)
         files["benchmark"] = timed
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
@@ -75,21 +74,17 @@ def write(run_dir: Path | str) -> dict[str, Any]:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """The JSON of each stage but the benchmark. Raises RoverError for one that is missing, and without a benchmark."""
-    if not folder.is_dir():
-        raise RoverError(f"{folder}: no such run", remedy="rover inspect shows the runs that there are")
+    """The JSON of each stage but the benchmark. Raises RoverError for one that is missing."""
     files = {stage: folder / f"{stage}.json" for stage in (*STAGES, *LATER)}
-    missing = [files[stage].name for stage in STAGES if not files[stage].is_file()]
-    if not any(folder.glob("benchmark-*.json")):
-        missing.append("benchmark-<host>.json")
-    if missing:
+    if missing := [files[stage].name for stage in STAGES if not files[stage].is_file()]:
         raise RoverError(f"{folder}: no verdict without {', '.join(missing)}", remedy=AGAIN)
     return {stage: path for stage, path in files.items() if path.is_file()}
 
 
 def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Mapping[str, str]) -> None:
-    """Raise RoverError for a comparison of other artifacts, and for a policy_<mode>.pt that was put there later: all
-    figures are of another. modes: quantize.json's. compared: compare.json's inputs.
+    """Raise RoverError for a comparison of other artifacts, and for a policy_<mode>.pt that was put there later.
+
+    modes: quantize.json's. compared: compare.json's inputs.
     """
     if not is_of(compared, modes):
         raise RoverError(f"{folder / 'compare.json'}: is of other artifacts than this run's", remedy=AGAIN)
@@ -113,12 +108,10 @@ def typed(command: str) -> str:
     return command if shutil.which(program) or not beside.is_file() else f"{_relative(beside)}{space}{rest}"
 
 
-# --- in words ---------------------------------------------------------------------------------------------------------
-
-
 def text(judged: Mapping[str, Any]) -> str:
     """The verdict for a terminal, in lines."""
-    lines = [f"Verdict: {judged['headline']}", *(f"  {line}" for line in judged["why"]), "", *table(judged)]
+    lines = [f"Verdict: {judged['headline']}", *(f"  {line}" for line in judged["why"]), ""]
+    lines += align(columns(judged)) + _worth(judged)
     if judged["failed"]:
         lines += ["", "What failed:"]
         for row in judged["failed"]:
@@ -144,20 +137,12 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return lines
 
 
-def table(judged: Mapping[str, Any]) -> list[str]:
-    """`columns` in a terminal, and below it what each mode is worth."""
-    return align(columns(judged)) + _worth(judged)
-
-
 def _worth(judged: Mapping[str, Any]) -> list[str]:
     return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
-# --- as a page --------------------------------------------------------------------------------------------------------
-
-
 def write_card(run_dir: Path | str) -> Path:
-    """Write README.md into a run's folder, a model card for the Hub, from its run.json and load.json; return its path.
+    """Write README.md, a model card for the Hub, into a run's folder; return its path.
 
     Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
     """
@@ -168,10 +153,8 @@ def write_card(run_dir: Path | str) -> Path:
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
     recordings = load["recordings"]
-    card = _pages(escaped=False).get_template("card.md")
-    path.write_text(
-        card.render(name=folder.resolve().name, judged=judged, header=header, rows=rows, recordings=recordings)
-    )
+    values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
+    path.write_text(_pages(escaped=False).get_template("card.md").render(values))
     return path
 
 
@@ -184,17 +167,12 @@ def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
         _pages(escaped=True)
         .get_template(PAGE)
         .render(
-            name=name,
-            judged=judged,
-            header=header,
-            rows=rows,
+            {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
             kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
             worth=_worth(judged),
             figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
             files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
             made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
-            against=against,
-            typed=typed,
         )
     )
 
@@ -205,6 +183,5 @@ def _pages(*, escaped: bool) -> Environment:
     return pages
 
 
-def _to_html(line: str) -> Markup:
-    """A sentence as HTML, what is between backticks as code."""
+def _to_html(line: str) -> Markup:  # what is between backticks as code
     return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))

@@ -1,8 +1,7 @@
 """Find whether a checkpoint speaks the formula of older firmware, and convert its units if it does.
 
-A policy that was trained on such recordings as they are plans 0.1687 where it means "stopped", which is 222 us here.
-Its plans are held against both readings of the recordings: today's actions, and what the files say. If the files' fit
-better, states and actions are converted by the policy's normalisation, which the artifact's manifest carries.
+A policy of such recordings plans 0.1687 where it means "stopped", which is 222 us here. Its plans are held against both
+readings of the recordings. If the files' fit better, its normalisation converts states and actions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,10 +26,8 @@ def in_todays_units(
 ) -> Checkpoint:
     """Return the policy, in the units of today's actions if it was trained on others.
 
-    These are what the recordings had before they were recomputed. Recordings of the recorded car that follow today's
-    formula may be newer than what the policy learned from: then those of OLD are tried. samples: of the recordings, to
-    plan on; a LeRobotDataset has no other units. known: what an earlier call found, as its report's "units" say, so
-    that nothing is planned again.
+    Recordings of the recorded car that follow today's formula may be newer than what the policy learned from: then OLD
+    is tried. samples: to plan on. known: what an earlier call found, as its report's "units" say.
     """
     if policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
         return policy

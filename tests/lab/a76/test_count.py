@@ -24,7 +24,6 @@ from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
@@ -118,7 +117,7 @@ def test_lines_are_counted_by_the_cache_that_lacks_them(plugin_only, tmp_path, a
     code = [*mark(1), *[word for _ in range(passes) for word in (start, *mov(9, lines), *loop)], *mark(0)]
     path = program(tmp_path / "walks", [*code, *mov(8, 93), *mov(0, 0), SVC])
     done = emulate(plugin_only, [path], tmp_path, watch=f"memory={SECTION}")
-    assert (done.near_lines(SECTION), done.far_lines(SECTION)) == (near, far)
+    assert done.lines(SECTION) == (near, far)
 
 
 def test_functions_are_named_by_address(tmp_path):
@@ -144,11 +143,6 @@ def test_kernels_are_summed_and_the_rest_is_other():
 
 
 @pytest.fixture(scope="module")
-def core(users_cache) -> Core:
-    return prepare()
-
-
-@pytest.fixture(scope="module")
 def tiny_run(thin, tmp_path_factory) -> Path:
     """A run's folder with artifacts of the tests' thin policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
@@ -164,6 +158,11 @@ def tiny_run(thin, tmp_path_factory) -> Path:
     inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
     write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
     return folder
+
+
+@pytest.fixture(scope="module")
+def core(users_cache) -> Core:
+    return prepare()
 
 
 @pytest.fixture(scope="module")
@@ -205,20 +204,10 @@ def test_a_run_is_counted(report, tiny_run):
 def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     torchs, onnx = (report["metrics"]["artifacts"][f"policy_static{kind}"] for kind in ("", ".onnx"))
     assert onnx.keys() == torchs.keys() and onnx["reference"] == torchs["reference"]
-    assert (
-        onnx["versions"]["onnxruntime"] in REQUIREMENTS["onnxruntime"].read_text() and "torch" not in onnx["versions"]
-    )
+    assert "torch" not in onnx["versions"]
     assert onnx["sdot_g"] == pytest.approx(torchs["sdot_g"], rel=0.1)  # the same products, in stacks of columns
     assert 0 < onnx["steering_mae_pct"] < 1.5 * torchs["steering_mae_pct"]
     assert onnx["peak_memory_mb"] < torchs["peak_memory_mb"] - 100  # torch alone is more
-    assert "policy_static.onnx" in reports.table(report)
-
-
-def test_gates_are_of_what_drives(report):
-    rows = {row["gate"]: row["passed"] for row in report["metrics"]["gates"]}
-    assert not [name for name in rows if "instructions" in name or "fp32" in name]
-    assert not rows["policy_static frames judged on the emulated core"]
-    assert rows["policy_static peak_memory_mb"] and rows["policy_static peak_memory_loading_mb"]
 
 
 def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):

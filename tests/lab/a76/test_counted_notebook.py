@@ -1,7 +1,7 @@
 """Notebook 06: what was counted is drawn, and nothing counted is a sentence."""
 
 import pytest
-from executed import printed
+from executed import shown
 
 from lab.a76 import report
 from lab.params import lab_params
@@ -29,7 +29,7 @@ def test_counts_are_drawn(tmp_path):
     metrics = {"label": report.LABEL, "artifacts": artifacts, "peers": {"another one": peer}}
     metrics["gates"] = report.gates(metrics, lab_params()["arm"]["gates"])
     write_stage(tmp_path / "arm.json", "arm", params={}, metrics=metrics)
-    text = printed(runs.execute("06_arm", tmp_path))
+    text = shown(runs.execute("06_arm", tmp_path))
     assert report.LABEL in text
     assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {
         f"06_{figure}" for figure in ("counted", "by_kernel", "clock")
@@ -38,7 +38,7 @@ def test_counts_are_drawn(tmp_path):
 
 def test_nothing_counted_is_a_sentence(tmp_path):
     (tmp_path / "mine").mkdir()
-    assert "make count NAME=mine counts" in printed(runs.execute("06_arm", tmp_path / "mine"))
+    assert "make count NAME=mine counts" in shown(runs.execute("06_arm", tmp_path / "mine"))
     assert {p.name for p in (tmp_path / "mine").iterdir()} == {"06_arm.ipynb"}
     with pytest.raises(runs.RoverError, match="not found"):
         runs.execute("06_arm", tmp_path / "nothing")

@@ -47,7 +47,7 @@ def test_neutral_before_anything_else(board):
     for pin, period_us in (("steering", 21316), ("throttle", 1016)):
         assert pulses(events, pin)[0].at_us < 1000
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
-    assert board.lines[0] == f"<H 4 4.1.1 {board.boot} 0 p {Car().id}"
+    assert board.lines[0] == f"<H 4 4.2.0 {board.boot} 0 p {Car().id}"
     status = board.status
     assert (status.state, status.reason, status.result, status.receiver_steering_us) == ("M", "r", "-", "-")
 
@@ -147,7 +147,7 @@ def test_reset_button_while_driving(armed):
     on_pins(events, *NEUTRAL_US, after_us=start_us)
     assert pulses(events, "throttle", start_us)[0].at_us - start_us < 1000
     assert all(e.pulse_us <= 1800 + EDGE_US for e in events if e.kind == CUT)
-    assert any(body == f"<H 4 4.1.1 {boot + 1} 0 e {Car().id}" for body in armed.lines)
+    assert any(body == f"<H 4 4.2.0 {boot + 1} 0 e {Car().id}" for body in armed.lines)
     for text in old:
         armed.send(text)
     on_pins(armed.run_ms(60), *NEUTRAL_US)
@@ -166,7 +166,7 @@ def test_a_hung_loop_is_reset_by_the_watchdog(armed):
     on_pins([e for e in events if e.at_us + 2000 < reset_us], 1800, 232)
     assert max(widths(events, "throttle", reset_us)) <= 124 + ARDUINO_STEP_US
     on_pins(events, *REST, after_us=reset_us + 60_000, within_us=STEP_US)
-    assert any(body == f"<H 4 4.1.1 {armed.boot} 0 w {Car().id}" for body in armed.lines)
+    assert any(body == f"<H 4 4.2.0 {armed.boot} 0 w {Car().id}" for body in armed.lines)
 
 
 def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):

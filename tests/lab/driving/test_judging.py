@@ -1,16 +1,13 @@
 """How pulses are judged, by made-up ones: each gate by what it must not let pass. Whole rows are in test_rows.py."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from balloon_world.simulated_arduino import PinEvent
-from lab.driving import on_pins
 from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge, periods_of
 from rover_lib.onboard.car.car import Car
 
-GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50, rows=60, stopped_rows=30)
+GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50)
 AT, START, END = 100.0, 99.5, 102.0
 DRIVEN = (1567, 209)
 
@@ -53,15 +50,3 @@ def seen(what):
 def test_a_judgement(expected, what, sentence):
     wrong = judge(expected, seen(what), GATES, human_us=(1600, 140)).wrong
     assert any(sentence in w for w in wrong) if sentence else wrong == []
-
-
-def test_a_row_that_this_machine_spoilt_is_known():
-    fault, steady = on_pins.PinRow("a fault", "link", CONTINUES, "", "", lambda bench: None), seen(then())
-    assert not on_pins._spoilt(fault, steady, GATES)
-    paused = replace(steady, commands=[c for c in steady.commands if not 0.5 < c.at_s - AT < 0.65])
-    assert on_pins._spoilt(fault, paused, GATES)  # rover drive did not get its turn
-    assert not on_pins._spoilt(replace(fault, starves=True), paused, GATES)
-    for kind in ("stall", "lost"):
-        stalled = replace(steady, events=[*steady.events, PinEvent(AT + 1, kind, "", 30_000.0, 0.0)])
-        assert on_pins._spoilt(fault, stalled, GATES)
-    assert on_pins._spoilt(fault, seen(then((-0.5, 1456, 120))), GATES)

@@ -13,8 +13,6 @@ from lab.driving.virtual_host import Process
 from rover_lib.onboard.drive.takeover import LET_GO_S
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 
-# ---- in virtual time: the real firmware's state machine, link, loop and plans
-
 
 class Rows:
     """In the place of a Recorder."""
@@ -127,7 +125,6 @@ def test_every_frame_of_a_mixed_drive_says_who_drove():
             judged += 1
             if said != truly(int(frame_ms)):
                 farthest_ms = max(farthest_ms, min(abs(frame_ms - ms) for ms in changes))
-    print(f"{judged} moments judged; who drove is wrong for at most {farthest_ms:.1f} ms beside a change")
     assert judged > 10_000 and farthest_ms <= FRAME_MS
 
 

@@ -1,25 +1,20 @@
 """A car other than the first: its recordings, its artifacts, its reverse, and its policy on a different car."""
 
 import json
-from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from lab.driving.policy import make_artifact
 from rover_lib.onboard.artifact.manifest import car_of
-from rover_lib.onboard.car import car as car_module
-from rover_lib.onboard.car.car import Car, yaml_of
-from rover_lib.onboard.care import doctor
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.drive.arming import arm_capped
 from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
-from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
+from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, json_controls, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import car_of as car_of_samples
 
 CRAWLER = Car.of(
     {
@@ -46,20 +41,7 @@ def test_a_recording_carries_its_car(tmp_path):
     assert read_car_of(folder) == CRAWLER and read_car_of(episode(tmp_path / "first", Car())) == Car()
     assert {row["throttle_raw_us"] for row in json_controls(folder / "episode_data.json")} == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
-    assert actions[:, 1].min() == pytest.approx(-0.1)
-    assert actions[:, 1].max() == pytest.approx(0.1)
-    assert actions[:, 0] == pytest.approx(0.5)
-
-
-def test_recordings_of_two_cars_make_no_policy(tmp_path):
-    episode(tmp_path, CRAWLER)
-    episode(tmp_path, Car(), "episode_20260101_000100")
-    samples = load_recordings(tmp_path).samples
-    with pytest.raises(EpisodeError, match="of several cars"):
-        car_of_samples(samples)
-    same = Car.of(CRAWLER.description() | {"name": "its twin"})
-    twins = [replace(sample, car=same) if i % 2 else sample for i, sample in enumerate(samples[:20])]
-    assert car_of_samples(twins) == twins[0].car == CRAWLER
+    assert (actions[:, 1].min(), actions[:, 1].max(), actions[0, 0]) == pytest.approx((-0.1, 0.1, 0.5))
 
 
 def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):
@@ -94,20 +76,7 @@ def test_plans_with_reverse():
 
 def test_the_cap_of_a_car_with_reverse():
     said, link = [], Mock(calibration=CRAWLER.pwm)
-    for cap_us in (1600, 1550):
-        link.lower_cap.return_value = Mock(cap_us=cap_us)
-        assert arm_capped(link, 0.2, said.append) is link.arm.return_value
+    link.lower_cap.return_value = Mock(cap_us=1550)
+    assert arm_capped(link, 0.2, said.append) is link.arm.return_value
     assert abs(link.lower_cap.call_args[0][0] - 1500) == 100
     assert len(said) == 1 and "at most throttle 0.10 (1550 us)" in said[0]
-
-
-def test_doctor_says_which_car(monkeypatch, tmp_path):
-    path = tmp_path / "crawler.yml"
-    path.write_text(yaml_of(CRAWLER))
-    monkeypatch.setenv(car_module.FILE_VARIABLE, str(path))
-    make_artifact(tmp_path / "policy.pt")
-    first, second = doctor.car(tmp_path / "policy.pt")
-    assert (first.verdict, first.found) == ("ok", f"crawler, of {path}")
-    assert second.verdict == "warning"
-    assert 'calibrated for "the recordings\' car"' in second.found
-    assert len(list(doctor.car(None))) == 1

@@ -50,7 +50,7 @@ def test_what_cannot_be_read_is_said(tmp_path, monkeypatch):
     (cut / "0.jpg").write_bytes(hostile.cut(hostile.WHOLE))
     for source, message in (
         ("63", "no such camera"),
-        (tmp_path, "no pictures"),
+        (tmp_path, "no JPEGs"),
         (tmp_path / "drive.mp4", "ffmpeg"),
         (cut, r"no frame within 0\.3 s: a JPEG is damaged or cut short"),
     ):
@@ -69,22 +69,19 @@ def test_a_folder_is_shown_again_and_again_until_it_begins(tmp_path):
     assert b"".join(picture for picture, _ in reader) == b"abc"
 
 
-@pytest.mark.parametrize(("at", "axis"), [(0, 0), (0.5, 1), (0.95, 0)])
-def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen(at, axis):
+def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen():
     """A strip of 5 % lies in one or two rows or columns of the blocks that are compared; it drove on."""
-    rng, camera = np.random.default_rng(0), Camera("frozen")
+    rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (360, 640, 3), np.uint8)
-    size = picture.shape[axis]
-    strip = slice(int(at * size), int(at * size) + size // 20)
-    for _ in range(4):
-        part = picture[strip] if axis == 0 else picture[:, strip]
-        part[:] = rng.integers(0, 255, part.shape, np.uint8)
-        camera.add(picture.copy(), 0.0, None)
-    assert camera.latest().repeats == 3
+    for strip in (picture[:18], picture[:, 320:352]):
+        camera = Camera("frozen")
+        for _ in range(4):
+            strip[:] = rng.integers(0, 255, strip.shape, np.uint8)
+            camera.add(picture.copy(), 0.0, None)
+        assert camera.latest().repeats == 3
 
 
 def test_no_picture_of_a_real_drive_counts_as_frozen():
-    """The most equal ones share a fiftieth of their blocks."""
     for episode in sorted(recorded.real_recordings().glob("episode_*")):
         camera = Camera("recorded")
         for jpeg in sorted((episode / "frames").glob("*.jpg")):
@@ -93,15 +90,13 @@ def test_no_picture_of_a_real_drive_counts_as_frozen():
 
 
 def test_a_film_that_begins_again_is_no_frozen_camera():
-    rng, camera = np.random.default_rng(0), Camera("film", held=True)
+    rng, camera, shown = np.random.default_rng(0), Camera("film", held=True), []
     pictures = [rng.integers(0, 255, (36, 64, 3), np.uint8) for _ in range(6)]
-    shown = []
-    for _ in range(3):
-        for picture in pictures:
-            camera.add(picture, 0.0, None)
-            shown.append(camera.latest().repeats)
+    for picture in pictures * 3:
         if len(shown) == 12:  # until here they do no harm: nobody drives with it yet
             camera.begin()
+        camera.add(picture, 0.0, None)
+        shown.append(camera.latest().repeats)
     assert shown == [0] * 6 + [1, 2, 3, 4, 5, 6] + [0] * 6
 
 
@@ -149,12 +144,10 @@ def test_pictures_of_another_form_are_refused(readings):
     assert "too small" in small.ended
 
 
-@pytest.mark.parametrize("ring", [1, 3, 31])
+@pytest.mark.parametrize("ring", [1, 31])
 def test_a_ring_of_old_pictures_shows_nothing_new(readings, ring):
     newest = readings.read(live(50) + live(50)[50 - ring :] * 40)
-    repeats = [repeats for _, repeats, _ in newest]
-    assert repeats[:50] == [0] * 50
-    assert repeats[50:90] == list(range(1, 41))
+    assert [repeats for _, repeats, _ in newest][:90] == [0] * 50 + list(range(1, 41))
 
 
 def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
@@ -172,8 +165,7 @@ def test_damaged_pictures_are_left_out_and_four_in_a_row_are_a_fault(readings):
 )
 def test_a_frame_is_as_old_as_its_time_stamp_if_that_is_the_machines(readings, stamp, kind, age_s):
     newest = readings.read(live(10), stamp)
-    assert readings.camera.time_stamps == kind
-    assert [number for number, _, _ in newest] == [1, 2, 3, 4, 5, 6]  # the first five only decide the clock
+    assert readings.camera.time_stamps == kind and len(newest) == 10
     assert all(age == pytest.approx(age_s, abs=1e-5) for _, _, age in newest)
 
 
@@ -182,14 +174,13 @@ def test_a_frame_is_as_old_as_its_time_stamp_if_that_is_the_machines(readings, s
 )
 def test_stamps_that_become_old_are_a_fault(readings, stamp, found):
     newest = readings.read(live(30), lambda now_s, i: now_s if i < 20 else stamp(now_s))
-    assert newest[-1][0] == 16 and len(newest) == 19
+    assert newest[-1][0] == 20 and len(newest) == 23
     assert "time stamp" in readings.ended and found in readings.ended
 
 
-@pytest.mark.parametrize("stamp", [lambda now_s, i: now_s - 1.5, lambda now_s, i: now_s - 30, lambda now_s, i: 4999.0])
+@pytest.mark.parametrize("stamp", [lambda now_s, i: now_s - 1.5, lambda now_s, i: 4999.0])
 def test_stamps_that_were_never_of_now_are_no_frames(readings, stamp):
     assert readings.read(live(30), stamp) == []
-    assert readings.camera._refusal.what == "a frame's time stamp is not of now"
 
 
 class Device:
@@ -198,9 +189,6 @@ class Device:
     def __init__(self, fourcc, picture):
         self.fourcc, self.picture, self.converts = fourcc, picture, True
         self.isOpened = self.release = lambda: True
-
-    def __call__(self, source, backend):
-        return self
 
     def set(self, what, value):
         if what == cv2.CAP_PROP_CONVERT_RGB:
@@ -218,7 +206,7 @@ class Device:
 def test_jpegs_of_a_device_are_decoded_here_and_others_by_opencv(monkeypatch, fourcc):
     """OpenCV gives a device's JPEG as (1, bytes) uint8 if told not to convert it."""
     device = Device(cv2.VideoWriter.fourcc(*fourcc), np.frombuffer(hostile.WHOLE, np.uint8)[None])
-    monkeypatch.setattr(cv2, "VideoCapture", device)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source, backend: device)
     picture, stamp_s = next(c._v4l2("/dev/video0", (640, 360), 30))
     assert (picture == hostile.WHOLE) if fourcc == "MJPG" else picture.shape == (360, 640, 3)
     assert stamp_s == 2.5

@@ -42,10 +42,8 @@ def no_file(monkeypatch, tmp_path):
 
 def test_without_a_file_it_is_the_recordings_car(no_file):
     car = this_car()
-    assert car.pwm == PwmCalibration()
-    assert car.is_default
-    assert car.focal_px == 400
-    assert (car.wheelbase_m, car.cap, car.reverses) == (0.26, pytest.approx(0.2, abs=1e-3), False)
+    assert car.pwm == PwmCalibration() and car.is_default
+    assert (car.focal_px, car.wheelbase_m, car.cap, car.reverses) == (400, 0.26, pytest.approx(0.2, abs=1e-3), False)
     np.testing.assert_array_equal(car.limits, [[-1, 0], [1, 1]])
 
 
@@ -64,11 +62,11 @@ def test_the_default_written_down_is_the_same_to_the_bit_and_a_named_file_counts
 def test_each_side_of_neutral_has_its_own_span():
     car = Car.of(CRAWLER)
     assert [car.pwm.steering.pulse_us(a) for a in (-1, -0.5, 0, 0.5, 1)] == [1100, 1300, 1500, 1750, 2000]
-    assert car.pwm.neutral() == car.pwm.pulses(0, 0)
     assert car.numbers == (20000, 1100, 1500, 2000, 20000, 1000, 1500, 2000, 100)
-    assert car.reverses
-    assert car.limits.tolist() == [[-1, -1], [1, 1]]
+    assert car.reverses and car.limits.tolist() == [[-1, -1], [1, 1]]
     assert car.focal_px == pytest.approx(268.5, abs=0.05)
+    assert [car.pwm.throttle.moves(us) for us in (1490, 1496, 1500, 1504, 1510)] == [True, False, False, False, True]
+    assert [Car().pwm.throttle.moves(us) for us in (0, 104, 120, 124, 125)] == [False] * 4 + [True]
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.booleans())
@@ -85,18 +83,11 @@ def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
     assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)
 
 
-def test_what_moves_a_car():
-    both = Car.of(CRAWLER).pwm.throttle
-    assert [both.moves(us) for us in (1490, 1496, 1500, 1504, 1510)] == [True, False, False, False, True]
-    assert [Car().pwm.throttle.moves(us) for us in (0, 104, 120, 124, 125)] == [False] * 4 + [True]
-
-
 @pytest.mark.parametrize(
     ("where", "value", "sentence"),
     [
         ("steering.left_us", None, "left_us must be a whole number"),
         ("colour", "red", "unknown colour"),
-        ("steering.left_us", True, "left_us"),
         ("steering.left_us", 1500, "between its two ends"),
         ("steering.neutral_us", 1250, "neutral_us must be from 1300 to 1700"),
         ("steering.right_us", 1300, "must be from 250"),
@@ -107,12 +98,11 @@ def test_what_moves_a_car():
         ("throttle.forward_us", 1550, "must be from 100"),
         ("throttle.cap_us", 119, "from 1 to 118"),
         pytest.param("wheelbase_m", 10**400, "wheelbase_m", id="a number of 401 digits"),
-        ("name", "", "name"),
         ("human", "nobody", "human"),
     ],
 )
 def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, no_file):
-    for text, words in ((yaml.safe_dump(changed(where, value)), sentence), ("- a list", ""), ("a: [", ""), ("", "")):
+    for text, words in ((yaml.safe_dump(changed(where, value)), sentence), ("- a list", ""), ("a: [", "")):
         no_file.write_text(text)
         with pytest.raises(CarError) as error:
             this_car()
@@ -122,14 +112,9 @@ def test_what_is_no_car_is_said_in_a_sentence(where, value, sentence, no_file):
 def test_which_side_is_positive_is_said_and_changes_no_pulse():
     """The recorded car's files once called 2012 us left; its pictures show that it is right."""
     ours = Car()
-    assert ours.description()["steering"] | {"period_us": 0} == {
-        "period_us": 0, "left_us": 900, "neutral_us": 1456, "right_us": 2012, "positive": "right",
-    }  # fmt: skip
     before = ours.description()
     before["steering"] = {"period_us": 21316, "left_us": 2012, "neutral_us": 1456, "right_us": 900}
     for content in (ours.description(), before):
         assert Car.of(content) == ours and Car.of(content).pwm.pulses(1, 0).steering_us == 2012
     left = Car.of(before | {"steering": before["steering"] | {"positive": "left"}})
     assert (left.positive, left.left, ours.left) == ("left", 1, -1) and left.drives_like(ours)
-    with pytest.raises(CarError, match="positive must be"):
-        Car.of(before | {"steering": before["steering"] | {"positive": "up"}})

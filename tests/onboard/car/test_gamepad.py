@@ -84,14 +84,12 @@ def test_the_human_counts_while_l1_is_held(pad):
     assert pad.sticks() is None
 
 
-@pytest.mark.parametrize(
-    ("event", "age_s"), [((KEY, BTN_L1, 2), 0), ((KEY, BTN_L1, 1), 0.2), ((KEY, BTN_L1 + 1, 1), 0)]
-)
-def test_only_a_press_that_is_seen_counts(pad, event, age_s):
+def test_only_a_press_that_is_seen_counts(pad):
     """A button that is stuck, or events that waited, are nobody."""
-    pad.send(event, age_s=age_s)
-    pad.move(0.5, 0)
-    assert pad.sticks() is None
+    for event, age_s in (((KEY, BTN_L1, 2), 0), ((KEY, BTN_L1, 1), 0.2), ((KEY, BTN_L1 + 1, 1), 0)):
+        pad.send(event, age_s=age_s)
+        pad.move(0.5, 0)
+        assert pad.sticks() is None
 
 
 def test_where_the_sticks_are_is_asked_at_the_opening(pad):
@@ -128,7 +126,7 @@ def test_after_a_silence_l1_must_be_pressed_again(pad):
     assert pad.sticks() == (1, 0)
 
 
-def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeypatch, caplog):
+def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeypatch):
     """Whoever waits to be armed asks what is missing ten times a second, and systemd's watchdog waits with them."""
     link = ServoLink("none", car=Car(human="gamepad"))
     link._gamepad = first = pad.opened
@@ -136,11 +134,10 @@ def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeyp
     assert pad.sticks()
     pad.unplug()
     assert first.sticks(pad.now_s) is None and first.sticks(pad.now_s) is None
-    assert caplog.text.count("is gone") == 1
     there = []
     monkeypatch.setattr(gamepads, "list_gamepads", lambda: there)
     monkeypatch.setattr(gamepads.time, "sleep", None)  # nothing is waited for
-    assert "no gamepad that can be used is connected" in link.remedy("s")
+    assert "none in /dev/input" in link.remedy("s")
     there.append(Found("virtual", Path("B"), Path("B"), identity="B"))
     assert "connect virtual again" in link.remedy("s") and link._gamepad is first
     there.append(Found("virtual", Path("A"), Path("A"), identity="A"))

@@ -125,7 +125,7 @@ def test_an_arduino(monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
         checks = {c.name: c for c in doctor.arduino(board.port, boot_s=2)}
-    assert checks["Arduino"].found == f"{board.port}: firmware 4.1.1, protocol 4"
+    assert checks["Arduino"].found == f"{board.port}: firmware 4.2.0, protocol 4"
     assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
@@ -139,7 +139,7 @@ def test_a_gamepad_that_nobody_holds(proc, monkeypatch):
         monkeypatch.setattr(f"rover_lib.onboard.{module}.this_car", lambda: gamepad_car)
         monkeypatch.setattr(f"rover_lib.onboard.{module}.open_gamepad", lambda: pad)
     monkeypatch.setattr(doctor, "list_gamepads", lambda: ("A (event0)", "B (event1)"))
-    with board_of(answer=talking("- - - -"), hello=f"<H 4 4.1.1-gamepad 7 0 e {gamepad_car.id}") as board:
+    with board_of(answer=talking("- - - -"), hello=f"<H 4 4.2.0-gamepad 7 0 e {gamepad_car.id}") as board:
         found = examine(camera=str(proc / "none"), port=board.port, host=Host(proc_root=proc), boot_s=2)
         checks = {c.name: c for c in found}
     assert checks["transmitter"].verdict == "warning"

@@ -32,7 +32,7 @@ class Link:
     def __init__(self, clock, acknowledge=lambda n: True):
         self.clock, self.acknowledge = clock, acknowledge
         self.said, self.sent_at, self.status, self.sequence = [], [], STATUS, 0
-        self.hello = Hello(4, "4.1.1", 7, 0, "reset pin")
+        self.hello = Hello(4, "4.2.0", 7, 0, "reset pin")
         self.fails = None
 
     def arm(self):

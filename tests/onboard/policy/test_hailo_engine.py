@@ -22,9 +22,7 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 def packed(hailo_kit, tmp_path_factory):
     """The artifact, compiled and packed."""
     kit = shutil.copytree(hailo_kit, tmp_path_factory.mktemp("packed") / "kit")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        hailo_standin.install(monkeypatch)
-        return hailo_compile.pack(kit, "hailo8", hailo_compile.compile_network(kit, "hailo8"))
+    return hailo_compile.pack(kit, "hailo8", hailo_standin.compile_kit(kit))
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,5 @@
 """The recorder beside a loop, and the loop for a human: what is recorded, and what is left when something fails."""
 
-import csv
 import json
 import os
 import pty
@@ -23,7 +22,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry, frame
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import recorder as module
-from rover_lib.onboard.recording.episode import About, EpisodeWriter, finish_killed
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.recording.recorder import Recorder, record
 from rover_lib.workshop.recordings.episodes import load_recordings
 
@@ -115,8 +114,6 @@ def test_an_episode_beside_a_loop(tmp_path, virtual):
     times = [c["system_timestamp"] for c in content["control_samples"]]
     times += [f["timestamp"] for f in content["frame_samples"]]
     assert before_s <= min(times) <= max(times) <= time.time() + 0.125
-    with (folder / "control_data.csv").open(newline="") as f:
-        assert [r["plan_age_ms"] for r in csv.DictReader(f)] == ["", "", "80.5", "80.5", "80.5"]
     assert len(load_recordings(folder, chunk=2).samples) == 5
 
 
@@ -189,8 +186,8 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, virtual, monkeypatch):
 
 def test_episodes_take_no_more_than_they_may(tmp_path, virtual):
     picture = np.random.default_rng(0).integers(0, 256, (360, 640, 3), np.uint8)  # 500 kB as JPEG
-    (tmp_path / "episode_before" / "frames").mkdir(parents=True)
-    (tmp_path / "episode_before" / "frames" / "frame_000001.jpg").write_bytes(bytes(2_000_000))
+    (tmp_path / "before").mkdir()
+    (tmp_path / "before" / "frame_000001.jpg").write_bytes(bytes(2_000_000))
     room = module.room_for(tmp_path, 6.0)
     assert 3_900_000 < room <= 4_000_000
     recorder = virtual.beside(tmp_path, most_bytes=room)
@@ -202,20 +199,7 @@ def test_episodes_take_no_more_than_they_may(tmp_path, virtual):
     assert content_of(folder)["metadata"]["fault"] == recorder.failure
     with pytest.raises(EpisodeError, match="or delete some"):
         virtual.beside(tmp_path, most_bytes=module.room_for(tmp_path, 6.0))
-    assert left_in(tmp_path) == [folder.name, "episode_before"]
-
-
-def test_a_disk_that_is_full_at_the_end_keeps_what_there_is(tmp_path, virtual, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    recorder = virtual.beside(tmp_path)
-    virtual.drive(100)
-    with monkeypatch.context() as patch:
-        patch.setattr(csv.DictWriter, "writerows", full)
-        assert recorder.close() is None and "No space left on device" in recorder.failure
-    (part,) = tmp_path.iterdir()
-    assert len(content_of(finish_killed(part))["control_samples"]) == 100
+    assert left_in(tmp_path) == ["before", folder.name]
 
 
 def test_a_disk_that_hangs_holds_up_nothing(tmp_path, virtual, monkeypatch):
@@ -311,7 +295,7 @@ def arduino():
             if done.wait(0.02):
                 break
             if n % 25 == 15:
-                os.write(master, frame(f"<H 4 4.1.1 7 0 e {Car().id}"))
+                os.write(master, frame(f"<H 4 4.2.0 7 0 e {Car().id}"))
             os.write(master, status(n))
         os.close(master)
 

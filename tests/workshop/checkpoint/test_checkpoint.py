@@ -11,14 +11,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from policies import TINY, check_is, lerobot_policy, memory_samples, normalised, trainer_content
 from safetensors.torch import load_file, save_file
 
-from rover_lib.cli import main
-from rover_lib.onboard.errors import CheckpointError, RoverError
+from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.act import ACT, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
@@ -56,15 +54,12 @@ def save(folder, policy, inner, outer):
     return folder
 
 
-# ---- the trainer's file -----------------------------------------------------------------------------------
-
-
 def test_reads_the_trainers_file(tiny, tiny_policy):
     c, r = tiny.config, tiny.report
     assert (c.chunk, c.dim, c.heads, c.feedforward, c.latent, c.vae_layers) == (32, 64, 4, 128, 32, 1)
     assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle")
     assert r["parameters"] == sum(p.numel() for p in tiny_policy.state_dict().values())
-    assert r["parameters"] - r["parameters_acting"] == r["parameters_by_part"]["vae (training only)"] > 0
+    assert r["parameters"] - r["parameters_acting"] > 0
     assert r["best_val_loss"] == pytest.approx(0.15) and r["epoch"] == 7 and json.dumps(r)
     # Beside weights and optimizer a file has only names and a few numbers, so the sum must explain its size.
     assert r["file_mb"] == pytest.approx(r["weights_mb"] + r["optimizer_mb"], rel=0.02) and r["optimizer_mb"] > 0
@@ -86,9 +81,7 @@ def test_what_is_not_needed_may_be_missing_or_odd(tiny, tiny_policy, tmp_path):
     found = load_checkpoint(path)
     assert found.config == tiny.config and found.report["trainer_config"]["size"] == [1, 2]
     assert all(torch.equal(v, tiny.weights[k]) for k, v in found.weights.items() if k != "action_head.weight")
-    with pytest.raises(RoverError) as e:  # a folder that holds it
-        load_checkpoint(tmp_path)
-    assert path.name in str(e.value)
+    assert "best_model.pth" in refused(tmp_path)  # a folder that holds it
 
 
 def test_reads_scalars_of_older_numpy(tiny_file, tmp_path):
@@ -132,17 +125,15 @@ def weight(value):
         (lambda c: c.pop("config"), "no 'config'"),
         (lambda c: c["config"].update(chunk_size="32"), "chunk_size"),
         (lambda c: c["config"].update(n_heads=7), "divisible"),
+        (lambda c: c["config"].update(image_height=8), "cameras must be"),
         (lambda c: c["config"].update(n_obs_steps=2), "n_obs_steps"),
         (lambda c: c["config"].update(vision_encoder="vit"), "'vit'"),
         (lambda c: c["config"].update(n_decoder_layers=10**6), "1000000"),
-        (lambda c: c["config"].update(n_decoder_layers=3), "missing: decoder.layers.2"),
-        (lambda c: c["config"].update(feedforward_dim=64), "of another shape"),
-        (lambda c: c.update(best_val_loss="low"), "best_val_loss"),
+        (lambda c: c["config"].update(feedforward_dim=64), "size mismatch"),
+        (lambda c: c.update(best_val_loss="low"), "'low'"),
         (lambda c: c["model_state_dict"].pop("model.action_head.bias"), "action_head.bias"),
-        (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "unknown: extra"),
-        (weight(3), BIAS),
+        (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "Unexpected key"),
         (weight(torch.eye(8).to_sparse()), BIAS),
-        (weight(torch.ones(64, dtype=torch.int64)), BIAS),
         # finite here, but not in float32, in which the policy drives
         (weight(torch.full((64,), 1e300, dtype=torch.float64)), "NaN"),
     ],
@@ -172,13 +163,9 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
     refused(path)
 
 
-# ---- another size -----------------------------------------------------------------------------------------
-
-
 def test_at_another_size_it_is_lerobots_policy_of_that_size(tiny):
     size = (75, 131)
     other = tiny.at_size(*size)
-    assert other.config == replace(tiny.config, image_sizes=(size,)) and other.weights is tiny.weights
     ours, lerobot = ACT(other.config, other.weights), LerobotEager(other)
     (sample,) = memory_samples(1, *size)
     with torch.inference_mode():
@@ -186,21 +173,10 @@ def test_at_another_size_it_is_lerobots_policy_of_that_size(tiny):
     lerobot._low, lerobot._high = -np.inf, np.inf  # clipped plans would be equal in any case
     expected = lerobot.predict_chunk(sample.picture, sample.state)
     assert np.abs(found - expected).max() < 1e-5 < np.abs(found).max()
-
-
-def test_a_size_that_makes_no_sense_is_refused(tiny):
     two = replace(tiny, config=replace(tiny.config, cameras=("left", "right"), image_sizes=((72, 128),) * 2))
-    for policy, size, words in (
-        (tiny, (54.0, 96.0), "whole"),
-        (tiny, (18, 32), "feature"),
-        (tiny, (96, 96), "aspect"),
-        (two, (54, 96), "2 cameras"),
-    ):
-        with pytest.raises(CheckpointError, match=words):
+    for policy, size in ((tiny, (54.0, 96.0)), (tiny, (18, 32)), (tiny, (96, 96)), (two, (54, 96))):
+        with pytest.raises(CheckpointError, match="cannot run at"):
             policy.at_size(*size)
-
-
-# ---- LeRobot's folder -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -236,15 +212,13 @@ def in_step(change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda c: c.update(type="pi0"), "'pi0'"),
         (lambda c: c.pop("type"), "migrate_policy_normalization"),
         (lambda c: c.update(feedforward_activation="glu"), "'glu'"),
-        (lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot build it"),
-        (lambda c: c.update(n_obs_steps=2), "LeRobot cannot read it"),
+        (lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
+        (lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
         (lambda c: c.update(input_features={}), "features"),
-        (lambda c: c["input_features"].pop("observation.state"), "unknown: encoder_robot_state_input_proj"),
-        (lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot read it"),
-        (lambda c: c["input_features"].update(x={"type": "VISUAL", "shape": [1, 8, 8]}), "features"),
+        (lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
+        (lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
         (lambda c: c["output_features"]["action"].update(type="STATE"), "features"),
     ],
 )
@@ -259,15 +233,9 @@ def test_refuses_damaged_and_divided_folders(copied):
         weights.write_bytes(data)
         refused(copied)
     weights.unlink()
-    assert "not found" in refused(copied)
+    assert "merge an adapter or pieces" in refused(copied)
     os.mkfifo(weights)
     refused(copied)
-    weights.unlink()
-    (copied / "model.safetensors.index.json").write_text("{}")
-    assert "sharded" in refused(copied)
-    (copied / "adapter_config.json").write_text("{}")
-    assert "PEFT" in refused(copied)
-    (copied / "adapter_config.json").unlink()
     for text in ("{", "[]", "[" * 100_000, " " * 2_000_000):
         (copied / "config.json").write_text(text)
         refused(copied)
@@ -308,19 +276,20 @@ def test_one_odd_value_is_a_sentence_or_changes_nothing(folder, data, file):
         path.write_text(before)
 
 
-# ---- normalisation: never left out without a word --------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [
-        (INNER, in_step(lambda s: s["config"]["norm_map"].pop("STATE")), "would be left"),
-        (INNER, in_step(lambda s: s["config"]["features"].pop("observation.state")), "would be left"),
-        (INNER, in_step(lambda s: s["config"]["features"]["observation.state"].update(type="ACTION")), "would be left"),
+        (INNER, in_step(lambda s: s["config"]["norm_map"].pop("STATE")), "would not be normalised"),
+        (INNER, in_step(lambda s: s["config"]["features"].pop("observation.state")), "would not be normalised"),
+        (
+            INNER,
+            in_step(lambda s: s["config"]["features"]["observation.state"].update(type="ACTION")),
+            "would not be normalised",
+        ),
         (INNER, in_step(lambda s: s["config"].update(normalize_observation_keys=[])), "some of the observations only"),
         (INNER, in_step(lambda s: s.update(registry_name="magic")), "'magic'"),
-        (INNER, in_step(lambda s: s["config"].update(rename_map={"a": "b"})), "LeRobot cannot read it"),
-        (OUTER, in_step(lambda s: s.pop("state_file")), "would be left"),
+        (INNER, in_step(lambda s: s["config"].update(rename_map={"a": "b"})), "LeRobot cannot use it"),
+        (OUTER, in_step(lambda s: s.pop("state_file")), "would not be normalised"),
         (OUTER, lambda c: c["steps"].clear(), "normalises 0 times"),
         (OUTER, lambda c: c["steps"].append(c["steps"][0]), "normalises 2 times"),
     ],
@@ -384,36 +353,16 @@ def test_the_steps_own_type_of_a_feature_decides_how_it_is_normalised(policy, tm
 def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copied):
     for file in (INNER, OUTER):
         (copied / file).unlink()
-        refused(copied)
-    assert "policy_preprocessor*" in refused(copied)
+        assert "policy_preprocessor*" in refused(copied)
     edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
     assert load_checkpoint(copied).config.state_norm is None
 
 
-@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX"])
-def test_statistics_in_the_weights_are_read_as_lerobot_did_before_processors(policy, mode, tmp_path):
-    inner, outer, stats = normalised(policy, mode)
-    policy.save_pretrained(tmp_path)
-    weights = load_file(tmp_path / "model.safetensors")
-    for part, keys in (
-        ("normalize_inputs", [k for k in stats if k != "action"]),
-        ("normalize_targets", ["action"]),
-        ("unnormalize_outputs", ["action"]),
-    ):
-        for key in keys:
-            name = f"{part}.buffer_{key.replace('.', '_')}"
-            weights |= {f"{name}.{stat}": value.clone() for stat, value in stats[key].items()}
-    save_file(weights, tmp_path / "model.safetensors")
-    checkpoint = load_checkpoint(tmp_path)
-    check_is(checkpoint, policy, inner, outer)
-    assert "0.4" in checkpoint.report["normalisation_from"]["out"]
-    for stat in ("mean", "min"):
-        weights[f"unnormalize_outputs.buffer_action.{stat}"] = torch.full((2,), torch.inf)  # LeRobot's mark: never set
-    save_file(weights, tmp_path / "model.safetensors")
-    refused(tmp_path)
-
-
-# ---- as people have them ----------------------------------------------------------------------------------
+def test_statistics_in_the_weights_are_refused_with_lerobots_conversion(copied):
+    """As LeRobot wrote them before it had processors."""
+    weights = load_file(copied / "model.safetensors")
+    save_file(weights | {"unnormalize_outputs.buffer_action.std": torch.ones(2)}, copied / "model.safetensors")
+    assert "migrate_policy_normalization" in refused(copied)
 
 
 def rename(folder, change):
@@ -425,12 +374,11 @@ def rename(folder, change):
     ("change", "says"),
     [
         (lambda f: rename(f, "_orig_mod.{}".format), "'_orig_mod.model.'"),
-        (lambda f: rename(f, lambda n: n.removeprefix("model.")), "''"),
         (lambda f: edit(f / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1)), "0.01"),
         (lambda f: edit(f / "config.json", lambda c: c.update(use_film=True, device="cuda")), "use_film"),
         (lambda f: edit(f / "config.json", lambda c: c.update(pretrained_revision="v1")), None),  # of LeRobot 0.6
     ],
-    ids=["compiled", "the network alone", "ensembling", "unknown field", "newer"],
+    ids=["compiled", "ensembling", "unknown field", "newer"],
 )
 def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_path, change, says):
     inner, outer, _ = normalised(policy, "MEAN_STD")
@@ -476,18 +424,12 @@ def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
 def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
     inner, outer, _ = normalised(policy, "MEAN_STD")
     folder = save(tmp_path / "out/checkpoints/000020/pretrained_model", policy, inner, outer)
-    # as copied by a program that leaves links out
-    assert [note for note in load_checkpoint(tmp_path / "out").report["notes"] if "000020" in note]
-    other = shutil.copytree(folder.parent, folder.parents[1] / "000010")
-    with pytest.raises(CheckpointError, match="the last, found 000010, 000020"):
+    with pytest.raises(CheckpointError, match="000020"):  # as copied by a program that leaves links out
         load_checkpoint(tmp_path / "out")
-    shutil.rmtree(other)
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
-    assert lerobot_folder(tmp_path) is None
-    for place in ("out", "out/checkpoints", "out/checkpoints/last", "out/checkpoints/last/pretrained_model"):
-        assert lerobot_folder(tmp_path / place)[0].resolve() == folder
+    for place in ("out", "out/checkpoints", "out/checkpoints/last/pretrained_model"):
+        assert lerobot_folder(tmp_path / place).resolve() == folder
     checkpoint = load_checkpoint(tmp_path / "out/checkpoints/last")
     check_is(checkpoint, policy, inner, outer)
     assert checkpoint.report["normalisation"]["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"
-    result = CliRunner().invoke(main, ["inspect", str(tmp_path / "out")])
-    assert result.exit_code == 0 and "output * (1.2, 0.3) + (0.3, 0.25)" in result.output
+    assert checkpoint.report["normalisation"]["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"

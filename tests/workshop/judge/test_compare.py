@@ -238,7 +238,7 @@ def test_microseconds_are_of_the_policys_car():
     """This machine may be set up for another car than the run's."""
     described = Car().description()
     described["steering"] = {"period_us": 20000, "left_us": 1900, "neutral_us": 1500, "right_us": 1100}
-    for car, us in ((Car.of(described), 400), (Car(), PwmCalibration().us_per_unit("steering"))):
+    for car, us in ((Car.of(described), 400), (Car(), PwmCalibration().steering.us_per_unit)):
         base, off = np.full((3, 2), 0.1), [np.full((3, 2), 0.01)]
         report = compare.fidelity(Fixed(base, car=car), {"static": Fixed(base, off)}, [sample()], RANGE)
         assert report.us("steering") == pytest.approx(us) and math.isnan(report.us("gripper"))

@@ -13,7 +13,7 @@ import pytest
 import simplejpeg
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from recorded import real_episode, real_recordings
+from recorded import real_recordings
 
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
@@ -47,13 +47,11 @@ def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
 
 
 def edit(folder, change):
-    """Rewrite a recording's JSON, and remove the CSVs, so that nothing can be read from them."""
+    """Rewrite a recording's JSON."""
     path = folder / "episode_data.json"
     content = json.loads(path.read_text())
     changed = change(content)
     path.write_text(json.dumps(content if changed is None else changed))
-    for name in ("control_data.csv", "frame_data.csv"):
-        (folder / name).unlink(missing_ok=True)
     return folder
 
 
@@ -88,11 +86,9 @@ def test_pairs_of_a_faultless_recording(tmp_path):
     assert (episode.id, episode.label, episode.frames) == ("episode_20260101_120000", "hit red balloon", 40)
     assert episode.duration_s == pytest.approx(39 / 30)
     samples = recordings.samples
-    assert len(samples) == 40
-    assert samples[0].state.tolist() == [0, 0]  # neutral at the start
+    assert len(samples) == 40 and samples[0].state.tolist() == [0, 0]  # neutral at the start
     for k, sample in enumerate(samples):
-        assert sample.state.dtype == sample.chunk.dtype == np.float32
-        assert sample.chunk.shape == (CHUNK, 2)
+        assert sample.state.dtype == sample.chunk.dtype == np.float32 and sample.chunk.shape == (CHUNK, 2)
         assert sample.time_s == pytest.approx(k / 30, abs=1e-6)
         # The chunk is this frame's action and the next ones, each within half a control interval of the drive's.
         for step in range(CHUNK):
@@ -103,8 +99,6 @@ def test_pairs_of_a_faultless_recording(tmp_path):
     for before, after in pairwise(samples):
         assert after.state.tolist() == before.chunk[0].tolist()
         assert after.chunk[0].tolist() == before.chunk[1].tolist()
-    assert (samples[-1].chunk == samples[-1].chunk[0]).all()
-    assert len({tuple(c) for c in samples[5].chunk.tolist()}) > CHUNK // 2  # a chunk changes over time
 
 
 @pytest.mark.parametrize(
@@ -137,42 +131,27 @@ def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
     assert recordings.summary()["driven_by_pct"].keys() == {"human", "nobody"}
 
 
-def test_an_unknown_outcome_is_counted(tmp_path):
-    recordings = load(edit(record(tmp_path), lambda c: c["metadata"].update(outcome=["hit"])).parent)
-    assert kinds(recordings) == {"unknown_outcome": 1} and recordings.episodes[0].outcome is None
-
-
 def test_summary_range_and_hashes(tmp_path):
     record(tmp_path)
     recordings = load(tmp_path)
     ends = recordings.action_range()
-    assert ends["throttle"][0] == pytest.approx(0.01, abs=0.004)
-    assert ends["throttle"][1] == pytest.approx(0.07, abs=0.004)
+    assert ends["throttle"] == pytest.approx((0.01, 0.07), abs=0.004)
     assert ends["steering"][1] == pytest.approx(0.6, abs=0.01)
     summary = recordings.summary()
     assert json.loads(json.dumps(summary)) == summary
     assert (summary["episodes"], summary["frames"], summary["samples"], summary["faults"]) == (1, 40, 40, [])
     hashes = recordings.hashes()
-    assert len(hashes) == 43
-    assert "episode_20260101_120000/frames/frame_000001.jpg" in hashes
-    assert hashes == load(tmp_path).hashes()
-
-
-def test_one_episode_folder_may_be_given_itself(tmp_path):
-    folder = record(tmp_path)
-    assert [s.chunk.tolist() for s in load(folder).samples] == [s.chunk.tolist() for s in load(tmp_path).samples]
-    assert load(folder).hashes() == load(tmp_path).hashes()
+    assert len(hashes) == 43 and "episode_20260101_120000/frames/frame_000001.jpg" in hashes
+    assert hashes == load(tmp_path / "episode_20260101_120000").hashes()
 
 
 def test_pictures(tmp_path):
     folder = record(tmp_path, frames=3)
     samples = load(tmp_path).samples
-    assert samples[0].frame_bgr().shape == (18, 32, 3)
     assert np.abs(samples[0].frame_bgr().astype(int) - FRAME).max() <= 3
     picture = folder / "frames/frame_000001.jpg"
     whole = picture.read_bytes()
-    damages = [whole[:-30], b"", b"\xff\xd8\xff\xd9", b"\xff\xd8" + bytes(300) + b"\xff\xd9"]
-    for damaged in (*damages, hostile.cut(whole), hostile.claims(whole, 16_000, 16_000)):
+    for damaged in (whole[:-30], b"", hostile.cut(whole), hostile.claims(whole, 16_000, 16_000)):
         picture.write_bytes(damaged)
         with pytest.raises(EpisodeError, match="frame_000001"):
             samples[0].frame_bgr()
@@ -209,10 +188,7 @@ def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, period)
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
-    found = kinds(recordings)
-    assert found["throttle_zero_period"] == 10
-    assert found["frame_without_measurement"] > 5
-    assert found["frame_without_state"] == 1
+    assert kinds(recordings) == {"throttle_zero_period": 10, "frame_without_measurement": 8, "frame_without_state": 1}
     assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
     before = [s for s in recordings.samples if s.time_s < 0.7]
     assert before[-1].is_pad.tolist() == [False] + [True] * (CHUNK - 1)  # the hole ends the chunks before it
@@ -227,23 +203,10 @@ def test_a_channel_that_is_flagged_is_missing(tmp_path):
             throttle = (None, None) if lost else (pulses.throttle_us, 1016)
             writer.control(t_s, 33 * i, pulses.steering_us, throttle[0], 21316, throttle[1], mode="human")
             writer.frame(t_s, FRAME)
-    for _ in range(2):
-        recordings = load(tmp_path)
-        assert kinds(recordings) == {"throttle_no_pulse": 10, "frame_without_measurement": 8, "frame_without_state": 1}
-        assert len(recordings.samples) == 31
-        assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
-        (flagged.folder / "episode_data.json").write_text("{}")  # the second turn reads the CSVs
-
-
-def test_null_is_no_pulse_with_and_without_a_flag(tmp_path):
-    lost = dict.fromkeys(("throttle_normalized", "throttle_raw_us", "throttle_period_us"))
-
-    def change(content):
-        for control, more in zip(content["control_samples"][20:], ({}, {"throttle_measured": False}), strict=False):
-            control.update(lost | more)
-
-    edit(record(tmp_path), change)
-    assert kinds(load(tmp_path))["throttle_no_pulse"] == 2
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"throttle_no_pulse": 10, "frame_without_measurement": 8, "frame_without_state": 1}
+    assert len(recordings.samples) == 31
+    assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
 
 
 def test_single_lost_readings_cost_no_frame(tmp_path):
@@ -297,70 +260,16 @@ def test_serial_burst_that_the_clock_cannot_place_is_dropped(tmp_path):
     }
 
 
-def test_real_recording(tmp_path):
-    sample_episode = real_episode()
-    copy = tmp_path / sample_episode.name
-    copy.mkdir()
-    shutil.copyfile(sample_episode / "episode_data.json", copy / "episode_data.json")
-    (copy / "frames").mkdir()
-    with pytest.raises(EpisodeError, match="frame_missing 176 times"):
-        load_recordings(tmp_path)
-    pictures = sorted((sample_episode / "frames").glob("*.jpg"))
-    for k in range(1, 177):  # each missing picture becomes a copy of the one that exists
-        shutil.copyfile(pictures[0], copy / f"frames/frame_{k:06d}.jpg")
-    recordings = load_recordings(tmp_path)
-    found = kinds(recordings)
-    assert found["throttle_zero_period"] == 138
-    assert found["serial_burst"] + found["serial_burst_dropped"] == 111
-    assert found["frame_without_measurement"] == 25  # the first 0.9 s: no throttle pulse yet
-    assert len(recordings.samples) == 150
-    assert recordings.action_range()["throttle"][1] == pytest.approx(0.0348)
-    assert recordings.samples[0].frame_bgr().shape == (480, 640, 3)
-
-
-@pytest.mark.parametrize(
-    ("text", "kind"), [(None, "absent"), ("", "empty"), ("{", "broken_json"), ("[]", "wrong_type")]
-)
-def test_without_json_the_csvs_serve(tmp_path, text, kind):
-    folder = record(tmp_path)
-    whole = load(tmp_path).samples
-    if text is None:
-        (folder / "episode_data.json").unlink()
-    else:
-        (folder / "episode_data.json").write_text(text)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {kind: 1}
-    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
-    assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in whole]
-
-
-@pytest.mark.parametrize("text", ["", '{"control_samples": {}, "frame_samples": 1}', "\udcff"])
-def test_without_json_and_csvs_the_folder_is_skipped(tmp_path, text):
+@pytest.mark.parametrize("text", ["", "{", '{"control_samples": {}, "frame_samples": 1}', "\udcff", "[" * 10_000_000])
+def test_a_folder_without_an_episodes_json_is_skipped(tmp_path, text):
     record(tmp_path, "episode_20260101_000000")
     folder = record(tmp_path, "episode_20260102_000000")
     (folder / "episode_data.json").write_bytes(text.encode(errors="surrogateescape"))
-    (folder / "control_data.csv").unlink()
-    (folder / "frame_data.csv").unlink()
     recordings = load(tmp_path)
     assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
-    assert kinds(recordings)["nothing_usable"] == 1
+    assert kinds(recordings) == {"unreadable": 1}
     shutil.rmtree(tmp_path / "episode_20260101_000000")
-    with pytest.raises(EpisodeError, match="no usable sample in 1 episode folder"):
-        load(tmp_path)
-
-
-def test_csv_faults(tmp_path):
-    folder = record(tmp_path)
-    (folder / "episode_data.json").unlink()
-    lines = (folder / "control_data.csv").read_text().splitlines()
-    lines[3] = "1,2"
-    lines[6] = lines[6].replace("1000.", "nan1000.")
-    lines[9] = "99," + "nan," + ",".join(lines[9].split(",")[2:])
-    (folder / "control_data.csv").write_text("\n".join(lines))
-    found = kinds(load(tmp_path))
-    assert found == {"absent": 1, "wrong_type": 2, "not_finite": 1}
-    (folder / "control_data.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(EpisodeError, match=r"wrong_header 1 times.*no column arduino_timestamp in its first line, 'a"):
+    with pytest.raises(EpisodeError, match=r"no usable sample in 1 folder.*unreadable"):
         load(tmp_path)
 
 
@@ -372,6 +281,8 @@ def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
         controls[26]["throttle_raw_us"] = None
         controls[29]["throttle_normalized"] = 7.0
         controls.append("control")
+        controls[5], controls[12] = controls[12], controls[5]
+        content["metadata"]["outcome"] = ["hit"]
         frames[10]["timestamp"] = math.nan
         frames[15]["image_path"] = 15
         frames[20]["frame_id"] = "x"
@@ -380,7 +291,8 @@ def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
 
     edit(record(tmp_path), change)
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6, "throttle_out_of_range": 1}
+    odd = {"unknown_outcome": 1, "unsorted_control_times": 2}
+    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6, "throttle_out_of_range": 1} | odd
     assert len(recordings.samples) == 36
     assert all(np.isfinite(s.chunk).all() and np.isfinite(s.state).all() for s in recordings.samples)
 
@@ -446,34 +358,30 @@ def test_actions_of_any_other_formula_are_refused(tmp_path, name, formula):
 
 
 def test_the_few_readings_of_one_channel_are_recomputed_where_the_other_channels_are(tmp_path):
-    """Seven readings, of many, showed no formula, and were taken as recorded beside a steering that was recomputed."""
+    """Too few readings to show a formula were taken as recorded beside a steering that was recomputed."""
     whole = [s.chunk.tolist() for s in load(record(tmp_path)).samples]
     folder = tmp_path / "episode_20260101_120000"
     edit(folder, rewritten({"steering": OLD["steering"]}, share=0.6))
-    edit(folder, rewritten({"throttle": (5, 80)}, share=0.05))
+    edit(folder, rewritten({"throttle": (5, 80)}, share=0.09))  # four, and the fourth is the first frame's
     recordings = load(tmp_path)
     assert np.abs(np.array([s.chunk.tolist() for s in recordings.samples]) - whole).max() <= 1e-3
     assert recordings.faults_by_kind().keys() == {"recomputed from the pulses"}
 
 
-def changed(table, name, change):
-    return lambda content: [row.update({name: change(row[name])}) for row in content[f"{table}_samples"]] and None
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (changed("control", "steering_raw_us", lambda us: us / 1000), "no_formula 1 times"),
-        (changed("frame", "timestamp", lambda s: s + 3600), "no_overlap 1 times"),
-        (None, "broken_jpeg 40 times"),
-    ],
-)
-def test_the_reason_why_nothing_is_usable_comes_first(tmp_path, change, says):
+@pytest.mark.parametrize("reason", ["no_formula 1 times", "no_overlap 1 times", "broken_jpeg 40 times"])
+def test_the_reason_why_nothing_is_usable_comes_first(tmp_path, reason):
     """What was recomputed, repaired or absent was counted and quoted as the reason; pulses in ms gave full left."""
-    folder = edit(record(tmp_path), change or rewritten(OLD))
-    for picture in [] if change else (folder / "frames").iterdir():
+
+    def change(content):
+        for row in content["control_samples"]:
+            row["steering_raw_us"] /= 1000 if reason.startswith("no_formula") else 1
+        for row in content["frame_samples"]:
+            row["timestamp"] += 3600 if reason.startswith("no_overlap") else 0
+
+    folder = edit(edit(record(tmp_path), rewritten(OLD)), change)
+    for picture in (folder / "frames").iterdir() if reason.startswith("broken") else []:
         picture.write_bytes(b"\x89PNG")
-    with pytest.raises(EpisodeError, match=rf"\({says}"):
+    with pytest.raises(EpisodeError, match=rf"\({reason}"):
         load(tmp_path)
 
 
@@ -494,20 +402,6 @@ def test_the_real_recordings_have_the_actions_of_their_pulses():
             assert np.abs(actions[:, None] - pulses).min(1).max() <= 1e-3
     assert recordings.action_range()["throttle"] == pytest.approx((0, 0.0812), abs=1e-3)
     assert sum(s.chunk[0, 1] > 0.1 for s in recordings.samples) == 0
-
-
-def test_unsorted_times(tmp_path):
-    folder = record(tmp_path)
-    whole = load(tmp_path).samples
-
-    def change(content):
-        for rows in (content["control_samples"], content["frame_samples"]):
-            rows[5], rows[12] = rows[12], rows[5]
-
-    edit(folder, change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"unsorted_control_times": 2, "unsorted_frame_times": 2}
-    assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in whole]
 
 
 @pytest.mark.parametrize("back_s", [0.2, 30])
@@ -599,16 +493,10 @@ def test_paths_that_leave_the_folder(tmp_path):
 @pytest.mark.parametrize("make", [lambda root: None, lambda root: root.write_text("x"), lambda root: root.mkdir()])
 def test_no_recordings_is_one_sentence(tmp_path, make):
     make(tmp_path / "episodes")
-    with pytest.raises(EpisodeError, match="episodes") as e:
-        load(tmp_path / "episodes")
-    assert "\n" not in str(e.value)
-
-
-def test_options_that_make_no_sense(tmp_path):
-    record(tmp_path)
-    for options in ({"chunk": 0}, {"sync_s": math.nan}):
-        with pytest.raises(EpisodeError, match="sync_s"):
-            load(tmp_path, **options)
+    for options in ({}, {"chunk": 0}, {"sync_s": math.nan}):
+        with pytest.raises(EpisodeError) as e:
+            load(tmp_path / "episodes", **options)
+        assert "\n" not in str(e.value)
 
 
 # ---- wild input ------------------------------------------------------------------------------------------
@@ -623,38 +511,7 @@ ODD = st.one_of(
     st.lists(st.integers(), max_size=2),
     st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
 )
-GOOD = {
-    "arduino_timestamp": st.integers(0, 3000),
-    "system_timestamp": st.floats(0, 3),
-    "steering_normalized": st.floats(-1, 1),
-    "throttle_normalized": st.floats(0, 1),
-    "steering_raw_us": st.sampled_from([0, 1000, 1456, 1900]),
-    "throttle_raw_us": st.sampled_from([0, 120, 136, 700]),
-    "steering_period_us": st.sampled_from([0, 21316, 42632]),
-    "throttle_period_us": st.sampled_from([0, 1012, 1016, 2032]),
-    "frame_id": st.integers(0, 60),
-    "timestamp": st.floats(0, 3),
-    "image_path": st.sampled_from(["frames/frame_000001.jpg", "frames/frame_000002.jpg"]),
-}
-
-
-def rows_of(fields):
-    good = st.fixed_dictionaries({f: GOOD[f] for f in fields})
-    mixed = st.fixed_dictionaries({f: st.one_of(GOOD[f], GOOD[f], GOOD[f], ODD) for f in fields})
-    return st.lists(st.one_of(good, good, mixed, ODD), max_size=30)
-
-
-WILD = st.one_of(
-    ODD,
-    st.fixed_dictionaries(
-        {
-            "action_label": st.one_of(st.just("x"), ODD),
-            "control_samples": st.one_of(rows_of(CONTROL_FIELDS), rows_of(CONTROL_FIELDS), ODD),
-            "frame_samples": st.one_of(rows_of(FRAME_FIELDS), rows_of(FRAME_FIELDS), ODD),
-        }
-    ),
-)
-QUICK = settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+FIELD = st.sampled_from([*CONTROL_FIELDS, *FRAME_FIELDS, ""])
 
 
 def check_sane(root):
@@ -664,32 +521,33 @@ def check_sane(root):
     except EpisodeError as e:
         assert "\n" not in str(e)
         return
-    assert recordings.samples
     json.dumps(recordings.summary(), allow_nan=False)
     for sample in recordings.samples:
-        assert np.isfinite(sample.chunk).all()
-        assert np.isfinite(sample.state).all()
-        assert math.isfinite(sample.time_s)
-        assert (np.abs(sample.chunk) <= 1).all()
-        assert (sample.chunk[:, 1] >= 0).all()
-        assert not sample.is_pad[0]
+        assert np.isfinite(sample.chunk).all() and np.isfinite(sample.state).all() and math.isfinite(sample.time_s)
+        assert (np.abs(sample.chunk) <= 1).all() and (sample.chunk[:, 1] >= 0).all() and not sample.is_pad[0]
         assert sample.frame_bgr().shape == (18, 32, 3)
 
 
 @pytest.fixture(scope="module")
 def wild_folder(tmp_path_factory):
-    folder = record(tmp_path_factory.mktemp("wild"), frames=2)
-    for name in ("control_data.csv", "frame_data.csv"):
-        (folder / name).unlink()
-    return folder
+    return record(tmp_path_factory.mktemp("wild"), frames=2)
 
 
 @pytest.mark.slow
-@QUICK
-@given(content=WILD)
-def test_wild_json(wild_folder, content):
-    (wild_folder / "episode_data.json").write_text(json.dumps(content))
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(changes=st.lists(st.tuples(st.sampled_from(["control", "frame"]), st.integers(0, 7), FIELD, ODD), max_size=12))
+def test_wild_json(wild_folder, changes):
+    whole = (wild_folder / "episode_data.json").read_bytes()
+
+    def change(content):
+        for table, number, field, value in changes:
+            rows = content[f"{table}_samples"]
+            row = rows[number % len(rows)]
+            rows[number % len(rows)] = row | {field: value} if field and isinstance(row, dict) else value
+
+    edit(wild_folder, change)
     check_sane(wild_folder.parent)
+    (wild_folder / "episode_data.json").write_bytes(whole)
 
 
 # ---- splitting and choosing ------------------------------------------------------------------------------
@@ -707,12 +565,10 @@ def test_split_by_whole_episodes(many):
     parts = split(many, 0.25, seed=0)
     assert {p: len(ids) for p, ids in parts.episodes.items()} == {"calibration": 12, "choosing": 2, "held_out": 2}
     assert parts.note is None
-    ids = [i for part in parts.episodes.values() for i in part]
-    assert sorted(ids) == [e.id for e in many.episodes]
+    assert sorted(i for part in parts.episodes.values() for i in part) == [e.id for e in many.episodes]
     for name, part in parts.episodes.items():
         assert {s.episode for s in getattr(parts, name)} == set(part)
-    total = len(parts.calibration) + len(parts.choosing) + len(parts.held_out)
-    assert total == len(many.samples)
+    assert len(parts.calibration) + len(parts.choosing) + len(parts.held_out) == len(many.samples)
     assert split(many, 0.25, seed=0).episodes == parts.episodes
     assert any(split(many, 0.25, seed=k).episodes != parts.episodes for k in range(1, 5))
 
@@ -723,35 +579,15 @@ def test_few_episodes_are_parted_along_time_with_a_gap(tmp_path):
     parts = split(load(tmp_path))
     assert "along time" in parts.note
     for k in range(2):
-        times = [
-            [s.time_s for s in part if s.episode.endswith(str(k))]
-            for part in (parts.calibration, parts.choosing, parts.held_out)
-        ]
+        every = (parts.calibration, parts.choosing, parts.held_out)
+        times = [[s.time_s for s in part if s.episode.endswith(str(k))] for part in every]
         assert all(times)
         for before, after in pairwise(times):
             # A chunk's last action is (CHUNK - 1) frames after its frame, so no action is shared.
             assert min(after) - max(before) > (CHUNK - 0.5) / 30
     assert len(parts.calibration) > len(parts.choosing) + len(parts.held_out)
-
-
-def test_too_short_to_split(tmp_path):
-    record(tmp_path, frames=2 * CHUNK)
     with pytest.raises(EpisodeError, match="too short to be parted"):
-        split(load(tmp_path))
-
-
-def test_a_split_share_that_makes_no_sense(many):
-    with pytest.raises(EpisodeError, match="held_out_share"):
-        split(many, math.nan)
-
-
-@given(share=st.floats(0.01, 0.99), seed=st.integers(0, 10**6))
-@settings(deadline=None, suppress_health_check=list(HealthCheck))
-def test_split_never_shares_an_episode(many, share, seed):
-    parts = split(many, share, seed)
-    ids = [i for part in parts.episodes.values() for i in part]
-    assert len(ids) == len(set(ids)) == 16
-    assert all(parts.episodes.values())
+        split(load(record(tmp_path / "short", frames=2 * CHUNK)))
 
 
 def test_calibration_covers_the_recorded_actions(many):

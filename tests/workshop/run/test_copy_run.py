@@ -1,36 +1,22 @@
 """A run is opened as a copy: what is executed again there leaves the run as it was."""
 
-import json
-
 import pytest
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run.copy_run import copy_run
 
 
-@pytest.fixture
-def run_dir(tmp_path):
-    folder = tmp_path / "runs" / "demo"
-    (folder / "figures").mkdir(parents=True)
-    cell = f'run_dir = "{folder}"\nepisodes = "{folder}/episodes"'  # as earlier versions wrote it
-    (folder / "01_load.ipynb").write_text(json.dumps({"cells": [{"source": cell}]}))
-    for name in ("best_model.pth", "policy_static.pt", "benchmark-pi.json"):
-        (folder / name).write_text("whole")
-    return folder
-
-
-def test_a_copy_works_in_its_own_folder_and_reads_the_same_recordings(run_dir):
-    copy = copy_run("demo", "try1", run_dir.parent)
-    cell = json.loads((copy / "01_load.ipynb").read_text())["cells"][0]["source"]
-    assert cell.splitlines() == ['run_dir = "."', f'episodes = "{run_dir}/episodes"']
-    assert {p.name for p in copy.iterdir()} == {"01_load.ipynb", "policy_static.pt", "figures", "benchmark-pi.json"}
+def test_a_copy_has_what_the_run_made_and_leaves_the_run_alone(tmp_path):
+    made = ("01_load.ipynb", "policy_static.pt", "benchmark-pi.json", "figures/01_faults.png")
+    for name in (*made, "best_model.pth"):
+        (tmp_path / "demo" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "demo" / name).write_text("whole")
+    copy = copy_run("demo", "try1", tmp_path)
+    assert {str(p.relative_to(copy)) for p in copy.rglob("*.*")} == set(made)
     (copy / "policy_static.pt").write_text("turned")
-    assert copy_run("demo", "try1", run_dir.parent) == copy  # opened again, not made anew
-    assert [(f / "policy_static.pt").read_text() for f in (copy, run_dir)] == ["turned", "whole"]
-
-
-@pytest.mark.parametrize(("name", "copy"), [("dmo", ""), ("demo", "demo"), ("demo", "taken")])
-def test_what_cannot_be_copied_is_refused(run_dir, name, copy):
-    (run_dir.parent / "taken").mkdir()
-    with pytest.raises(RoverError):
-        copy_run(name, copy, run_dir.parent)
+    assert copy_run("demo", "try1", tmp_path) == copy  # opened again, not made anew
+    assert [(f / "policy_static.pt").read_text() for f in (copy, tmp_path / "demo")] == ["turned", "whole"]
+    (tmp_path / "taken").mkdir()
+    for name, other in (("dmo", ""), ("demo", "demo"), ("demo", "taken")):
+        with pytest.raises(RoverError):
+            copy_run(name, other, tmp_path)

@@ -29,8 +29,8 @@ def test_the_recipe_is_what_params_yml_says():
     p = params()
     recipe = Recipe.of(p)
     assert (recipe.samples, recipe.seed) == (p["calibration"]["samples"], p["calibration"]["seed"])
-    assert (recipe.scheme.kind, recipe.scheme.smooth) == (p["quantization"]["scheme"], p["quantization"]["smooth"])
-    assert recipe.scheme.percentile == p["quantization"]["percentile"] and recipe.scheme.mode == "static"
+    scheme = asdict(recipe.scheme) | {"scheme": recipe.scheme.kind}
+    assert all(scheme[key] == p["quantization"][key] for key in ("scheme", "smooth", "percentile"))
     assert recipe.parity == Parity(p["parity"]["fp32"], p["parity"]["int8_errors"], p["parity"]["vectors"])
     assert Recipe.of(p, samples=7).samples == 7 and recipe.observers == tuple(p["quantization"]["observers"])
     schemes = pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed", float_blocks=("head",)))

@@ -63,19 +63,17 @@ def test_a_policy_of_older_actions_is_converted_once(tiny, old_recordings):
     assert np.array([0, 0]) * state.scale + state.shift == pytest.approx([(6.83 - 7) / 2.42, 11.81 / 70])
 
 
-def test_a_policy_of_todays_actions_stays_as_it_is(tiny, old_recordings, tmp_path):
-    today = speaks(tiny, neutral=0.05, gain=1e-3)
-    assert in_todays_units(today, old_recordings, old_recordings.samples) is today
-    never = load_recordings(record_drives(tmp_path / "today"))
-    assert in_todays_units(today, never, never.samples) is today
-
-
-def test_a_policy_of_older_actions_on_newer_recordings(tiny, tmp_path):
-    """It went on as it was, as nothing in the recordings says that there ever was another formula."""
-    older = speaks(tiny, neutral=0.2, gain=1e-3)
-    newer = load_recordings(record_drives(tmp_path))
+def test_policies_of_todays_and_of_older_actions_on_newer_recordings(tiny, old_recordings, tmp_path):
+    """Nothing in newer recordings says that there ever was another formula."""
+    today, older = speaks(tiny, neutral=0.05, gain=1e-3), speaks(tiny, neutral=0.2, gain=1e-3)
+    newer = load_recordings(record_drives(tmp_path / "today"))
+    doubtful = speaks(tiny, neutral=0.15, gain=1e-3)  # converted, it would be nearer by a quarter only
+    for policy, recordings in ((today, old_recordings), (doubtful, old_recordings), (today, newer)):
+        assert in_todays_units(policy, recordings, recordings.samples) is policy
     assert "converted" in in_todays_units(older, newer, newer.samples).report["normalisation"]["units"]
-    another = replace(newer, episodes=tuple(_of_another_car(e) for e in newer.episodes))
+    crawler = read_car("lab/cars/crawler.yml")
+    of_it = [replace(e, samples=tuple(replace(s, car=crawler) for s in e.samples)) for e in newer.episodes]
+    another = replace(newer, episodes=tuple(of_it))
     assert in_todays_units(older, another, another.samples) is older
 
 
@@ -90,8 +88,3 @@ def test_what_notebook_01_found_is_not_planned_again(tiny, old_recordings, tmp_p
             first.setattr(units, "_error", lambda *given: pytest.fail("it was planned again"))
             again = session.open_run(tmp_path / "run").checkpoint
         assert (again.config, again.report) == (opened.checkpoint.config, opened.checkpoint.report)
-
-
-def _of_another_car(episode):
-    car = read_car("lab/cars/crawler.yml")
-    return replace(episode, samples=tuple(replace(s, car=car) for s in episode.samples))

@@ -2,8 +2,7 @@
 
     make_executorch.py CHECKPOINT CALIBRATION ARTIFACT
 
-Arguments and the printed JSON line are those of make_onnxruntime.py, but ARTIFACT is a .pte. The same parts are INT8
-or float as there.
+Arguments and the printed line are those of make_onnxruntime.py, but ARTIFACT is a .pte. The same parts are INT8.
 
 The recipe is the quantizer's own: symmetric INT8 weights per channel, INT8 activations, ranges by histogram. It is set
 for the whole graph, with a filter: if it is set by module type or name, the quantizer silently skips convolutions.
@@ -30,8 +29,12 @@ from rover_lib.workshop.act import Residual
 
 INT8 = tuple(f"{c.__module__}.{c.__qualname__}" for c in (nn.Conv2d, nn.Linear, nn.ReLU, nn.MaxPool2d, Residual))
 STAYS_FLOAT = ("head", "state_project")
-LAYERS = ("aten.conv2d", "aten.linear")
-PRODUCTS = ("aten.convolution", "aten.linear", "aten.addmm", "aten.mm")  # what LAYERS become after export
+PRODUCTS = (
+    "aten.convolution",
+    "aten.linear",
+    "aten.addmm",
+    "aten.mm",
+)  # after export
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
@@ -49,12 +52,6 @@ def is_int8(node: torch.fx.Node) -> bool:
     return kind in INT8 and not str(name).endswith(STAYS_FLOAT)
 
 
-def int8_layers(graph: torch.fx.Graph) -> int:
-    """Count the convolutions and linear layers whose input and weight both come from INT8."""
-    layers = [n for n in graph.nodes if n.op == "call_function" and str(n.target).startswith(LAYERS)]
-    return sum(all("dequantize" in str(source.target) for source in node.args[:2]) for node in layers)
-
-
 def main(checkpoint: str, calibration: str, artifact: str) -> None:
     warnings.simplefilter("ignore")
     logging.disable(logging.WARNING)
@@ -68,7 +65,6 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
         for observation in observations(calibration):
             graph(*map(torch.from_numpy, observation))
         graph = convert_pt2e(graph)
-        int8 = int8_layers(graph.graph)
         edge = to_edge_transform_and_lower(
             torch.export.export(graph, example),
             partitioner=[XnnpackPartitioner()],
@@ -79,7 +75,7 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
         sys.exit(f"error: XNNPACK did not take {len(left)} convolutions and linears: {left[:3]}")
     Path(artifact).write_bytes(edge.to_executorch().buffer)
     versions = {"executorch": version("executorch"), "torchao": version("torchao"), "torch": torch.__version__}
-    print(json.dumps({"int8_layers": int8, "versions": versions}))
+    print(json.dumps(versions))
 
 
 if __name__ == "__main__":

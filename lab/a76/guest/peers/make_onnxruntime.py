@@ -2,14 +2,12 @@
 
     make_onnxruntime.py CHECKPOINT CALIBRATION ARTIFACT
 
-It runs on the workstation with ONNX Runtime's packages before ours (see lab/a76/peers.py). CALIBRATION: see
-float_policy.observations. Writes ARTIFACT, an .onnx with the inputs `state` and `frame`, and prints one JSON line:
-{"int8_layers": how many convolutions and linear layers became INT8, "versions"}.
+CALIBRATION: see float_policy.observations. Writes ARTIFACT, an .onnx with the inputs `state` and `frame`, and prints
+the versions of the tools as a line of JSON.
 
 The recipe is what ONNX Runtime's documentation advises for ARM: QDQ, symmetric INT8 weights per channel, signed
-activations, ranges by minimum and maximum. The backbone's additions are INT8 too. Attention's products and the
-transformer's residual stream stay float; so do the head and the state's projection: with these two in INT8, the demo
-policy's throttle was four times as far off.
+activations, ranges by minimum and maximum. Attention's products and the transformer's residual stream stay float; so do
+the head and the state's projection: with these two in INT8, the demo policy's throttle was four times as far off.
 """
 
 import json
@@ -33,8 +31,6 @@ OPSET = 17
 
 
 class Recorded(CalibrationDataReader):
-    """A reader that gives the calibration frames one by one."""
-
     def __init__(self, calibration: str):
         self.rest = observations(calibration)
 
@@ -58,14 +54,6 @@ def stays_float(graph: onnx.GraphProto) -> list[str]:
     return found
 
 
-def int8_layers(graph: onnx.GraphProto) -> int:
-    """Count the convolutions and linear layers whose input and weight both come out of INT8."""
-    constants = {i.name for i in graph.initializer}
-    from_int8 = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "DequantizeLinear"}
-    layers = (n for n in graph.node if n.op_type in LAYERS and from_int8.get(n.input[1], n.input[1]) in constants)
-    return sum(n.input[0] in from_int8 and n.input[1] in from_int8 for n in layers)
-
-
 def main(checkpoint: str, calibration: str, artifact: str) -> None:
     warnings.simplefilter("ignore")  # the trace warns that shapes become constants, which is intended
     model, example = float_policy(checkpoint)
@@ -74,19 +62,11 @@ def main(checkpoint: str, calibration: str, artifact: str) -> None:
         names = {"input_names": ["state", "frame"], "output_names": ["chunk"]}
         torch.onnx.export(model, example, str(exported), opset_version=OPSET, dynamo=False, **names)
         quant_pre_process(exported, prepared, skip_symbolic_shape=True)
-        quantize_static(
-            prepared,
-            artifact,
-            Recorded(calibration),
-            quant_format=QuantFormat.QDQ,
-            op_types_to_quantize=list(INT8),
-            nodes_to_exclude=stays_float(onnx.load(prepared).graph),
-            per_channel=True,
-            activation_type=QuantType.QInt8,
-            weight_type=QuantType.QInt8,
-        )
+        types = {"quant_format": QuantFormat.QDQ, "activation_type": QuantType.QInt8, "weight_type": QuantType.QInt8}
+        layers = {"op_types_to_quantize": list(INT8), "nodes_to_exclude": stays_float(onnx.load(prepared).graph)}
+        quantize_static(prepared, artifact, Recorded(calibration), per_channel=True, **types, **layers)
     versions = {"onnxruntime": onnxruntime.__version__, "onnx": onnx.__version__, "torch": torch.__version__}
-    print(json.dumps({"int8_layers": int8_layers(onnx.load(artifact).graph), "versions": versions}))
+    print(json.dumps(versions))
 
 
 if __name__ == "__main__":
