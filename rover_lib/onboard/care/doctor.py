@@ -327,8 +327,7 @@ def power(host: Host) -> Iterator[Check]:
     if means is None:
         trouble = shutil.which(host.vcgencmd)
         found = "cannot be read, so low voltage would not be seen" if trouble else "no vcgencmd here"
-        remedy = "sudo usermod -aG video $USER, log in again; `vcgencmd get_throttled` shows the rest"
-        yield warn_unless(not trouble, "power", found, remedy)
+        yield warn_unless(not trouble, "power", found, "sudo usermod -aG video $USER, log in again")
         return
     supply = any("voltage" in m for m in means)
     remedy = "a supply of 5 V and 5 A with a short thick cable; a charged battery" if supply else "a fan, or air"
