@@ -38,7 +38,6 @@ NEEDS = {  # commands and files, each with the Debian package that it comes from
 }
 CC = ("gcc", "-O2", "-g", "-Wall", "-Wextra", "-Werror")
 WITH_SIMAVR = ("-I/usr/include/simavr", str(EMULATOR), "-lsimavr", "-lelf", "-lutil", "-lm")
-OUR_SOURCE = "is this the repository's own source?"
 LOG_BYTES = 1 << 20  # how much of the pins' events may wait to be read: 20 s of every pulse
 START_S = 10.0
 NICE = -10  # a real Arduino has a processor of its own
@@ -60,14 +59,11 @@ def missing_packages() -> list[str]:
 def build(human: str = "receiver") -> Built:
     """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
 
-    human: as in `make -C firmware HUMAN=gamepad`. Raises RoverError if Debian packages or the repository's sources are
-    missing, or if the compiler fails.
+    human: as in `make -C firmware HUMAN=gamepad`. Raises RoverError if Debian packages or sources are missing.
     """
     if missing := " ".join(missing_packages()):
-        raise RoverError(
-            f"the emulated Arduino needs the Debian packages {missing}, which are not here",
-            remedy=f"sudo apt-get install --no-install-recommends {missing}",
-        )
+        remedy = f"sudo apt-get install --no-install-recommends {missing}"
+        raise RoverError("the emulated Arduino needs Debian packages that are not here", remedy=remedy)
     sources = [EMULATOR, FIRMWARE / "Makefile", *sorted(p for p in (FIRMWARE / "rover").glob("*") if p.is_file())]
     if not all(source.is_file() for source in sources):
         raise RoverError(f"no firmware in {FIRMWARE}", remedy="the emulated Arduino needs a checkout of the repository")
@@ -83,7 +79,7 @@ def build(human: str = "receiver") -> Built:
 
 def compile_c(*command: object) -> None:
     """Run a compiler, or make. Raises RoverError with the last lines that it printed."""
-    run(*command, error=RoverError, remedy=OUR_SOURCE)
+    run(*command, error=RoverError, remedy="is this the repository's own source?")
 
 
 @functools.cache
@@ -91,8 +87,7 @@ def symbol(name: str) -> int:
     """Return the address of one of the firmware's functions in flash memory."""
     firmware = build().firmware
     line = re.search(rf"^([0-9a-f]+) \w {name}$", run("avr-nm", firmware, error=RoverError), re.M)
-    if not line:
-        raise RoverError(f"{firmware}: the firmware has no function {name}")
+    assert line, f"{firmware}: no function {name}"
     return int(line[1], 16)
 
 
@@ -124,12 +119,10 @@ class EmulatedArduino:
         ready: bool = False,
         nice: int = 0,
     ):
-        """Start the process.
+        """every_pulse: whether pulses() returns each pulse, or only those that differ from the one before.
 
-        every_pulse: whether pulses() returns each pulse, about a thousand a second, or only those that differ from the
-        one before. transmitter: its pulses from the start on; their periods are this_car()'s. ready: see ready(). nice:
-        scheduling priority; NICE comes close to a processor of its own, and is left out for others than root.
-        Raises RoverError as build() does, and if the program does not start.
+        transmitter: its pulses from the start on, with this_car()'s periods. ready: see ready(). nice: scheduling
+        priority, for root. Raises RoverError as build() does, and if the program does not start.
         """
         built = build()
         # The program makes this link, and removes it even if the present process was killed.
@@ -140,9 +133,8 @@ class EmulatedArduino:
         car = this_car()
         options += ["--boot-ms", f"{BOOT_S * 1000:.0f}", "--periods", str(car.numbers[0]), str(car.numbers[4])]
         options += ["--eeprom", eeprom_of(car).hex()]
-        self._process = Child(
-            "the emulated Arduino", built.program, built.firmware, *options, error=RoverError, talks=True
-        )
+        command = built.program, built.firmware, *options
+        self._process = Child("the emulated Arduino", *command, error=RoverError, talks=True)
         self.pid = self._process.pid
         self._process.keep_unread(LOG_BYTES)
         try:
@@ -152,9 +144,7 @@ class EmulatedArduino:
                 if not self._process.running:
                     raise self._process.ended()
                 if time.monotonic() > deadline:
-                    raise RoverError(
-                        f"the emulated Arduino did not start within {START_S:g} s", remedy="is this machine busy?"
-                    )
+                    raise RoverError("the emulated Arduino did not start in time", remedy="is this machine busy?")
                 time.sleep(0.005)
             self.transmitter(*transmitter)
             self.ready(ready)
@@ -177,10 +167,7 @@ class EmulatedArduino:
         self._process.send_line("wiggle")
 
     def ready(self, ready: bool) -> None:
-        """Set whether the human wiggles the stick unasked whenever arming lacks only that.
-
-        They leave a stopped car alone until somebody opens its port again.
-        """
+        """Set whether the human wiggles the stick unasked whenever a car that was not stopped lacks only that."""
         self._process.send_line(f"ready {ready:d}")
 
     def reset(self) -> None:
@@ -196,10 +183,9 @@ class EmulatedArduino:
         self._process.send_line(f"hang {symbol('loop'):x}")
 
     def pulses(self) -> list[PinEvent]:
-        """Return what happened since the last call, ordered by when it ended.
+        """Return what happened since the last call, ordered by when it ended. RoverError if the process has ended.
 
-        With every_pulse, call it at least every 10 s: what does not fit into the pipe is lost, and a 'lost' event says
-        how much. Raises RoverError if the process has ended.
+        With every_pulse, call it at least every 10 s: what does not fit into the pipe is lost, as a 'lost' event says.
         """
         with self._reading:
             try:

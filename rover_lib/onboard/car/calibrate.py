@@ -3,8 +3,8 @@
     with ServoLink(port) as link:
         car = measure(link, ask=input)
 
-The car is not armed, but the human's pulses go through to the servo and the speed controller, and while several kinds
-of car are tried, these two get the neutral of each. So the wheels must be off the ground and the motor unplugged.
+The human's pulses go through to the servo and the speed controller, and while several kinds of car are tried, these get
+the neutral of each. So the wheels must be off the ground and the motor unplugged.
 """
 
 import statistics
@@ -18,7 +18,7 @@ from rover_lib.onboard.car.protocol import Telemetry
 from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.stage import atomic_path
 
-if TYPE_CHECKING:  # what asks may also be a stand-in with tell() and latest()
+if TYPE_CHECKING:
     from rover_lib.onboard.car.servo_link import ServoLink
 
 LOOK_S = 0.5  # time for both signals to appear with one kind of car; two or even eight pulses of 25 ms take less
@@ -53,9 +53,8 @@ def measure(
     """Lead a human through the ends and centres of both sticks; return the measured car.
 
     ask: tells the human what to do, and returns when it is done. notify: is told what was measured. positive: the side
-    that positive steering turns to; None: that of the longer pulse, as on the recorded car. more: entries of car.yml
-    that cannot be measured, `name`, `camera` and `wheelbase_m`.
-    Raises CarError, with what was measured and what to do, if the values do not make a car; LinkError like the link.
+    that positive steering turns to; None: that of the longer pulse. more: `name`, `camera` and `wheelbase_m` of
+    car.yml. Raises CarError if the values do not make a car; LinkError like the link.
     """
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
@@ -74,9 +73,8 @@ def measure(
         notify(f"{where}: {ends[where]} us")
     ask("Let go of both sticks.")
     fast = periods_us[1] < PERIOD_MIN_US
-    if fast and ends["forward"] > FAST_PULSE_MAX_US:
-        notify(f"full throttle is {ends['forward']} us; the firmware takes {FAST_PULSE_MAX_US} for it on such a car")
-        ends["forward"] = FAST_PULSE_MAX_US
+    if fast:
+        ends["forward"] = min(ends["forward"], FAST_PULSE_MAX_US)  # which the firmware takes for full throttle
     steering = {
         "period_us": periods_us[0],
         "left_us": ends["left"],

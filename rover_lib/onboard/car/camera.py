@@ -41,9 +41,7 @@ PICTURES = (".jpg", ".jpeg")
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 MONOTONIC, NO_CLOCK = "monotonic", "no"  # the clock that time stamps come from
 REFUSED_MOST = 4  # bad pictures in a row mean that the camera has failed; 0.13 s at 30 Hz
-# A picture repeats another if this share of its blocks is equal. Six real recordings leave 0.02 at most and a sensor's
-# noise alone 0.37; a strip of 5 % of a picture, which still changes, touches 2 of 9 rows and leaves 0.78.
-SAME = 0.6
+SAME = 0.6  # share of equal blocks of a repeated picture; real recordings have 0.02, a still scene's noise 0.37
 REMEMBERED = 32  # pictures; a driver has at most this many buffers that it could repeat (VIDEO_MAX_FRAME)
 OLD_S = 0.5  # a frame this old is of no use: a plan's throttle begins to fade at this age
 AHEAD_S = 0.01  # a time stamp may lie this far in the future, because it may be rounded
@@ -92,9 +90,9 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO with one
-    JPEG after another. size: (width, height) to request from a camera. rate_hz: frames per second to request, and the
-    rate at which a folder is shown. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO of JPEGs.
+    size: (width, height) to request from a camera. rate_hz: to request, or at which a folder is shown. held: a folder
+    is repeated until begin() is called, and from then on shown once. Any thread may call any method.
     """
 
     def __init__(
@@ -106,7 +104,6 @@ class Camera:
         clock: Callable[[], float] = time.monotonic,
         held: bool = False,
     ):
-        """held: a folder is repeated until begin() is called, and from then on shown once."""
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
         self._clock = clock
@@ -151,7 +148,7 @@ class Camera:
         return CameraError(f"{self.source}: {what}: {why.what}", found=why.found, remedy=why.remedy)
 
     def begin(self) -> None:
-        """Start held pictures from the first one, see __init__. Has no effect on a camera."""
+        """Start held pictures from the first one. Has no effect on a camera."""
         self._begun.set()
 
     def close(self) -> None:

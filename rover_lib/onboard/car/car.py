@@ -47,9 +47,8 @@ WIDTH_PX = 640  # of the pictures that the balloon world draws
 class Car:
     """One car. Only a car that the Arduino accepts can be made: otherwise CarError says what is wrong.
 
-    pwm: its two channels. cap_us: the farthest that a host may move the throttle's pulse from neutral, either way.
-    field_of_view_deg: of the camera, from the left edge to the right one. wheelbase_m: from axle to axle. positive: the
-    side that positive steering turns to, "left" or "right". human: where the human's pulses come from, one of HUMANS.
+    cap_us: the farthest that a host may move the throttle's pulse from neutral, either way. field_of_view_deg: of the
+    camera, horizontally. positive: the side that positive steering turns to, "left" or "right". human: one of HUMANS.
     """
 
     name: str = "the recordings' car"

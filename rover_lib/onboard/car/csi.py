@@ -1,8 +1,7 @@
 """Read a Raspberry Pi camera (CSI) through rpicam-vid of Raspberry Pi OS, which sets exposure and colours by libcamera.
 
 rpicam-vid writes JPEGs to its standard output and, after each, what libcamera knows of it to a pipe: lines NAME=VALUE,
-then an empty one. (rpicam-apps: output/output.cpp, and encoder/mjpeg_encoder.cpp, which keeps the order.) So the nth
-picture has the nth time stamp. SensorTimestamp is in nanoseconds since boot, of the first row's exposure.
+then an empty one (rpicam-apps: output/output.cpp). So the nth picture has the nth time stamp, nanoseconds since boot.
 """
 
 import contextlib
@@ -13,7 +12,6 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Generator
-from typing import Any
 
 from rover_lib.onboard.car.picture import MOST_BYTES
 from rover_lib.onboard.errors import CameraError
@@ -21,8 +19,7 @@ from rover_lib.onboard.errors import CameraError
 PROGRAM = "rpicam-vid"
 SOURCE = re.compile(r"csi(?::(\d))?((?:,[a-z]+=[\w.-]+)*)", re.ASCII)  # csi, csi:1, csi,shutter=8000,gain=4
 SETTINGS = ("shutter", "gain", "ev", "exposure", "awb", "rotation")  # options of rpicam-vid; shutter in microseconds
-# A short exposure first: a car that moves blurs a long one.
-DEFAULTS = {"exposure": "sport"}
+DEFAULTS = {"exposure": "sport"}  # a short one: a car that moves blurs a long one
 QUALITY = 90  # of the JPEGs, in percent; rpicam-vid's own default is 50
 START, END = b"\xff\xd8\xff", b"\xff\xd9"  # of a JPEG; its data contains neither: there 00 follows each FF
 STAMP = re.compile(rb"^SensorTimestamp=(\d+)$", re.M)
@@ -56,12 +53,13 @@ def read_csi(
         leaving.callback(os.close, reading)
         leaving.callback(os.close, writing)
         line = command(source, size, rate_hz, f"/proc/self/fd/{writing}")
-        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": errors}
+        none, pipe = subprocess.DEVNULL, subprocess.PIPE
         try:
-            process = leaving.enter_context(subprocess.Popen(line, pass_fds=[writing], **pipes))
+            process = subprocess.Popen(line, stdin=none, stdout=pipe, stderr=errors, pass_fds=[writing])
         except OSError as error:
             remedy = "sudo apt-get install rpicam-apps-lite, on Raspberry Pi OS; is the cable in?"
             raise CameraError(f"{source}: {PROGRAM} cannot be started ({error.strerror})", remedy=remedy) from None
+        leaving.enter_context(process)
         leaving.callback(process.kill)
         assert process.stdout
         yield from _pairs(process.stdout.fileno(), reading, closing)

@@ -1,12 +1,9 @@
 """A gamepad on this machine as the human's transmitter, for an Arduino without a receiver (car.yml: `human: gamepad`).
 
-The sticks are read by a ServoLink, which sends them to the Arduino in answer to each of its statuses. All that decides
-is there: gesture, takeover, loss, cap. Here are three rules. The human counts only while L1 is held, from a press that
-was seen; only while the gamepad sends something all the time, as the motion sensors of a DualShock, DualSense or Switch
-Pro Controller do; and only once the kernel has told where both sticks are. The kernel reports no value that stays the
-same, so a gamepad without sensors is as silent in a still hand as one whose battery is empty, and is refused.
-
-The kernel's devices are read directly: PyPI's evdev is compiled where it is installed, and a rover has no compiler.
+The sticks are read by a ServoLink, which sends them to the Arduino in answer to each of its statuses; the Arduino
+decides. The human counts only while L1 is held, from a press that was seen; only while the gamepad sends something all
+the time, as motion sensors do (without them a still hand is as silent as an empty battery); and only once the kernel
+has told where both sticks are. PyPI's evdev is compiled where it is installed, and a rover has no compiler.
 """
 
 import contextlib
@@ -138,10 +135,9 @@ class Gamepad:
 
 @dataclass(frozen=True)
 class Found:
-    """A gamepad that the kernel knows.
+    """A gamepad that the kernel knows: the devices of its sticks and of its motion sensors, if it has any.
 
-    pad, motion: the devices of its sticks, and of its motion sensors (None: it has none). identity: its own address, or
-    where it is plugged in.
+    identity: its own address, or where it is plugged in.
     """
 
     name: str
@@ -196,8 +192,7 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
 def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: Gamepad | None = None) -> Gamepad:
     """Open the only gamepad that can be used, and wait up to OPEN_S for its first event.
 
-    again: one that is gone; only the same one is opened, and nothing is waited for. CarError says why there is
-    none, or why it cannot be read.
+    again: one that is gone; only the same one is opened, and nothing is waited for. Raises CarError.
     """
     found = (list_them or list_gamepads)()
     usable = [pad for pad in found if pad.motion and (not again or pad.identity == again.identity)]

@@ -9,7 +9,6 @@ import re
 import resource
 import socket
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,9 +48,7 @@ class Host:
         return min((khz / 1000 for f in files if (khz := _number_in(f)) is not None), default=None)
 
     def throttled(self) -> str | None:
-        """Return what `vcgencmd get_throttled` reports, such as "0x0"; None elsewhere than on a Raspberry Pi, or if it
-        fails.
-        """
+        """Return what `vcgencmd get_throttled` reports, such as "0x0"; None if it fails, or is not there."""
         try:
             found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
         except (OSError, subprocess.SubprocessError):
@@ -64,9 +61,8 @@ class Host:
         for line in (_text_in(self.proc_root / "self/status") or "").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
-        # ru_maxrss comes second: a child inherits its parent's, while VmHWM starts anew
-        kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return kib * (1 if sys.platform == "darwin" else 1024) / 1e6 or None
+        # second, because a child inherits its parent's, while VmHWM starts anew
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6 or None
 
     def core_ticks(self) -> list[tuple[int, int]] | None:
         """Return (busy, total) ticks since the machine started for each core; None if they are not reported."""
@@ -85,10 +81,7 @@ def usable_cores() -> int:
 
 
 def throttled_means(value: str | None) -> list[str] | None:
-    """Return the meaning of each bit set in get_throttled's value, as text; None if there was no reading.
-
-    value: as Host.throttled returns it.
-    """
+    """Return the meaning of each bit that is set in Host.throttled()'s value; None if there was no reading."""
     if value is None:
         return None
     bits = int(value, 16)

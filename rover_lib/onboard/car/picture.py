@@ -34,10 +34,7 @@ SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead 
 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
-    """Decode to (h, w, 3) uint8 BGR. Raises CameraError if it is not a complete JPEG, or larger than any camera's.
-
-    The size is checked before anything is decoded. The orientation that the JPEG may contain is ignored.
-    """
+    """Decode to (h, w, 3) uint8 BGR. Raises CameraError if it is not complete, or larger than any camera's."""
     if len(data) > MOST_BYTES:
         raise CameraError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
     try:
@@ -76,9 +73,8 @@ def _check_only_filler(data: bytes, warning: ValueError) -> None:
     pieces = RESTART.split(scan)
     in_turn = all(marker[1] & 7 == i % 8 for i, marker in enumerate(RESTART.findall(scan)))
     tables = b"".join(segment for segment in segments if segment[1] in TABLES)
-    if not (end and in_turn and interval > 0 and (len(pieces) - 1) * interval < blocks <= len(pieces) * interval):
-        raise warning
-    if len(pieces) > MOST_PIECES or len(tables) > MOST_TABLES:
+    whole = interval > 0 and (len(pieces) - 1) * interval < blocks <= len(pieces) * interval
+    if not (end and in_turn and whole) or len(pieces) > MOST_PIECES or len(tables) > MOST_TABLES:
         raise warning
     for i, piece in enumerate(pieces):
         row = [v.to_bytes(2, "big") for v in (block[1], block[0] * min(interval, blocks - i * interval))]
@@ -119,7 +115,6 @@ def brightness(image: np.ndarray) -> tuple[float, float]:
     """Return the mean of a picture's pixels, and its contrast, both in grey levels from 0 to 255.
 
     The contrast is the standard deviation of the means of a 16x9 grid of blocks, for the colour where it is largest.
-    The sensor's noise averages out within a block.
     """
     small = cv2.resize(image, (160, 90), interpolation=cv2.INTER_NEAREST)
     cells = cv2.resize(small, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
@@ -129,7 +124,7 @@ def brightness(image: np.ndarray) -> tuple[float, float]:
 def block_sums(image: np.ndarray) -> np.ndarray:
     """Return (144,) uint64, one sum per block of a 16x9 grid. Equal sums mean that the blocks are equal, byte for byte.
 
-    image: contiguous, and at least LEAST in size. Pixels left over at the right and lower edge belong to no block.
+    image: contiguous, and at least LEAST in size.
     """
     height, width = image.shape[:2]
     rows, words = height // ROWS, width * 3 // 8 // COLUMNS

@@ -1,8 +1,7 @@
 """Convert actions to servo pulses and back. The constants were checked on the recordings, to 5e-5.
 
 A channel's pulse is a share ("duty") of its period: action = (duty% - neutral) / span, clipped to the channel's range.
-Throttle 0 means *stopped*, 120 us; it is not the middle of the throttle's range. Another car's channels come from its
-car.yml (see car.py). Their spans may differ on the two sides of neutral, and they may be inverted.
+Throttle 0 means *stopped*, 120 us; it is not the middle of the throttle's range.
 """
 
 import contextlib
@@ -29,10 +28,9 @@ def _finite(value: object, what: str) -> float:
 class Channel:
     """One servo signal. Every Channel is valid: values that make no servo channel raise CarError.
 
-    period_us: nominal period. neutral_pct: duty of action 0, in percent. span_pct: duty per unit of action, in
-    percent; negative if the signal is inverted. low, high: range of the action, which includes 0.
-    below_pct: the span for actions below 0, with the same sign as span_pct; None if it is span_pct. by_pulse: judge a
-    measured pulse by its microseconds, as a servo does, and not by its share of the measured period.
+    neutral_pct: duty of action 0, in percent. span_pct: duty per unit of action, in percent; negative if the signal is
+    inverted. low, high: range of the action, which includes 0. below_pct: the span for actions below 0; None if it is
+    span_pct. by_pulse: judge a measured pulse by its microseconds, and not by its share of the measured period.
     """
 
     name: str
@@ -71,8 +69,8 @@ class Channel:
     @property
     def ends_us(self) -> tuple[int, int]:
         """The shortest and the longest pulse in the range of the action, in microseconds."""
-        first, second = self.pulse_us(self.low), self.pulse_us(self.high)
-        return min(first, second), max(first, second)
+        ends = self.pulse_us(self.low), self.pulse_us(self.high)
+        return min(ends), max(ends)
 
     @property
     def neutral_us(self) -> int:
@@ -136,7 +134,7 @@ class PwmCalibration:
     def channel(self, action_name: str) -> Channel:
         """Return the channel of "steering" or "throttle". Raises CarError for other names."""
         if action_name not in ("steering", "throttle"):
-            raise CarError(f"an action must be steering or throttle, found {action_name!r}")
+            raise CarError("an action must be steering or throttle", found=repr(action_name))
         return getattr(self, action_name)
 
     def pulses(self, steering: float, throttle: float) -> Pulses:

@@ -1,15 +1,10 @@
 """Arduinos without a board: what goes for the stand-in too, and what only the real firmware does."""
 
-import os
-import signal
-import subprocess
-import sys
 import time
-from contextlib import suppress
 
 import needs
 import pytest
-from needs import ended, until
+from needs import until
 
 from balloon_world.simulated_arduino import StandIn
 from lab.arduino import emulator as arduino
@@ -51,50 +46,19 @@ def test_a_link_arms_drives_and_stops(kind):
             time.sleep(0.1)
             assert (link.latest().state, link.latest().result) == (State.STOPPED, "i")
             assert (link.latest().steering_us, link.latest().throttle_us) == (1456, 120)
-            assert link.latest().bad_lines == link.latest().old_commands == 0
             assert link.round_trip_s() < 0.2
         events = [e for e in board.pulses() if e.monotonic_s > armed and e.kind == "pulse"]
         for pin, wanted, neutral in (("steering", sent.steering_us, 1456), ("throttle", sent.throttle_us, 120)):
             widths = [e.pulse_us for e in events if e.pin == pin]
-            assert all(neutral - ARDUINO_STEP_US <= us <= wanted + ARDUINO_STEP_US for us in widths), widths
-            assert any(abs(us - wanted) <= ARDUINO_STEP_US for us in widths)
-            assert abs(widths[-1] - neutral) <= ARDUINO_STEP_US
+            assert min(widths) >= neutral - ARDUINO_STEP_US
+            assert max(widths) == pytest.approx(wanted, abs=ARDUINO_STEP_US)
+            assert widths[-1] == pytest.approx(neutral, abs=ARDUINO_STEP_US)
         assert 0.1 < max(e.end_s for e in events if e.pin == "throttle") - stopped < 0.4
         with ServoLink(board.port) as again:  # which does not reset it: the human's pulses were gone for a second
             assert (again.hello.boot, again.latest().state) == (link.hello.boot, State.STOPPED)
 
 
-# ---- the real firmware
-
-
-def test_what_it_needs_is_named(monkeypatch, tmp_path):
+def test_what_it_needs_is_named(monkeypatch):
     monkeypatch.setitem(arduino.NEEDS, "/nowhere", "gcc-avr")
-    with pytest.raises(RoverError, match=r"gcc-avr.*apt-get install .*gcc-avr"):
+    with pytest.raises(RoverError, match=r"apt-get install .*gcc-avr"):
         arduino.build.__wrapped__()
-    monkeypatch.setattr(arduino, "NEEDS", {})
-    monkeypatch.setattr(arduino, "FIRMWARE", tmp_path / "firmware")
-    with pytest.raises(RoverError, match="needs a checkout"):
-        arduino.build.__wrapped__()
-
-
-@pytest.mark.emulated
-@needs.simavr
-def test_it_ends_with_its_parent():
-    """Also where a sister that was forked keeps the pipe open."""
-    program = (
-        "import os, time; from lab.arduino.emulator import EmulatedArduino; board = EmulatedArduino()\n"
-        "if os.fork() == 0: time.sleep(5); os._exit(0)\n"
-        "print(board.pid, board.port, flush=True); time.sleep(30)"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, start_new_session=True)
-    try:
-        pid, port = parent.stdout.readline().decode().split()
-        os.kill(int(pid), 0)
-        parent.kill()
-        parent.wait()
-        until(lambda: ended(int(pid)))
-        assert not os.path.lexists(port)
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(parent.pid, signal.SIGKILL)
-        parent.stdout.close()

@@ -48,8 +48,6 @@ def test_neutral_before_anything_else(board):
         assert pulses(events, pin)[0].at_us < 1000
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
     assert board.lines[0] == f"<H 4 4.2.0 {board.boot} 0 p {Car().id}"
-    status = board.status
-    assert (status.state, status.reason, status.result, status.receiver_steering_us) == ("M", "r", "-", "-")
 
 
 def test_recorded_pulses_come_out_as_they_went_in(board):
@@ -104,19 +102,9 @@ def test_the_human_takes_over_within_50_ms(armed):
         events = armed.drive(1800, 232, 90, every_ms=20)
         on_pins(events, 1560, 124, after_us=start_us + TAKEOVER_MS * 1000, within_us=STEP_US)
         print(f"the host's last throttle {(last_throttle_us(events) - start_us) / 1000:.1f} ms after the stick")
-        assert (armed.status.state, armed.status.reason) == ("M", "h")
         armed.transmitter(*REST)
         armed.run_ms(50)
         arm(armed)
-
-
-def test_the_clock_is_true(armed):
-    """It is counted from Timer1's overflows: none may be lost, with all interrupts busy."""
-    armed.transmitter(None, 200, throttle_period_us=1016.4)  # its edges wander across the overflows
-    for _ in range(100):
-        armed.command("D", 1300, 200)
-        armed.run_ms(20)
-    assert armed.now_us / 1000 - 35 <= armed.status.uptime_ms <= armed.now_us / 1000
 
 
 def test_a_line_full_of_rubbish_keeps_no_command_out(armed):
@@ -128,9 +116,9 @@ def test_a_line_full_of_rubbish_keeps_no_command_out(armed):
         armed.send(bytes(rng.choice(RUBBISH) for _ in range(60)) + b"\n" + line(">Q"))
         armed.command("D", 1300 + n, 150 + n)
         armed.command("D", 1301 + n, 151 + n)
-        events = armed.run_ms(rng.uniform(14, 17))  # 165 bytes take 14: more would wait longer each time, and be late
+        armed.run_ms(rng.uniform(14, 17))  # 165 bytes take 14: more would wait longer each time, and be late
     assert (armed.status.state, armed.status.lost) == ("A", 0)
-    assert not any(e.kind == RESET for e in events)
+    assert armed.now_us / 1000 - 35 <= armed.status.uptime_ms <= armed.now_us / 1000  # no overflow of Timer1 was lost
     print(f"the loop's longest turn takes {armed.longest_ms:.2f} ms")
     assert 0.1 < armed.longest_ms < 2
 
@@ -170,10 +158,7 @@ def test_a_hung_loop_is_reset_by_the_watchdog(armed):
 
 
 def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
-    """Throttle edges, lines and overflows at all phases: one that kept INT0 waiting for 6 us was seen in 0.3 %.
-
-    A status says whole microseconds, so that up to half of one is its rounding.
-    """
+    """Throttle edges, lines and overflows at all phases: one that kept INT0 waiting for 6 us was seen in 0.3 %."""
     rng = random.Random(5)
     board.transmitter(*REST)
     board.run_ms(150)
@@ -184,12 +169,11 @@ def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
             board.send(line(">Q"))
             board.run_ms(rng.uniform(9, 12))
         assert abs(board.status.receiver_throttle_us - throttle_us) <= 1
-        assert abs(board.status.receiver_steering_us - steering_us) <= STEP_US + 0.5
+        assert abs(board.status.receiver_steering_us - steering_us) <= STEP_US + 0.5  # half of one is rounding
 
 
 @pytest.mark.parametrize(("let_go", "most_ms"), [(False, 155), (True, 30)])
 def test_a_held_throttle_of_a_gamepad_stops(let_go, most_ms):
-    """Of the firmware that is built with HUMAN=gamepad, whose human's sticks are a host's lines."""
     board = Uno(human="gamepad")
     board.run_ms(120)
     held = [(1456, 120)] * 20 + [(1600, 200)] * 15
