@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import time
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +115,7 @@ def record(inputs, folder, logged=True):
     module.sync_disk = timed
     limits = {"header": {}, "max_bytes": 10_000_000, "keep": 1}
     with (
-        FlightLog(folder / "flight.log" if logged else None, **limits) as log,
+        FlightLog(folder / "flight.log", **limits) if logged else nullcontext() as log,
         EpisodeWriter(folder / NAME, About("cut"), resolution=None, flags=True) as writer,
     ):
         began_s = time.time()
@@ -123,7 +123,8 @@ def record(inputs, folder, logged=True):
             time.sleep(max(0.0, began_s + i / HZ - time.time()))
             writer.frame(time.time(), PICTURE)
             writer.control(time.time(), i, 1500, 136, 21308, 1016)
-            log.tick(TICK._replace(t_s=time.monotonic() - log.start_s, frame=i))
+            if log:
+                log.tick(TICK._replace(t_s=time.monotonic() - log.start_s, frame=i))
 
 
 def check_kept(folder, cut_s):

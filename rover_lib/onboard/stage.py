@@ -188,6 +188,8 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
     path = Path(path)
     try:
         content = json.loads(read_plain(path))
+    except FileNotFoundError:
+        raise RoverError(f"{path}: not found", remedy=f"run the stage '{stage}'") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
         raise RoverError(f"{path}: not readable as JSON ({e})", remedy=f"run the stage '{stage}' (again)") from None
     found = content if isinstance(content, dict) else {}

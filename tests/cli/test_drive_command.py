@@ -53,7 +53,7 @@ def test_a_drive_leaves_its_report_its_log_and_an_episode(demo_run, tmp_path):
     report = json.loads((folder / "drive.json").read_text())
     assert (report["ticks"], report["ended"]) == (60, "60 ticks")
     assert {"missed", "jitter_p99_ms", "plan_age_p95_ms", "hits", "trials"} <= set(report)
-    assert 50 <= report["latency_p50_ms"] < 150 and report["memory_mb"] > 50
+    assert 50 <= report["latency_p50_ms"] < 150
     flight = read_log(folder / "flight.log")
     assert len(flight.ticks["t_s"]) == 60 and set(flight.ticks["state"]) == {"A"}
     assert any("neutral: stopped" in event.text for event in flight.events) and "armed" in done.stderr

@@ -218,7 +218,7 @@ def test_a_disk_that_cannot_sync_ends_the_recording(tmp_path, monkeypatch):
     writer = EpisodeWriter(tmp_path / NAME, About(), resolution=None)
     with monkeypatch.context() as patch:
         patch.setattr(module, "sync_disk", broken)
-        patch.setattr(module, "SYNC_S", 0.001)
+        patch.setattr(module, "SYNC_S", 0.5)
         writer.open()
         fill(writer)
         writer._syncing.join(10)
