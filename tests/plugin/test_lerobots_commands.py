@@ -1,6 +1,7 @@
 """LeRobot's own commands, as processes, with the rover: on the emulated Arduino, and in the balloon world."""
 
 import importlib
+import inspect
 import os
 import re
 import shlex
@@ -10,7 +11,6 @@ import sys
 import tempfile
 import threading
 import time
-import typing
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -143,7 +143,8 @@ def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
         if not (BIN / program).exists() or (ENDING and program == "lerobot-record" and "policy" in line):
             continue
         module = importlib.import_module(f"lerobot.scripts.{program.replace('-', '_')}")
-        config = typing.get_type_hints(getattr(module, program.partition("-")[2]).__wrapped__)["cfg"]
+        config = inspect.unwrap(getattr(module, program.partition("-")[2])).__annotations__["cfg"]
+        config = eval(config, vars(module)) if isinstance(config, str) else config
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
         assert draccus.parse(config, args=words)
         parsed.append(program)
