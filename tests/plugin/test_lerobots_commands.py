@@ -148,7 +148,7 @@ def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
         assert draccus.parse(config, args=words)
         parsed.append(program)
-    assert len(parsed) == (3 if ENDING else 4), parsed
+    assert len(parsed) == 4, parsed
 
 
 @pytest.fixture(scope="module")
