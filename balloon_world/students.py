@@ -3,7 +3,7 @@
     content = judge_students("runs/full", ["runs/fast", "runs/faster"])
 
 All results concern the artifact that would drive the car, a run's policy_static.pt. Every drive stays in the cache,
-keyed by the artifact's content, so a process that was ended goes on where it was. A rule holds the rows to limits from
+keyed by the artifact's content, so a run that was ended can resume. A rule holds the rows to limits from
 params.yml, and recommends a student or the teacher.
 """
 
@@ -87,7 +87,7 @@ def judge_students(
     students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
     `run_trials`, and pushed at the latency computed for it; 0 for a real car's policy, which has no world.
-    Raises TrainingError for runs that do not belong together, StageError and ArtifactError for a missing file.
+    Raises TrainingError for runs that do not belong together, RoverError and ArtifactError for a missing file.
     """
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
@@ -177,7 +177,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
 def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Settings) -> str:
     """Drive through the world of a seed and return the outcome: left alone, or pushed if plans are late_ms late."""
     if late_ms is None:
-        return run_trials(policy, worlds=1, seed=seed, keep_frames=0).per_world[0].outcome
+        return run_trials(policy, worlds=1, seed=seed).per_world[0].outcome
     return drive_in(policy, World(seed, PUSHES), late_ms / 1e3, settings).outcome
 
 

@@ -57,13 +57,12 @@ class Driven:
 
 @dataclass(frozen=True)
 class TrialReport:
-    """How a policy drove. wilson: 95 % interval of the share of hits. frames: some (frame_bgr, state) of the drives."""
+    """How a policy drove. wilson: 95 % interval of the share of hits."""
 
     hits: int
     trials: int
     wilson: tuple[float, float]
     per_world: list[Driven]
-    frames: list[tuple[np.ndarray, np.ndarray]]
 
 
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -81,34 +80,24 @@ def run_trials(
     seed: int = 10_000,
     replan_every: int = 8,
     progress: Progress = silent,
-    keep_frames: int = 200,
 ) -> TrialReport:
     """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
 
     policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`. replan_every: how many actions of
     each chunk are driven before the policy sees the next frame; its state is the action commanded before, neutral at
-    the start. keep_frames: at most so many (frame_bgr, state) pairs are kept, spread evenly over all.
+    the start.
     Raises TrainingError for parameters outside their ranges, and plans of a wrong shape or that are not finite.
     """
     if worlds < 1 or not 1 <= replan_every <= policy.chunk:
         what = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
         raise TrainingError(what, found=f"{worlds} and {replan_every}")
     results: list[Driven] = []
-    seen: list[tuple[np.ndarray, np.ndarray]] = []
-    stride, shown = 1, 0  # the stride doubles whenever too many are kept: memory is bounded, and all drives are there
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
-        result, pairs = _drive(policy, World(world_seed, left=left), replan_every)
-        results.append(result)
-        for pair in pairs:
-            if shown % stride == 0 and keep_frames:
-                seen.append(pair)
-            shown += 1
-            if len(seen) > keep_frames:
-                seen, stride = seen[::2], 2 * stride
+        results.append(_drive(policy, World(world_seed, left=left), replan_every))
     hits = sum(r.hit for r in results)
-    return TrialReport(hits, worlds, wilson_interval(hits, worlds), results, seen)
+    return TrialReport(hits, worlds, wilson_interval(hits, worlds), results)
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
@@ -118,13 +107,10 @@ def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any)
         return {name: trial.result() for name, trial in running.items()}
 
 
-def _drive(policy: Any, world: World, replan_every: int) -> tuple[Driven, list[tuple[np.ndarray, np.ndarray]]]:
+def _drive(policy: Any, world: World, replan_every: int) -> Driven:
     state: np.ndarray = np.zeros(2, np.float32)
-    pairs = []
     while not world.done:
-        frame = world.render()
-        pairs.append((frame, state))
-        chunk = np.asarray(policy.predict_chunk(frame, state))
+        chunk = np.asarray(policy.predict_chunk(world.render(), state))
         if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
             found = f"{chunk.shape} in world {world.seed}"
             raise TrainingError("the policy must plan finite (steps, 2) actions", found=found)
@@ -133,4 +119,4 @@ def _drive(policy: Any, world: World, replan_every: int) -> tuple[Driven, list[t
             state = np.array([steering, throttle], np.float32)
             if world.done:
                 break
-    return Driven(str(world.outcome), world.state.time_s, Trajectory.of(world)), pairs
+    return Driven(str(world.outcome), world.state.time_s, Trajectory.of(world))

@@ -151,7 +151,7 @@ class Best:
 
 
 class Resumable:
-    """A training in phases, in a folder, that goes on where it was after a power cut at any moment, to the last bit.
+    """A training in phases, in a folder, that resumes to the last bit after a power cut at any moment.
 
     every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase.
     """

@@ -68,8 +68,6 @@ class Drive(Child):
 
     def line_of(self, message: str) -> str | None:
         """Return the first line since mark() that matches, or None if there is none within LINE_S."""
-        if not message:
-            return "nothing tells of it"
         deadline, line = time.monotonic() + LINE_S, None
         while line is None and time.monotonic() < deadline:
             line = next((line for line in self.errors()[self._marked :] if re.search(message, line)), None)

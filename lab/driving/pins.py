@@ -139,7 +139,12 @@ def periods_of(car: Car) -> dict[str, int]:
 def row_of(
     fault: Any, verdict: Verdict, code: int | None, line: str | None, recovered: bool, method: str, **more: Any
 ) -> dict[str, Any]:
-    """Return a row of metrics.faults. line: tells of the fault, None if none does. method: how it was done."""
+    """Return a row of metrics.faults. line: tells of the fault, None if none does. method: how it was done.
+
+    A fault without a message needs no line.
+    """
+    if not fault.message:
+        line = "nothing tells of it"
     if line is None:
         verdict.wrong.append(f"no line tells of it (wanted: {fault.message})")
     if not recovered:

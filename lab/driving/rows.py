@@ -157,7 +157,7 @@ def run_row(fault: FaultRow, car: Car = DEFAULT) -> dict[str, Any]:
         verdict.wrong.append(f"the drive ended with {code}, expected {fault.wanted_code}")
     said = [text for ms, text in seen.log if ms >= at_ms] + [words for _, ms, words in seen.drives if words]
     message = fault.message + f"|{LOST_SIGNAL}" * (gamepad and fault.expected == STOPPED)  # its sticks stop, too
-    line = next((text for text in said if re.search(message, text)), None) if message else "nothing tells of it"
+    line = next((text for text in said if re.search(message, text)), None)
     run = Run(seen)
     recovered = bool((run.autonomous & (run.throttle != car.numbers[6]))[AGAIN_MS:].any())
     if car == DEFAULT:  # the invariants' numbers are this car's

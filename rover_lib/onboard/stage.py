@@ -70,7 +70,8 @@ def _create_locked(path: Path) -> BufferedWriter:
     while True:
         # Not mkstemp, whose mode of 0600 would hide the file from the service's user.
         file = os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666), "wb")
-        fcntl.flock(file, fcntl.LOCK_EX)
+        with contextlib.suppress(OSError):  # a network's file system may have no such locks
+            fcntl.flock(file, fcntl.LOCK_EX)
         if os.fstat(file.fileno()).st_nlink:
             return file
         file.close()  # another process removed it before it was locked

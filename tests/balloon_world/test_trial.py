@@ -71,13 +71,6 @@ def test_the_state_is_the_action_before_and_neutral_at_the_start():
     assert all(s == pytest.approx([0.25, 0.03]) for s in policy.states[1:])
 
 
-def test_frames_are_kept_evenly_and_not_too_many():
-    report = run_trials(Constant(0.0, 0.02), worlds=4, keep_frames=7)
-    assert 3 <= len(report.frames) <= 7
-    assert {(frame.shape, state.shape) for frame, state in report.frames} == {((360, 640, 3), (2,))}
-    assert run_trials(Constant(0.0, 0.02), worlds=1, keep_frames=0).frames == []
-
-
 @pytest.mark.parametrize("wrong", [{"replan_every": 33}, {"worlds": 0}, {"steering": np.nan}])
 def test_what_is_not_a_trial_is_refused(wrong):
     policy = Constant(wrong.pop("steering", 0.0), 0.0)

@@ -138,6 +138,5 @@ def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list
 
 def write_car(car: Car, path: Path) -> None:
     """Write car.yml atomically. Raises OSError if it cannot be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         temporary.write_text(yaml_of(car))

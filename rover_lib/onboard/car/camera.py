@@ -109,9 +109,7 @@ class Camera:
         self._clock = clock
         self.time_stamps = NO_CLOCK  # their clock; NO_CLOCK: frames get their time of arrival
         self._stamp_s = float("-inf")  # the newest one
-        self._shown = np.zeros(
-            (REMEMBERED, ROWS * COLUMNS), np.uint64
-        )  # the newest pictures' block_sums(), one row each
+        self._shown = np.zeros((REMEMBERED, ROWS * COLUMNS), np.uint64)  # block_sums() of the newest pictures, by row
         self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: CameraError | None = None
         self._closing, self._begun = threading.Event(), threading.Event()
@@ -303,7 +301,7 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
 
 
 def _folder(path: Path, rate_hz: float, closing: threading.Event, begun: threading.Event) -> Reader:
-    """Yield a folder's JPEGs at a camera's rate: again and again until `begun` is set, and then once."""
+    """Yield a folder's JPEGs at a camera's rate, repeatedly until `begun` is set, and then once."""
     folder = path / "frames" if (path / "frames").is_dir() else path
     files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
     if not files:

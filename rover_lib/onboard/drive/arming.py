@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
 from rover_lib.onboard.drive.loop import Arm
-from rover_lib.onboard.drive.service import CHECK_S, RoverError, check_age
+from rover_lib.onboard.drive.service import CHECK_S, check_age
+from rover_lib.onboard.errors import RoverError
 
 WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduino refuses an arming after 31
 

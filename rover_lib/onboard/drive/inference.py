@@ -1,4 +1,4 @@
-"""Plan while the control loop runs: a thread asks the policy for a plan of the newest frame again and again.
+"""Plan while the control loop runs: a thread keeps asking the policy for a plan of the newest frame.
 
     with PolicyProcess("policy_static.pt") as policy, Planner(camera, policy.predict, commanded, 30.0) as planner:
         plan = planner.newest()
@@ -41,7 +41,7 @@ Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint
 
 
 class Planner:
-    """Plans for the newest frame again and again, in a thread; a context manager.
+    """Keeps planning from the newest frame, in a thread; a context manager.
 
     predict: returns (chunk, 2) actions, unclipped, or raises. rate_hz: actions per second of a plan. rest_s: pause
     after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see Plan.
@@ -198,11 +198,6 @@ class PolicyProcess:
             self._process.join()
         if self._pipe:
             self._pipe.close()
-
-    @property
-    def pids(self) -> tuple[int, ...]:
-        """The id of the policy's process; empty if none runs."""
-        return (self._process.pid,) if self._process and self._process.pid else ()
 
     def predict(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Return (chunk, 2) float32 as Policy.predict_unclipped() does, for one camera. close() ends the wait for it.

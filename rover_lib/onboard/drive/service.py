@@ -142,7 +142,7 @@ class Service:
     ) -> "Telemetry | None":
         """Report ready, wait until a human arms the car and the Arduino agrees, and return what arm() returned.
 
-        arm: must call check_request() just before the Arduino is told. checks: called again and again while waiting;
+        arm: must call check_request() just before the Arduino is told. checks: called repeatedly while waiting;
         each raises if its device fails. missing: what must be done before the car can be armed, "" if nothing. said:
         how the previous drive ended. Raises RoverError when told to stop, and what a check raises.
         """

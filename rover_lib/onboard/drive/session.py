@@ -1,4 +1,4 @@
-"""Arm the car and drive, once or again and again, with all that a drive has opened.
+"""Arm the car and drive, once or repeatedly, with all that a drive has opened.
 
 `rover drive` and the laboratory's random drives arm and drive by this code; only what is opened differs.
 """
@@ -115,7 +115,7 @@ class Session:
 
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
-        telemetry, attempt = None, partial(self.attempt, arming)
+        attempt = partial(self.attempt, arming)
         if self.link and (self.service or self.terminal):
             show = partial(self._show_waiting, said)
             checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]

@@ -82,7 +82,7 @@ class EpisodeWriter:
 
     folder: must not exist; its name is the episode's id. resolution: (width, height) of the frames; None: that of the
     first. flags: write the two columns that say what was measured. Raises EpisodeError for an existing folder, frames
-    of another size, values that are no numbers, an episode without a frame or a control, or a disk that takes no more.
+    of another size, values that are no numbers, an episode without a frame or a control, or a full disk.
     """
 
     def __init__(
@@ -473,11 +473,17 @@ def find_backlog(system_s: Iterable[float], arduino_s: Iterable[float]) -> list[
 def read_car_of(folder: Path | str) -> Car:
     """Return the car whose pulses an episode contains, by its metadata, or the default. Raises CarError for no car."""
     try:
-        metadata = json.loads(_data_of(Path(folder) / DATA))["metadata"]
-        described, said = metadata.get("car"), metadata.get("steering_positive")
-        before = metadata.get("arduino_port") == SIMULATED and said is None
-    except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
+        return car_in(json.loads(_data_of(Path(folder) / DATA))["metadata"], folder)
+    except (ValueError, RecursionError, TypeError, KeyError):
         return Car()
+
+
+def car_in(metadata: Any, folder: Path | str) -> Car:
+    """Return the car that an episode's metadata describe, or the default. Raises CarError for no car."""
+    if not isinstance(metadata, dict):
+        return Car()
+    described, said = metadata.get("car"), metadata.get("steering_positive")
+    before = metadata.get("arduino_port") == SIMULATED and said is None
     car = Car() if described is None else Car.of(described, f"{folder}: its car")
     # In the balloon world the default car turned left until recordings said which side is positive.
     return replace(car, positive="left") if before and car.drives_like(Car()) else car

@@ -93,7 +93,7 @@ def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: A
 
 
 def bars_figure(rows: int, height_in: float) -> tuple[Figure, Axes]:
-    """Make a figure of one row of axes, with room for so many horizontal bars. height_in: of the rest."""
+    """Make a figure of one row of axes, with room for this number of horizontal bars. height_in: of the rest."""
     fig, axes = new_figure(1, height_in=height_in + 0.36 * rows)
     return fig, axes[0, 0]
 

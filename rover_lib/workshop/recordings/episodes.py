@@ -28,6 +28,7 @@ import simplejpeg
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
+from rover_lib.onboard.kinds import EPISODE_FILES
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
     DATA,
@@ -35,6 +36,7 @@ from rover_lib.onboard.recording.episode import (
     FRAME_FIELDS,
     NOBODY,
     OUTCOMES,
+    car_in,
     find_killed,
     number_of,
     read_car_of,
@@ -100,7 +102,7 @@ def load_recordings(
         raise EpisodeError(what, found=found, remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
-        if any((root / name).exists() for name in (DATA, "control_data.csv")):
+        if any((root / name).exists() for name in EPISODE_FILES):
             root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
         else:
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
@@ -145,26 +147,26 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
-        path, content = _read_content(folder, faults)
+        content, tables = _read_tables(folder, faults)
     except (OSError, ValueError, csv.Error) as e:
         faults.add(folder, "unreadable", f"neither {DATA} nor its CSV files can be read: {quote(str(e))}")
         return None
-    control_rows, frame_rows = content["control_samples"], content["frame_samples"]
+    (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
     metadata, label = content.get("metadata"), content.get("action_label")
     outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
     if outcome is not None and outcome not in OUTCOMES:
-        faults.add(path, "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
+        faults.add(folder / DATA, "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
         outcome = None
     try:
-        car = read_car_of(folder)
-        controls, formulas = read_controls(path, control_rows, car.pwm, faults)
+        car = car_in(metadata, folder) if content else read_car_of(folder)  # which reads larger files
+        controls, formulas = read_controls(source, control_rows, car.pwm, faults)
     except (CarError, EpisodeError) as e:
         faults.add(folder, "no_car" if isinstance(e, CarError) else "no_formula", str(e))
         return None
-    frames = _read_frames(folder, path, frame_rows, faults)
+    frames = _read_frames(folder, frames_source, frame_rows, faults)
     samples: tuple[Sample, ...] = ()
     if controls and frames:
-        controls = place_bursts(controls, path, faults)
+        controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
         faults.add(
@@ -179,28 +181,30 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         frames=len(frame_rows),
         controls=len(control_rows),
         samples=samples,
-        files=tuple(p for name in (DATA, *(name for name, _ in TABLES.values())) if (p := folder / name).is_file()),
+        files=tuple(p for name in EPISODE_FILES if (p := folder / name).is_file()),
         outcome=outcome,
         formulas=formulas,
     )
 
 
-def _read_content(folder: Path, faults: Faults) -> tuple[Path, dict[str, Any]]:
-    """Return a file of an episode and its content: DATA's, or its rows in the CSV files if DATA has none.
+def _read_tables(folder: Path, faults: Faults) -> tuple[dict[str, Any], dict[str, tuple[Path, list[Any]]]]:
+    """Return DATA's content, {} if it has none, and for controls and frames the file that has rows, and these.
 
-    Raises OSError, ValueError and csv.Error if neither can be read.
+    The rows are DATA's, or where it has none the CSV file's. Raises OSError, ValueError and csv.Error for that one.
     """
-    path = folder / DATA
+    path, content, why = folder / DATA, dict[str, Any](), "no rows of controls or frames in it"
     try:
-        content = read_json(path)
-        if isinstance(content, dict) and all(content.get(key) and isinstance(content[key], list) for key in TABLES):
-            return path, content
-        faults.add(path, "broken_json", "no rows of controls and frames in it: its CSV files are read")
+        found = read_json(path)
+        content = found if isinstance(found, dict) else {}
     except (OSError, ValueError) as e:
-        faults.add(path, "broken_json", f"{quote(str(e))}: its CSV files are read")
-    return folder / "control_data.csv", {
-        key: _read_csv(folder / name, fields) for key, (name, fields) in TABLES.items()
-    }
+        why = quote(str(e))
+    tables = {key: (path, rows) for key in TABLES if isinstance(rows := content.get(key), list) and rows}
+    if len(tables) < len(TABLES):
+        faults.add(path, "broken_json", f"{why}: its CSV files are read")
+    for key, (name, fields) in TABLES.items():
+        if key not in tables:
+            tables[key] = folder / name, _read_csv(folder / name, fields)
+    return content, tables
 
 
 def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:

@@ -92,13 +92,11 @@ def run(
     runs_dir: Path | str = "runs",
     progress: Progress = silent,
     notebooks: Path | str = NOTEBOOKS,
-    timed: bool = True,
     **overrides: Any,
 ) -> Path:
     """Execute the five notebooks in order, and return the run's folder.
 
-    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100. timed: False leaves out the
-    last notebook, the benchmark, so that it can be executed at another time.
+    overrides: any of the notebooks' parameters, say worlds=40, samples=200, iterations=100.
 
     The new run is made in .<name>.new beside the old one of that name, and its files (`files_of_a_run`) replace the old
     one's when it is complete; recordings, a checkpoint and benchmarks of other hosts stay.
@@ -118,9 +116,8 @@ def run(
         finished = {path.name for path in new.glob("*.ipynb")}
         for path in folder.glob("benchmark-*.json"):  # notebook 05 shows those of other hosts
             shutil.copy2(path, new)
-        executed = sources if timed else sources[:-1]
         try:
-            for source in progress(executed, desc="notebooks", total=len(executed)):
+            for source in progress(sources, desc="notebooks", total=len(sources)):
                 if source.name not in finished:
                     known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
                     _execute(source, new, known_to_it, progress is not silent)

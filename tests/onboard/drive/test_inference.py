@@ -143,7 +143,7 @@ def test_the_process_computes_what_the_policy_does(process, artifacts):
 @pytest.mark.skipif(platform.machine() not in PROCESSORS, reason="no filter of system calls for this processor")
 def test_every_thread_of_the_process_is_confined(process):
     assert process.unconfined == ""
-    for thread in Path(f"/proc/{process.pids[0]}/task").iterdir():
+    for thread in Path(f"/proc/{process._process.pid}/task").iterdir():
         status = (thread / "status").read_text()
         assert "\nNoNewPrivs:\t1\n" in status and "\nSeccomp:\t2\n" in status
     assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
@@ -183,9 +183,9 @@ def test_what_fails_while_it_is_loaded_is_a_sentence(artifacts, monkeypatch):
 
 def test_a_process_that_is_killed(artifacts):
     with PolicyProcess(artifacts["static"], threads=1) as process:
-        os.kill(*process.pids, signal.SIGINT)  # a terminal's Ctrl-C is not for it
+        os.kill(process._process.pid, signal.SIGINT)  # a terminal's Ctrl-C is not for it
         assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
-        os.kill(*process.pids, signal.SIGKILL)
+        os.kill(process._process.pid, signal.SIGKILL)
         with pytest.raises(PolicyError, match="SIGKILL"):
             for _ in range(100):
                 process.predict(FRAME, np.zeros(2))
@@ -193,7 +193,7 @@ def test_a_process_that_is_killed(artifacts):
 
 def test_a_process_that_hangs_is_ended(artifacts):
     with PolicyProcess(artifacts["static"], threads=1) as process:
-        os.kill(*process.pids, signal.SIGSTOP)
+        os.kill(process._process.pid, signal.SIGSTOP)
         start = time.monotonic()
     assert time.monotonic() - start < 3
     assert process._process.exitcode is not None
@@ -202,7 +202,7 @@ def test_a_process_that_hangs_is_ended(artifacts):
 def test_it_ends_with_its_parent(artifacts):
     code = (
         "import os, sys; from rover_lib.onboard.drive.inference import PolicyProcess; "
-        f"p = PolicyProcess({str(artifacts['static'])!r}).__enter__(); print(*p.pids, flush=True); "
+        f"p = PolicyProcess({str(artifacts['static'])!r}).__enter__(); print(p._process.pid, flush=True); "
         "os.kill(os.getpid(), 9)"
     )
     pid = int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout)
