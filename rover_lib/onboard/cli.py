@@ -453,8 +453,8 @@ def open_view(
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
-    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
-    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
+    of_simulation = {"car": shown.car, "ask": shown.ask, "script": shown.script} if shown else {}
+    view = View(Address(web_port, interface), token, place, drive_user=drive_user, **of_simulation)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.

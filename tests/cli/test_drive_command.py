@@ -97,7 +97,7 @@ async def watch_and_stop(url: str) -> list[dict]:
 
 @real_time
 def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
-    pytest.importorskip("aiohttp", reason="needs the extra view")
+    pytest.importorskip("aiohttp", reason="needs the extra look")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
     with subprocess.Popen(served, stdout=subprocess.PIPE, text=True) as view:

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 import pytest
 
-pytest.importorskip("aiohttp", reason="needs the extra view")
+pytest.importorskip("aiohttp", reason="needs the extra look")
 
 from browser import Browser, chromium  # it needs aiohttp
 
@@ -46,6 +46,9 @@ def test_a_simulation_lives_through_a_busy_machine(simulation, tmp_path, seconds
             await tab.until("newest.phase === 'ended' && newest.text.startsWith('stopped here')")
             await tab.click("next")
             await tab.until("newest.phase === 'driving' && newest.ribbon.length > 3")  # where the plan leads
+            key = {"type": "keyDown", "key": "ArrowLeft"}
+            await tab.ask("Input.dispatchKeyEvent", **key)
+            await tab.until("hint.textContent.includes('Recovered from')")
             await tab.value("wire.close(); connect = () => {}; true")
             await tab.until("document.getElementById('phase').textContent.startsWith('no news for')")
             await tab.click("stop")

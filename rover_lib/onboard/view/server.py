@@ -84,7 +84,8 @@ class View:
 
     address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. car: whose drives are shown;
-    None means this machine's. ask: takes what a simulation's page asks for; None for a car. Raises RoverError for an
+    None means this machine's. ask: takes what a simulation's page asks for; None for a car. script: of such a page,
+    after that of every page. Raises RoverError for an
     unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
@@ -96,6 +97,7 @@ class View:
         drive_user: str | None = None,
         car: Car | None = None,
         ask: Callable[[str], object] | None = None,
+        script: bytes = b"",
     ):
         self._address, self._token, self._place, self._ask = address, token, place, ask
         self._users = {0, os.geteuid()}
@@ -112,7 +114,7 @@ class View:
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet"}
         self._picture = b""
         self._news = asyncio.Event()
-        self._html = PAGE.read_bytes()
+        self._html = PAGE.read_bytes().replace(b"</script>", script + b"</script>")
 
     async def run(
         self, opened: Callable[[str], object], beside: Callable[["View"], Awaitable[object]] | None = None

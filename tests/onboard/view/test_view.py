@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-aiohttp = pytest.importorskip("aiohttp", reason="needs the extra view: pip install 'rover-policy[view]'")
+aiohttp = pytest.importorskip("aiohttp", reason="needs the extra look")
 
 from rover_lib.onboard.car.car import Car  # noqa: E402
 from rover_lib.onboard.view import server as v  # noqa: E402
