@@ -303,7 +303,7 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
 def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
-    Says what the Arduino still wants, and waits for it. Moving a stick takes the car back;
+    If it is refused, it says what the Arduino still wants. Moving a stick takes the car back;
     `sudo systemctl restart rover-drive` disarms it.
     """
     from rover_lib.onboard.drive.service import Request, ask_service
@@ -318,7 +318,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    click.echo(arm(Request(**limits), model=model, confirm=confirm, notify=click.echo))
+    click.echo(arm(Request(**limits), model=model, confirm=confirm))
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")
@@ -449,12 +449,12 @@ def open_view(
     import secrets
 
     from rover_lib.onboard.car.host import default_view
-    from rover_lib.onboard.view.server import Address, View, read_token
+    from rover_lib.onboard.view.server import View, read_token
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
-    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
-    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
+    car, ask = shown and shown.car, getattr(shown, "ask", None)
+    view = View(token, place, port=web_port, interface=interface, drive_user=drive_user, car=car, ask=ask)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.
