@@ -449,12 +449,12 @@ def open_view(
     import secrets
 
     from rover_lib.onboard.car.host import default_view
-    from rover_lib.onboard.view.server import View, read_token
+    from rover_lib.onboard.view.server import Address, View, read_token
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
-    car, ask = shown and shown.car, getattr(shown, "ask", None)
-    view = View(token, place, port=web_port, interface=interface, drive_user=drive_user, car=car, ask=ask)
+    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
+    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.

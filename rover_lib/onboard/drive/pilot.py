@@ -182,15 +182,13 @@ class PolicyPilot:
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:
     """Return an error if the pictures have stopped changing. It matters only while the car moves."""
     seen = frame.repeats + 1
-    if not settings.frozen_frames or seen < settings.frozen_frames:
+    if seen < settings.frozen_frames:
         return None
     return CameraError(f"the camera is frozen: {seen} frames showed nothing new", remedy="plug it in again")
 
 
 def blank(frame: Frame, settings: Settings) -> CameraError | None:
     """Return an error if this frame is black or without contrast."""
-    if not settings.black_frames:
-        return None
     if frame.mean < settings.black_level:
         return CameraError(f"the camera's picture is black (mean {frame.mean:.1f} of 255)", remedy=CAP)
     if frame.contrast < settings.flat_level:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.checked import Rule, broken_rule, is_whole, number, of_type, optional, whole
+from rover_lib.onboard.checked import broken_rule, number, of_type, optional, whole
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
 STEERING, THROTTLE = 0, 1
@@ -26,7 +26,6 @@ BLIND_M = 1.0  # how far the car may go by one picture, at RECORDED_MPS
 RECORDED_MPS = 1.1  # throttle 0.09, the most of the recordings, of 12 m/s
 ENSEMBLE_MOST = 10.0  # times 64 plans, whose weights must not overflow: exp(709) is the largest that a float holds
 OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
-FRAMES = Rule(lambda count: is_whole(count, 0) and count != 1, "0 (off) or a whole number from 2")
 RULES = {
     "fade_s": number(1e-3, 3600),
     "stop_s": number(1e-3, 3600),
@@ -34,8 +33,8 @@ RULES = {
     "compensate": of_type(bool),
     "ensemble": optional(number(-ENSEMBLE_MOST, ENSEMBLE_MOST)),
     "throttle_limit": number(0, 1),
-    "frozen_frames": FRAMES,
-    "black_frames": FRAMES,
+    "frozen_frames": whole(2, 1000),
+    "black_frames": whole(2, 1000),
     "black_level": number(-255, 255),
     "flat_level": number(-255, 255),
 }

@@ -1,6 +1,6 @@
 """The view: a page in a browser that shows a drive and can stop it. It runs in its own process; no drive imports it.
 
-    asyncio.run(View(token).run(lambda url: print(url)))
+    asyncio.run(View(Address(), token).run(lambda url: print(url)))
 
 Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the page over HTTP, and each
 page opens a WebSocket. It receives the newest message, and the next one only after it has confirmed that it shows the
@@ -26,6 +26,7 @@ import socket
 import struct
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_plain
 from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
+PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
 GONE = "gone"
@@ -46,20 +48,27 @@ ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulati
 SHOWN = re.compile(r"shown (\d{1,12})", re.ASCII)
 
 
-def open_port(port: int, interface: str) -> socket.socket:
-    """Return a socket that listens for browsers. Raises RoverError if the port or the interface cannot be used."""
-    wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if interface:
-            wire.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode() + b"\0")
-        wire.bind(("0.0.0.0" if interface else "127.0.0.1", port))
-        wire.listen(64)
-    except OSError as error:
-        wire.close()
-        what = f"no page can be served at port {port} {interface} ({error.strerror})"
-        raise RoverError(what, remedy="another --web-port, or an --interface of `ip -brief address`") from None
-    return wire
+@dataclass(frozen=True)
+class Address:
+    """Where browsers find the view. port: 0: any free one. interface: such as wlan0; "": only from this machine."""
+
+    port: int = PORT
+    interface: str = ""
+
+    def open(self) -> socket.socket:
+        """Return a listening socket. Raises RoverError if the port or the interface cannot be used."""
+        wire = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            wire.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if self.interface:
+                wire.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, self.interface.encode() + b"\0")
+            wire.bind(("0.0.0.0" if self.interface else "127.0.0.1", self.port))
+            wire.listen(64)
+        except OSError as error:
+            wire.close()
+            what = f"no page can be served at port {self.port} {self.interface} ({error.strerror})"
+            raise RoverError(what, remedy="another --web-port, or an --interface of `ip -brief address`") from None
+        return wire
 
 
 def read_token(path: Path) -> str:
@@ -73,25 +82,22 @@ def read_token(path: Path) -> str:
 class View:
     """The web server of the view.
 
-    place: the socket to which drives connect; None if a simulation is shown. port: for browsers; 0: any free one.
-    interface: such as wlan0; "": only from this machine. drive_user: another user whose drives are accepted, besides
-    this user's and root's. car: whose drives are shown; None means this machine's. ask: takes what a simulation's page
-    asks for; None for a car. Raises RoverError for an unknown user, and CarError and ParamsError like this_car() and
-    CarShape.of().
+    address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
+    drive_user: another user whose drives are accepted, besides this user's and root's. car: whose drives are shown;
+    None means this machine's. ask: takes what a simulation's page asks for; None for a car. Raises RoverError for an
+    unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
     def __init__(
         self,
+        address: Address,
         token: str,
         place: Path | None = None,
-        *,
-        port: int = 0,
-        interface: str = "",
         drive_user: str | None = None,
         car: Car | None = None,
         ask: Callable[[str], object] | None = None,
     ):
-        self._token, self._place, self._port, self._interface, self._ask = token, place, port, interface, ask
+        self._address, self._token, self._place, self._ask = address, token, place, ask
         self._users = {0, os.geteuid()}
         if drive_user:
             try:
@@ -138,7 +144,7 @@ class View:
         silent.disabled = True  # it would write whole requests into the log, with the token and as often as they come
         asyncio.get_running_loop().set_exception_handler(lambda *_: None)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5, logger=silent)
-        wire = open_port(self._port, self._interface)
+        wire = self._address.open()
         stack.callback(wire.close)
         if self._place:
             drives = self._listen(self._place)
@@ -148,7 +154,7 @@ class View:
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
         await web.SockSite(runner, wire).start()
-        name = f"{socket.gethostname()}.local" if self._interface else "127.0.0.1"
+        name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
     def show(self, head: dict[str, Any], picture: bytes) -> None:

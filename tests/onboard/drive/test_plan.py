@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
 from rover_lib.onboard.errors import ParamsError, PolicyError
-from rover_lib.onboard.params import params
 
 RATE = 30.0
 STEP = 1 / RATE
@@ -147,12 +146,6 @@ def test_a_command_that_is_no_longer_in_force_is_no_state():
     assert commanded.state(1.0 + STEP + 0.149, RATE).tolist() == pytest.approx([0.5, 0.3])  # a loop of 10 Hz, say
     assert commanded.state(1.0 + STEP + 0.151, RATE).tolist() == [0.0, 0.0]
     assert commanded.state(60.0, RATE).tolist() == [0.0, 0.0]
-
-
-def test_settings_of_params():
-    settings = Settings.of(params()["drive"])
-    assert settings.fade_s < settings.stop_s <= 32 / RATE
-    assert Settings.of(params()["drive"], throttle_limit=0.05, ensemble=None).throttle_limit == 0.05
 
 
 WRONG = {"stop_s": math.nan}, {"fade_s": True}, {"frozen_frames": 1}, {"ensemble": -20.0}, {"speed": 1}, {"stop_s": 0.1}

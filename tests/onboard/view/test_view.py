@@ -52,7 +52,7 @@ class Bench:
 
     def __init__(self, folder, **options):
         self.place = folder / "view"
-        self.view = v.View(TOKEN, self.place, **options)
+        self.view = v.View(v.Address(0), TOKEN, self.place, **options)
         self.stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self):
@@ -124,7 +124,7 @@ async def test_a_page_shows_what_the_drive_says(bench):
     assert picture == b"" and head["stopped"] and head["ribbon"] == [] and head["delay_ms"] is not None
     steering = {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000}
     throttle = {"period_us": 20000, "forward_us": 2000, "neutral_us": 1500, "reverse_us": 1000}
-    view = v.View(TOKEN, car=Car.of({"steering": steering, "throttle": throttle}))
+    view = v.View(v.Address(0), TOKEN, car=Car.of({"steering": steering, "throttle": throttle}))
     for throttle_us, stands in ((120, False), (1500, True), (1440, False), (1503, True)):
         view.show(HEAD | {"pins": [1500, throttle_us]}, b"")
         assert view._head["stopped"] is stands
@@ -281,7 +281,7 @@ def test_what_cannot_be_opened(tmp_path):
                 async with Bench(tmp_path):
                     pass
             with pytest.raises(v.RoverError):
-                v.open_port(int(bench.base.rpartition(":")[2]), "")
+                v.Address(int(bench.base.rpartition(":")[2])).open()
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:  # by a view that was killed
         left.bind(str(tmp_path / "view"))
@@ -291,7 +291,7 @@ def test_what_cannot_be_opened(tmp_path):
         asyncio.run(both())
     assert (tmp_path / "view").read_text() == "a user's"
     with pytest.raises(v.RoverError, match="nobody-of-that-name"):
-        v.View(TOKEN, drive_user="nobody-of-that-name")
+        v.View(v.Address(0), TOKEN, drive_user="nobody-of-that-name")
 
 
 def test_a_token_is_kept_and_one_that_could_be_guessed_is_refused(tmp_path):
