@@ -15,7 +15,7 @@ from fake_drive import Always, Clock, Link, Log
 
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.car.servo_link import LinkError
+from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
@@ -166,6 +166,20 @@ def test_what_happens_before_it_is_armed_is_no_fault_of_a_drive(link, clock, err
     with pytest.raises(type(error)):
         go(Always(), link, clock, arm=arm)
     assert link.said == ["neutral"]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"state": State.MANUAL, "reason": "h"}, "human took over"),
+        ({"state": State.STOPPED, "reason": "t"}, "no valid command for 150 ms"),
+        ({"state": State.MANUAL, "reason": "r", "boot": 8}, "was reset"),
+    ],
+)
+def test_the_arduino_has_the_last_word(link, clock, change, match):
+    with pytest.raises(DriveFault, match=match):
+        go(Always({3: lambda: setattr(link, "status", replace(link.status, **change))}), link, clock)
+    assert len(link.drives) == 3 and link.said[-1] == "neutral"
 
 
 def test_what_was_not_acknowledged_is_sent_again(clock):
