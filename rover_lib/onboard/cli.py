@@ -303,7 +303,7 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
 def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
-    Says what the Arduino still wants, and waits for it. Moving a stick takes the car back;
+    If it is refused, it says what the Arduino still wants. Moving a stick takes the car back;
     `sudo systemctl restart rover-drive` disarms it.
     """
     from rover_lib.onboard.drive.service import Request, ask_service
@@ -318,7 +318,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    click.echo(arm(Request(**limits), model=model, confirm=confirm, notify=click.echo))
+    click.echo(arm(Request(**limits), model=model, confirm=confirm))
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")

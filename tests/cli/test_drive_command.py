@@ -9,7 +9,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from needs import real_time, until
@@ -87,8 +86,7 @@ async def watch_and_stop(url: str) -> list[dict]:
         while not heads or heads[-1]["phase"] != "ended":
             message = await page.receive(timeout=120)
             if message.type == aiohttp.WSMsgType.BINARY:
-                line, _, jpeg = message.data.partition(b"\n")
-                heads.append(json.loads(line) | {"jpeg_bytes": len(jpeg)})
+                heads.append(json.loads(message.data.partition(b"\n")[0]))
                 await page.send_str(f"shown {heads[-1]['n']}")
                 if sum(head["phase"] == "driving" for head in heads) == 20:
                     await page.send_str("stop")
@@ -96,7 +94,7 @@ async def watch_and_stop(url: str) -> list[dict]:
 
 
 @real_time
-def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
+def test_a_page_shows_the_drive_and_its_button_ends_it(demo_run, tmp_path):
     pytest.importorskip("aiohttp", reason="needs the extra look")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
@@ -109,12 +107,7 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp
     ended = json.loads((folder / "drive.json").read_text())["ended"]
     assert ended == heads[-1]["text"] == "stopped from the view (127.0.0.1)"
     assert heads[-1]["stopped"] and heads[-1]["pins"][1] == 120
-    ticks = read_log(folder / "flight.log").ticks
-    for head in (head for head in heads if head["phase"] == "driving"):
-        assert head["jpeg_bytes"] > 1000 and head["size"] == [640, 360]
-        row = int(np.argmin(np.abs(ticks["t_s"] - head["tick"]["t_s"])))
-        for name in ("steering_us", "throttle_us", "pins_steering_us", "pins_throttle_us", "plan", "frame"):
-            assert head["tick"][name] == ticks[name][row]
+    assert any(head["ribbon"] for head in heads if head["phase"] == "driving")
 
 
 @real_time

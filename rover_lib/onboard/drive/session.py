@@ -21,7 +21,7 @@ from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, wanted_si
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner
-from rover_lib.onboard.drive.loop import Hooks, Report, Until, Warnings, drive
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
@@ -67,12 +67,13 @@ class Session:
         Raises as loop.drive() does, but for a service no DriveFault.
         """
         options, pilot = self.options, self.make_pilot()
-        warnings = self.make_warnings(pilot)
+        health = HealthWatch(self.report, self.link)
         with Arming(self, pilot) as arming:
             self.report.clear()
             arm = partial(self._arm, arming, stop, said)
             show = partial(self.feed.tick, self.report, self.camera, pilot)
-            hooks = Hooks(arm, warnings, arming.record if options.record else None, show)
+            record = arming.record if options.record else None
+            hooks = Hooks(arm, lambda: [*pilot.warnings(), *health()], record, show)
             until = Until(options.ticks, options.max_seconds, stop, self.over)
             try:
                 drive(pilot, self.link, self.log, rate_hz=options.hz, until=until, hooks=hooks, report=self.report,
@@ -92,10 +93,6 @@ class Session:
     def make_pilot(self) -> PolicyPilot:
         pwm = self.car.pwm
         return PolicyPilot(self.camera, self.planner, self.commanded, self.settings, self.rate_hz, calibration=pwm)
-
-    def make_warnings(self, pilot: PolicyPilot) -> Warnings:
-        health = HealthWatch(self.report, self.link)
-        return lambda: [*pilot.warnings(), *health()]
 
     def make_recorder(self, folder: Path, room: int | None) -> AbstractContextManager[Recorder]:
         port = self.link.port if self.link else ""
@@ -183,7 +180,7 @@ class Arming:
             driving.enter_context(session.planner.without_rest())
             driving.enter_context(session.boost(session.log))
             session.planner.renew(session.settings.fade_s)
-            self._pilot.check_sight()
+            self._pilot.sight.check()
             if session.link:
                 limit = session.settings.throttle_limit
                 self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)
@@ -197,7 +194,7 @@ class Arming:
     def record_human(self, stop: threading.Event, over: Callable[[], str | None]) -> None:
         """After a takeover in a recorded drive, record the human. Raises nothing."""
         session = self._session
-        if not self._recorder or not session.link:
+        if not (self._recorder and session.link and self._armed):
             return
         self._driving.close()  # the host no longer drives: ordinary priority, and one plan per second
         recorder, log = self._recorder.recorder, session.log

@@ -232,8 +232,6 @@ class View:
                     line, _, picture = data.partition(b"\n")
                     head = json.loads(line)
                     phase = head["phase"]
-                    if shape := head.pop("shape", None):
-                        picture = _jpeg_of(picture, shape)
                     if drive is self._drives[-1]:
                         self.show(head, picture)
         finally:
@@ -319,14 +317,6 @@ def _digest_of(tag: bytes, html: bytes) -> str:
     part = re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S)
     assert part, "view.html has one of each"
     return f"sha256-{base64.b64encode(hashlib.sha256(part[1]).digest()).decode()}"
-
-
-def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
-    """Compress the raw BGR picture of a camera that delivers no JPEGs. Raises ValueError if it has another size."""
-    import numpy as np  # imported here because few cameras need it
-    import simplejpeg
-
-    return simplejpeg.encode_jpeg(np.frombuffer(picture, np.uint8).reshape(shape), 80, "BGR")
 
 
 async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:
