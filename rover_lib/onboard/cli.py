@@ -69,7 +69,6 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option("--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in your state folder]."),
     click.option("--json", "json_file", type=Output(appended=True), help="Write a summary to this file; - prints it."),
-    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
     click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )

@@ -24,7 +24,7 @@ from click.testing import CliRunner
 from needs import until
 
 from rover_lib.cli import main
-from rover_lib.onboard.car import camera, host
+from rover_lib.onboard.car import host
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import service as s
@@ -456,25 +456,6 @@ def test_no_car_is_armed_for_a_command_of_long_ago():
     """Loading a policy took 45 s, and the 30 s began after it."""
     with pytest.raises(s.RoverError):
         arms()
-
-
-def test_a_film_begins_when_the_car_is_armed(tmp_path, monkeypatch):
-    """Its pictures are due from then on, at the camera's rate, each once; not while arming waits."""
-    now, begun = [0.0], threading.Event()
-    monkeypatch.setattr(camera, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    closing = SimpleNamespace(wait=lambda seconds: now.__setitem__(0, now[0] + seconds))
-    for i in range(5):
-        (tmp_path / f"{i}.jpg").write_bytes(bytes([i]))
-    film, shown = camera._folder(tmp_path, 30, closing, begun), []
-
-    def arm():
-        shown.extend(next(film)[0][0] for _ in range(12))
-
-    session_of(link=None, camera=SimpleNamespace(begin=begun.set))._arm(SimpleNamespace(arm=arm), threading.Event(), "")
-    armed_s, due = now[0], [(picture[0], now[0]) for picture, _ in film]
-    assert shown == [0, 1, 2, 3, 4] * 2 + [0, 1] and [number for number, _ in due] == [0, 1, 2, 3, 4]
-    assert [at_s - due[0][1] for _, at_s in due] == pytest.approx([i / 30 for i in range(5)])
-    assert 0 <= due[0][1] - armed_s <= 1 / 30
 
 
 def lacking(steps):
