@@ -216,10 +216,11 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
 
     Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
-    from rover_lib.onboard.car.calibrate import measure, write_car
+    from rover_lib.onboard.car.calibrate import measure
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
+    from rover_lib.onboard.stage import atomic_path
 
     path = output or default_place()
     if path.exists() and not force:
@@ -236,7 +237,8 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
         with contextlib.suppress(LinkError):
             link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
-    write_car(car, path)
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml_of(car))
     notify(f"rover: written to {path}")
 
 

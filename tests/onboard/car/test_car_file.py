@@ -92,7 +92,7 @@ def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
         ("steering.neutral_us", 1250, "neutral_us must be from 1300 to 1700"),
         ("steering.right_us", 1300, "must be from 250"),
         ("steering.left_us", 2400, "must be from 800 to 2200"),
-        ("steering.period_us", 1900, "longer than its pulses"),
+        ("steering.period_us", 1900, "steering's period_us must be from 3000"),
         ("throttle.period_us", 2500, "throttle's period_us must be from 1000"),
         ("throttle.reverse_us", 700, "an end of throttle"),
         ("throttle.forward_us", 1550, "must be from 100"),
