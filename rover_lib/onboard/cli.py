@@ -268,7 +268,9 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
-def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_json: bool, **options: Any) -> None:
+def benchmark(
+    artifacts: tuple[Path, ...], threads: int, output: Path | None, gates: bool, as_json: bool, **options: Any
+) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
     from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
     from rover_lib.onboard.car.host import usable_cores
@@ -279,9 +281,9 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
 
     files = distinct_names(artifacts)
     contents = {name.removesuffix(path.suffix) + path.suffix: content_hash(path) for name, path in files.items()}
-    metrics = benchmark_artifacts(files, options["threads"] or usable_cores(), options)
+    metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if output:
-        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
+        write_stage(output, "benchmark", params={"threads": threads, **options}, metrics=metrics, inputs=contents)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:
