@@ -5,8 +5,6 @@ import copy
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rover_lib.onboard.car import car as module
 from rover_lib.onboard.car.car import Car, this_car, yaml_of
@@ -67,20 +65,6 @@ def test_each_side_of_neutral_has_its_own_span():
     assert car.focal_px == pytest.approx(268.5, abs=0.05)
     assert [car.pwm.throttle.moves(us) for us in (1490, 1496, 1500, 1504, 1510)] == [True, False, False, False, True]
     assert [Car().pwm.throttle.moves(us) for us in (0, 104, 120, 124, 125)] == [False] * 4 + [True]
-
-
-@given(st.floats(-1, 1), st.floats(-1, 1), st.booleans())
-def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
-    content = copy.deepcopy(CRAWLER)
-    if inverted:
-        content["steering"] |= {"left_us": 1100, "right_us": 2000}
-    pwm = Car.of(content).pwm
-    pulses = pwm.pulses(steering, throttle)
-    # A receiver's period may be a little longer or shorter; only the pulse counts for a servo.
-    actions = pwm.actions_from_pulses(pulses.steering_us, pulses.throttle_us, 19000, 22000)
-    assert pwm.pulses(-1, 0).steering_us == (2000 if inverted else 1100)
-    assert actions.steering == pytest.approx(steering, abs=0.6 / 400)
-    assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)
 
 
 @pytest.mark.parametrize(
