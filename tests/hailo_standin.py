@@ -46,7 +46,7 @@ class Stream:
 
 
 class InferModel:
-    """A network of one input on the chip: also what configure() and create_bindings() return of it, and its HEF."""
+    """A network of one input on the chip: also what configure() and create_bindings() return of it."""
 
     fails = False  # True: the chip no longer answers
 
@@ -54,12 +54,9 @@ class InferModel:
         if not hef.startswith(MAGIC):
             raise HailoRTException("Invalid HEF. See hailort.log for more information")
         about, _, model = hef.removeprefix(MAGIC).partition(b"\0")
-        self.about, self.hef = json.loads(about), self
+        self.about = json.loads(about)
         self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
         self.inputs, self.outputs = ([Stream(name, shape)] for name, shape, _ in self.about["streams"])
-
-    def get_original_names_from_vstream_name(self, name: str) -> list[str]:
-        return [original for stream, _, original in self.about["streams"] if stream == name]
 
     def input(self, name: str) -> Stream:
         return next(s for s in self.inputs if s.name == name)

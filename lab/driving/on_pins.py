@@ -58,7 +58,7 @@ class Drive(Child):
         self.prepared, self._marked = prepared, 0
         code = f"{IN_TERMINAL}{prepared}from rover_lib.onboard.cli import main; main()"
         devices = "--camera", bench.camera, "--port", bench.cable.port, "--view", bench.folder / "view"
-        options = "--film", "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
+        options = "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
         command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options)
         super().__init__("rover drive", *command, error=RoverError)
 

@@ -85,7 +85,7 @@ class Deployment:
         self.gates: list[dict[str, Any]] = []
         self.wrong: list[str] = []
         self.variables: dict[str, Any] = {f"rover_{name}": str(folder / name) for name in ("wheels", "fetched")}
-        self.variables |= {"rover_camera": CAMERA, "rover_film": True, "rover_port": PORT}
+        self.variables |= {"rover_camera": CAMERA, "rover_port": PORT}
         self.variables |= {"rover_hz": HZ, "rover_ready_s": READY_S}
 
     def gate(self, name: str, wanted: str, found: Any, holds: bool) -> None:

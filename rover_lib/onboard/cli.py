@@ -69,7 +69,6 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option("--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in your state folder]."),
     click.option("--json", "json_file", type=Output(appended=True), help="Write a summary to this file; - prints it."),
-    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
     click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
@@ -217,10 +216,11 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
 
     Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
-    from rover_lib.onboard.car.calibrate import measure, write_car
+    from rover_lib.onboard.car.calibrate import measure
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
+    from rover_lib.onboard.stage import atomic_path
 
     path = output or default_place()
     if path.exists() and not force:
@@ -237,7 +237,8 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
         with contextlib.suppress(LinkError):
             link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
-    write_car(car, path)
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml_of(car))
     notify(f"rover: written to {path}")
 
 
@@ -267,7 +268,9 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
 @click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
-def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_json: bool, **options: Any) -> None:
+def benchmark(
+    artifacts: tuple[Path, ...], threads: int, output: Path | None, gates: bool, as_json: bool, **options: Any
+) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
     from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
     from rover_lib.onboard.car.host import usable_cores
@@ -278,9 +281,9 @@ def benchmark(artifacts: tuple[Path, ...], output: Path | None, gates: bool, as_
 
     files = distinct_names(artifacts)
     contents = {name.removesuffix(path.suffix) + path.suffix: content_hash(path) for name, path in files.items()}
-    metrics = benchmark_artifacts(files, options["threads"] or usable_cores(), options)
+    metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if output:
-        write_stage(output, "benchmark", params=options, metrics=metrics, inputs=contents)
+        write_stage(output, "benchmark", params={"threads": threads, **options}, metrics=metrics, inputs=contents)
     if gates:
         metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:

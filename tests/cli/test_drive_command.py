@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from needs import real_time, until
 
-from balloon_world.car import VirtualCar
+from balloon_world.car import CameraFeed, VirtualCar
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
@@ -112,17 +112,19 @@ def test_a_page_shows_the_drive_and_its_button_ends_it(demo_run, tmp_path):
 
 @real_time
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
-    """A camera of some seconds, which torch may take to load, the car being another world's."""
+    """A camera that is unplugged, the car being another world's."""
     folder = fresh(tmp_path)
-    for i, picture in enumerate(pictures(0) * 14):
-        (folder / f"{i:05}.jpg").write_bytes(picture)
-    with VirtualCar() as car:
-        options = ["--film", "--camera", folder, "--port", car.port]
-        options += ["--log", folder / "l", "--json", folder / "j"]
-        done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+    with VirtualCar() as car, CameraFeed(folder / "camera", *pictures(0)) as feed:
+        options = ["--camera", folder / "camera", "--port", car.port, "--log", folder / "l", "--json", folder / "j"]
+        with subprocess.Popen([*ROVER, artifact, *map(str, options)], stderr=subprocess.PIPE, text=True) as process:
+            for line in process.stderr:
+                if line.strip() == "rover: armed":
+                    break
+            feed.close()
+            _, stderr = process.communicate(timeout=20)
         with ServoLink(car.port) as link:  # the car stands after it
             until(lambda: link.latest() and link.latest().throttle_us == 120)
-    assert done.returncode == 3 and "Traceback" not in done.stderr, done.stderr
+    assert process.returncode == 3 and "Traceback" not in stderr, stderr
     assert "unplugged" in json.loads((folder / "j").read_text())["ended"]
 
 

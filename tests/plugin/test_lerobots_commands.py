@@ -101,7 +101,7 @@ class LeRobot:
 
 
 def robot(port, folder, **more):
-    given = {"port": port, "camera": folder / "camera", "film": True, "width": 96, "height": 48} | more
+    given = {"port": port, "camera": folder / "camera", "width": 96, "height": 48} | more
     given |= {"log": folder / "flight.log", "calibration_dir": folder}
     return {"robot__type": "rover"} | {f"robot__{key}": value for key, value in given.items()}
 

@@ -75,8 +75,7 @@ def test_lerobot_makes_it_of_its_config(tmp_path):
 
 
 def test_what_cannot_be_opened_keeps_nothing_open(bench):
-    # Recorded pictures are no camera unless somebody says so.
-    for options, error in (({"film": False}, CameraError), ({"port": "/dev/none"}, LinkError)):
+    for options, error in (({"camera": "/dev/none"}, CameraError), ({"port": "/dev/none"}, LinkError)):
         with bench(**options) as on, pytest.raises(error):
             on.robot.connect()
         assert not on.robot.is_connected

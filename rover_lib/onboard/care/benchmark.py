@@ -26,7 +26,7 @@ from rover_lib.onboard.policy.confined import load_confined, run_confined
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
-MOST = 10**9  # rounds, threads or seconds: a limit that nobody meets
+MOST = 10**9  # rounds or seconds: a limit that nobody meets
 NOTED = ("latency_p50_ms", "latency_p95_ms", "latency_max_ms", "n")  # of a point in the time series
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 
@@ -106,14 +106,13 @@ class BenchmarkOptions:
     """How to time policies. Raises ParamsError for impossible values.
 
     warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
-    test with a time series. at_most_s: limits the time, but not to less than LEAST_ROUNDS. threads: of the engines; 0:
-    all cores; None: as they are. main: whose figures are at the top level (None: the first's). reference: what the
-    others' speed is compared with. memory_alone: measure each artifact's memory in a process of its own.
+    test with a time series. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures are at
+    the top level (None: the first's). reference: what the others' speed is compared with. memory_alone: measure each
+    artifact's memory in a process of its own.
     """
 
     warmup: int = 10
     iterations: int = 100
-    threads: int | None = None
     duration_s: float | None = None
     at_most_s: float | None = None
     main: str | None = None
@@ -121,7 +120,7 @@ class BenchmarkOptions:
     memory_alone: bool = False
 
     def __post_init__(self) -> None:
-        rules = {"warmup": whole(0, MOST), "iterations": whole(1, MOST), "threads": optional(whole(0, MOST))}
+        rules = {"warmup": whole(0, MOST), "iterations": whole(1, MOST)}
         rules |= dict.fromkeys(("duration_s", "at_most_s"), optional(number(0.001, MOST)))
         if broken := broken_rule(vars(self), rules):
             raise ParamsError(f"{broken[0]} of a benchmark must be {broken[1]}", found=broken[2])
@@ -151,8 +150,8 @@ def benchmark(
 ) -> dict[str, Any]:
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
-    policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path`, and `.threads` with
-    `set_threads` are used if it has them. frames: used in turn.
+    policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path` and `.threads` are used if
+    it has them. frames: used in turn.
 
     cpu_pct is processor time as a share of all cores that this process may use. temperature_c is the highest and
     clock_mhz the lowest reading. peak_memory_mb is the artifact's alone if it was measured, else None, and this
@@ -166,18 +165,12 @@ def benchmark(
         raise ParamsError(what, found=f"{len(frames)} frames and {names}")
     host = host or Host()
     cores = usable_cores()
-    threads_before = {name: policies[name].threads for name in names if hasattr(policies[name], "threads")}
-    if options.threads is not None:
-        _set_threads(policies, dict.fromkeys(threads_before, options.threads or cores))
-    try:
-        for name in names:
-            for i in range(options.warmup):
-                policies[name].predict_chunk(frames[i % len(frames)], state)
-        run = _Run(policies, frames, state, host, clocks)
-        run.measure(options, progress)
-        threads = getattr(policies[main], "threads", None)
-    finally:
-        _set_threads(policies, threads_before)
+    for name in names:
+        for i in range(options.warmup):
+            policies[name].predict_chunk(frames[i % len(frames)], state)
+    run = _Run(policies, frames, state, host, clocks)
+    run.measure(options, progress)
+    threads = getattr(policies[main], "threads", None)
 
     artifacts = {name: run.metrics_of(name, cores) for name in names}
     top = dict(artifacts[main])
@@ -205,12 +198,6 @@ def benchmark(
         paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
         _add_memory(metrics, paths, threads)
     return metrics
-
-
-def _set_threads(policies: Mapping[str, Any], threads: Mapping[str, int]) -> None:
-    for name, count in threads.items():
-        if policies[name].threads != count:
-            policies[name].set_threads(count)
 
 
 def _share_pct(cpu_s: float, wall_s: float, cores: int) -> float | None:

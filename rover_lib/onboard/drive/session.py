@@ -113,18 +113,13 @@ class Session:
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
         attempt = partial(self.attempt, arming)
-        if self.link and (self.service or self.terminal):
-            show = partial(self._show_waiting, said)
-            checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]
-            if self.service:
-                missing = partial(what_is_missing, self.link)
-                telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)
-            else:
-                telemetry = arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
-        else:
-            telemetry = attempt()
-        self.camera.begin()  # a film must start with the loop, not while arming waits
-        return telemetry
+        if not (self.link and (self.service or self.terminal)):
+            return attempt()
+        show = partial(self._show_waiting, said)
+        checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]
+        if self.service:
+            return self.service.wait_for_human(attempt, checks, partial(what_is_missing, self.link), said=said)
+        return arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
 
     def _show_waiting(self, said: str) -> None:
         asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway

@@ -10,7 +10,7 @@ import pytest
 from rover_lib.onboard.care.benchmark import BenchmarkOptions, Clocks, benchmark
 from rover_lib.onboard.care.limits import check_gates
 from rover_lib.onboard.care.lower_bound import floor_ms
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.errors import ParamsError
 
 FRAMES = [np.full((4, 4, 3), k, np.uint8) for k in range(3)]
 STATE = np.zeros(2, np.float32)
@@ -113,26 +113,6 @@ def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host)
     for took_ms, rounds in ((90, 56), (1000, 20)):
         policy = {"a": machine.policy("a", [took_ms])}
         assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
-
-
-def test_threads_are_set_and_restored(bare_host):
-    class Threaded:
-        threads, seen = 7, ()
-
-        def set_threads(self, threads):
-            self.threads = threads
-
-        def predict_chunk(self, frame, state):
-            self.seen = (*self.seen, self.threads)
-            if len(self.seen) == 2:
-                raise PolicyError("no")
-
-    policy, options = Threaded(), BenchmarkOptions(warmup=0, iterations=1, threads=0)
-    metrics = benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
-    assert policy.seen == (metrics["threads"],) == (metrics["cores"],)
-    with pytest.raises(PolicyError):
-        benchmark({"a": policy}, FRAMES, STATE, options, host=bare_host)
-    assert policy.threads == 7
 
 
 @pytest.mark.parametrize("bad", [{"policies": {}}, {"frames": []}, {"iterations": 0}, {"duration_s": math.nan}])

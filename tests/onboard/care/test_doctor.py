@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from pty_board import board_of
 
+from balloon_world.car import CameraFeed
 from rover_lib.cli import main
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car
@@ -251,11 +251,10 @@ def test_a_check_that_breaks_is_its_own_fail(tmp_path, monkeypatch):
 def test_a_rover_that_drives(tmp_path, artifacts, monkeypatch):
     monkeypatch.setattr(doctor, "SETTLE_S", 0.05)
     monkeypatch.setattr(doctor, "MEASURE_S", 0.1)
-    slope = np.tile(np.arange(160, dtype=np.uint8), (90, 1))
-    for k in range(60):
-        cv2.imwrite(str(tmp_path / f"{k:03d}.jpg"), np.roll(slope, k, 1))
-    with board_of(answer=talking("1460 21316 124 1016")) as board:
-        words = ["doctor", artifacts["static"], "--camera", tmp_path, "--port", board.port, "--json"]
+    slope = np.tile(np.arange(160, dtype=np.uint8)[:, None], (90, 1, 3))
+    camera = CameraFeed(tmp_path / "camera", *(np.roll(slope, k, 1) for k in range(60)))
+    with camera, board_of(answer=talking("1460 21316 124 1016")) as board:
+        words = ["doctor", artifacts["static"], "--camera", tmp_path / "camera", "--port", board.port, "--json"]
         result = CliRunner().invoke(main, list(map(str, words)))
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
