@@ -19,7 +19,7 @@ SECTIONS: dict[str, list[click.Command]] = {
     "Drive": [ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive.drive],
     "Look": [],
     "Teach": [],
-    "Recordings": [ROVERS["label"]],
+    "Recordings": [],
     "A rover's models, and arming it": [ROVERS["release"], ROVERS["arm-car"]],
 }
 for title in ("Teach", "Look", "Recordings"):

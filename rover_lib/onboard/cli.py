@@ -156,20 +156,6 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
     ctx.exit(1 if report.fault else 0)
 
 
-@main.command("label", short_help="Note whether recorded drives hit or missed.")
-@click.argument("episodes", type=PathTo("recordings"), nargs=-1, required=True, metavar="EPISODE [EPISODE]...")
-@click.argument("outcome", type=click.Choice(["hit", "missed", "none"]))
-def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
-    """Note in each EPISODE, a folder of one recorded drive, whether it hit or missed; `none` removes the note.
-
-    A drive that failed is kept: `rover inspect` counts outcomes, and `rover export-dataset` writes them.
-    """
-    from rover_lib.onboard.recording.outcome import label
-
-    label(episodes, outcome)
-    click.echo(f"{len(episodes)} labelled: {outcome}")
-
-
 @main.command(short_help="Check all that driving needs; say what to do.")
 @click.argument("artifact", type=ARTIFACT, required=False)
 @CAMERA

@@ -12,7 +12,6 @@ from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.recording.outcome import label
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
@@ -24,7 +23,6 @@ READERS = {
     "car.yml": read_car,
     "flight.log": read_log,
     "episode_data.json": lambda path: load_recordings(path.parent, 8),
-    "./episode_data.json": lambda path: label([path.parent], "hit"),
     "best_model.pth": load_checkpoint,
     "calibration.pt": Calibration.load,
     "manifest.json": lambda path: read_tub(path.parent, Car()),

@@ -1,1 +1,1 @@
-"""Recordings on the rover: write episodes, read them again, and note how a drive ended."""
+"""Recordings on the rover: write episodes, and read them again."""

@@ -41,7 +41,6 @@ FLAG_FIELDS = ("steering_measured", "throttle_measured")
 FRAME_FIELDS = ("frame_id", "timestamp", "image_path")
 # Who drove at a control: a policy; a human, whose pulses went to the servos; or nobody, and the car was in neutral.
 POLICY, HUMAN, NOBODY = DRIVERS = ("policy", "human", "nobody")
-HIT, MISSED = OUTCOMES = ("hit", "missed")  # whether a drive succeeded: metadata.outcome
 
 DATA = "episode_data.json"
 PART = ".part"  # how the name of the hidden folder ends

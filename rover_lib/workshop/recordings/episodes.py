@@ -35,7 +35,6 @@ from rover_lib.onboard.recording.episode import (
     DATA_BYTES,
     FRAME_FIELDS,
     NOBODY,
-    OUTCOMES,
     car_in,
     find_killed,
     number_of,
@@ -153,10 +152,6 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         return None
     (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
     metadata, label = content.get("metadata"), content.get("action_label")
-    outcome = metadata.get("outcome") if isinstance(metadata, dict) else None
-    if outcome is not None and outcome not in OUTCOMES:
-        faults.add(folder / DATA, "unknown_outcome", f"{quote(outcome)}: rover label says it anew")
-        outcome = None
     try:
         car = car_in(metadata, folder) if content else read_car_of(folder)  # which reads larger files
         controls, formulas = read_controls(source, control_rows, car.pwm, faults)
@@ -182,7 +177,6 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         controls=len(control_rows),
         samples=samples,
         files=tuple(p for name in EPISODE_FILES if (p := folder / name).is_file()),
-        outcome=outcome,
         formulas=formulas,
     )
 

@@ -169,8 +169,8 @@ def is_another_rate(found_hz: float | None, rate_hz: float) -> bool:
 class Episode:
     """One drive.
 
-    duration_s: from the first to the last frame. frames, controls: how many the recording lists. outcome: one of
-    OUTCOMES or None. formulas: by channel, that of its actions before they were recomputed from the pulses.
+    duration_s: from the first to the last frame. frames, controls: how many the recording lists.
+    formulas: by channel, that of its actions before they were recomputed from the pulses.
     """
 
     id: str
@@ -181,7 +181,6 @@ class Episode:
     controls: int
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # those that the numbers came from
-    outcome: str | None = None
     formulas: Mapping[str, Formula] = field(default_factory=dict)
     corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
 
@@ -248,7 +247,6 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
-            "outcomes": _counted(e.outcome or "not labelled" for e in self.episodes),
             "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),

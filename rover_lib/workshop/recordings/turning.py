@@ -1,15 +1,61 @@
-"""Which way the cars of recordings steer, episode by episode, and which pictures are mirrored."""
+"""Which way the cars of recordings steer, episode by episode, and which pictures are mirrored.
+
+Steering is correlated with the horizontal shift of the pictures' upper part between frames (optical flow), at the delay
+with the strongest correlation, which is judged as one of far fewer, independent frames (Bartlett's formula).
+"""
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
+import cv2
 import numpy as np
 
-from rover_lib.onboard.recording.turning import LEAST_SPREAD, SURE, Turning, measure_turning
+from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, pick_evenly
+
+WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
+STEP = 2  # frames from one examined picture to the next
+POINTS, WINDOW = 80, (11, 11)
+LEAST_POINTS = 8
+LONGEST_DELAY_S = 0.4
+SMOOTH = 5  # examined pictures
+LEAST_PAIRS = 25
+LEAST_SPREAD = 0.05  # standard deviation of steering, of full; with less, other motion decides the correlation
+SURE = 2.2  # standard errors from no correlation
+
+
+@dataclass(frozen=True)
+class Turning:
+    """correlation: of steering with the shift of the background to the right. sure: its standard errors from 0.
+
+    spread: the standard deviation of steering, a share of full.
+    """
+
+    episode: str
+    correlation: float | None
+    sure: float
+    spread: float
+
+    @property
+    def side(self) -> str | None:
+        """The side that positive steering turns to: "right" or "left"; None if too little shows it."""
+        if self.correlation is None or self.spread < LEAST_SPREAD or self.sure < SURE:
+            return None
+        return "right" if self.correlation < 0 else "left"
+
+    def words(self) -> str:
+        if self.spread < LEAST_SPREAD:
+            return f"{self.episode}: steers too little to tell which way (spread {self.spread:.2f} of {LEAST_SPREAD})"
+        if self.correlation is None:
+            return f"{self.episode}: too few pictures that move to tell which way it steers"
+        how = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
+        return f"{self.episode}: " + (f"positive steering is {self.side} ({how})" if self.side else f"not sure ({how})")
 
 
 @dataclass(frozen=True)
@@ -61,13 +107,88 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
     if layout.action_names != ACTION_NAMES or len(layout.cameras) > 1:
         return Sides(())
     episodes = pick_evenly(recordings.episodes, most or len(recordings.episodes))
-
-    def measure(e: Episode) -> Turning:
-        return measure_turning(e.id, np.array([s.chunk[0, 0] for s in e.samples], float), e.samples)
-
     # OpenCV releases the interpreter's lock, so threads help.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        turnings = tuple(progress(pool.map(measure, episodes), desc="which way it steers", total=len(episodes)))
+        turnings = tuple(progress(pool.map(measure_turning, episodes), desc="which way it steers", total=len(episodes)))
     said = {s.car.positive for e in episodes for s in e.samples}
     # A LeRobotDataset, which states its rate, has no car's file.
     return Sides(turnings, said.pop() if len(said) == 1 and layout.rate_hz is None else None)
+
+
+def measure_turning(episode: Episode) -> Turning:
+    """Measure one drive of one camera."""
+    samples = episode.samples
+    steering = np.array([s.chunk[0, 0] for s in samples], float)
+    spread = float(steering.std()) if len(steering) else 0.0
+    nothing = Turning(episode.id, None, 0.0, spread)
+    if spread < LEAST_SPREAD / 2:
+        return nothing  # and no picture has to be read
+    try:
+        times_s, shifts = _shifts(samples)
+    except EpisodeError:
+        return nothing
+    if len(shifts) < LEAST_PAIRS:
+        return nothing
+    every_s = np.array([s.time_s for s in samples])
+    best = nothing
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7):
+        steered = np.interp(times_s - delay_s, every_s, steering)
+        found = _correlation(_smooth(steered), _smooth(shifts))
+        if found and found[1] > best.sure:
+            best = Turning(episode.id, found[0], found[1], spread)
+    return best
+
+
+def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
+    """Return when two pictures were compared, in seconds, and how fast the background moved right, in pixels/s."""
+    chosen = list(samples[::STEP])
+    times_s, shifts = [], []
+    before = None
+    for first, second in pairwise(chosen):
+        if second.row - first.row != STEP:
+            before = None
+            continue
+        before = _grey(first) if before is None else before
+        after = _grey(second)
+        shift = _shift(before, after)
+        before = after
+        if shift is not None:
+            times_s.append((first.time_s + second.time_s) / 2)
+            shifts.append(shift / (second.time_s - first.time_s))
+    return np.array(times_s), np.array(shifts)
+
+
+def _grey(sample: Sample) -> np.ndarray:
+    frame = sample.frame_bgr()
+    height = round(WIDTH * frame.shape[0] / frame.shape[1])
+    small = cv2.resize(frame, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+
+
+def _shift(before: np.ndarray, after: np.ndarray) -> float | None:
+    points = cv2.goodFeaturesToTrack(before[: round(UPPER * len(before))], POINTS, 0.01, 3)
+    if points is None:
+        return None
+    flow: Any = cv2.calcOpticalFlowPyrLK  # OpenCV's types do not know that it finds where to begin
+    there, seen, _ = flow(before, after, points, None, winSize=WINDOW, maxLevel=3)
+    back, again, _ = flow(after, before, there, None, winSize=WINDOW, maxLevel=3)
+    good = (seen[:, 0] == 1) & (again[:, 0] == 1) & (np.abs(back - points).max((1, 2)) < 0.5)
+    return float(np.median((there - points)[good, 0, 0])) if good.sum() >= LEAST_POINTS else None
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    kernel = np.ones(SMOOTH)
+    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+
+
+def _correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
+    """Return the correlation of two series, and how many standard errors it is from 0; None if one does not vary."""
+    x, y = x - x.mean(), y - y.mean()
+    n, norm = len(x), math.sqrt((x @ x) * (y @ y))
+    if norm < 1e-9:
+        return None
+    r = float(x @ y) / norm
+    lags = range(1, n // 2)
+    together = sum((1 - k / n) * (x[k:] @ x[:-k]) * (y[k:] @ y[:-k]) for k in lags) / norm**2
+    independent = min(max(n / max(1 + 2 * together, 1), 4), n)
+    return r, math.atanh(min(abs(r), 0.999)) * math.sqrt(independent - 3)

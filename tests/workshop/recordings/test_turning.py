@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from recorded import pass_a_wall, real_recordings
 
-from rover_lib.onboard.recording.turning import LEAST_SPREAD
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
-from rover_lib.workshop.recordings.turning import measure_sides
+from rover_lib.workshop.recordings.turning import LEAST_SPREAD, measure_sides
 
 
 @dataclass(frozen=True, eq=False)
