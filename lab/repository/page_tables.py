@@ -77,11 +77,11 @@ def _demo(root: Path) -> list[Row]:
 
     def row(mode: str) -> Row:
         found = modes[mode]
-        errors = [_of(found, f"{action}_mae_pct", ".2f") for action in ("steering", "throttle")]
+        errors = [f"{found[f'{action}_mae_pct']:.2f}" for action in ("steering", "throttle") if mode != "fp32"]
         hits = f"{found['hits']} of {found['trials']}"
         faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
-        fields = (_of(found, "size_mb", ".1f"), hits, " / ".join(filter(None, errors)), faster)
-        return EXPLAINED[mode], *(f"**{field}**" if field and mode == BEST else field or "" for field in fields)
+        fields = (f"{found['size_mb']:.1f}", hits, " / ".join(errors), faster)
+        return EXPLAINED[mode], *(f"**{field}**" if mode == BEST else field for field in fields)
 
     return [("", "MB", "balloons hit", "error, %", "times faster"), *(row(mode) for mode in EXPLAINED if mode in modes)]
 
@@ -184,11 +184,6 @@ def _metrics(folder: Path, stage: str) -> dict[str, Any]:
     """A stage's metrics. Raises RoverError if it is not there."""
     path = next(folder.glob(f"{stage}.json"), folder / f"{stage}.json")
     return read_stage(path, stage.removesuffix("-*"))["metrics"]
-
-
-def _of(values: Mapping[str, Any], key: str, form: str) -> str | None:
-    value = values.get(key)
-    return None if value is None else format(value, form)
 
 
 if __name__ == "__main__":

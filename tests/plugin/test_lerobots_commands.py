@@ -23,7 +23,7 @@ import pytest
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.pins import HUMAN, STOPPED, Gates, Observation, judge
+from lab.driving.pins import HUMAN, STOPPED, Observation, judge, most_throttle_us
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from lerobot_robot_rover.line import ENDING
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
@@ -32,7 +32,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-GATES = Gates.of_params()
 START_S = 150.0  # LeRobot imports for 5 s, or 20 on a busy machine
 STICKS = ((1600.0, 150.0), (1300.0, 173.0), (1480.0, 140.0), (1750.0, 160.0))  # within what the host may ask for, too
 
@@ -241,11 +240,11 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
             throttle()  # all that came since
             seen = Observation(events, [], at_s, at_s + 1.0)
             expected, human_us = (HUMAN, (1700, REST_US[1])) if happens == "human" else (STOPPED, REST_US)
-            verdict = judge(expected, seen, GATES, human_us=human_us)
-            if verdict.wrong and seen.stalled_ms():
-                raise needs.Late(f"the emulated Arduino had no time: {verdict.wrong}")
-            assert verdict.wrong == []
-            print(f"{happens}: {verdict.figures}")
+            figures, wrong = judge(expected, seen, human_us=human_us)
+            if wrong and seen.stalled_ms():
+                raise needs.Late(f"the emulated Arduino had no time: {wrong}")
+            assert wrong == []
+            print(f"{happens}: {figures}")
             if happens == "SIGSTOP":  # in the middle of a turn, or between two of them
                 record.process.send_signal(signal.SIGCONT)
                 needs.until(lambda: record.process.poll() is not None or record.waits_for_a_human(), 30)
@@ -253,7 +252,7 @@ def test_however_it_ends_the_car_is_stopped_or_the_humans(happens, eyes, artifac
             status = record.ended()
             throttle()
             time.sleep(0.5)
-            assert 0 < throttle() <= GATES.throttle_max_us  # nothing drives it again
+            assert 0 < throttle() <= most_throttle_us()  # nothing drives it again
     # lerobot-rollout takes a first Ctrl-C for the wish to end in order
     assert (status == 0) == (happens == "SIGINT" and bool(ENDING))
     assert happens != "human" or "DriveFault" in record.text

@@ -16,7 +16,7 @@ from needs import real_time, simavr, until
 
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.pins import STOPPED, Gates, Observation, judge
+from lab.driving.pins import STOPPED, Observation, judge
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
 from lerobot_robot_rover.line import FEATURES, named
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -253,7 +253,8 @@ def test_a_hung_loop_leaves_a_stopped_car(bench):
         events += board.pulses()
         on.robot.disconnect()
     seen = Observation(events, [], at_s, at_s + HUNG_S)
-    if (wrong := judge(STOPPED, seen, Gates.of_params()).wrong) and seen.stalled_ms():
+    _, wrong = judge(STOPPED, seen)
+    if wrong and seen.stalled_ms():
         raise needs.Late(f"the emulated Arduino had no time: {wrong}")
     assert wrong == []
 
