@@ -2,7 +2,6 @@
 
 What our reader repairs is repaired in the dataset. Where a frame must be left out, the episode ends and another begins.
 If a policy drove in one of the recordings, `intervention` says where a human had taken over, as in `lerobot-rollout`.
-If every recording was labelled, the last frame of an episode has LeRobot's `next.success`, `next.reward`, `next.done`.
 """
 
 import json
@@ -20,7 +19,7 @@ from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.recording.episode import HIT, HUMAN, NOBODY, POLICY
+from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded_as
@@ -30,7 +29,6 @@ from rover_lib.workshop.recordings.samples import ACTION_NAMES, CAMERA, LEAST_RA
 from rover_lib.workshop.recordings.turning import measure_sides
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
-SUCCESS, REWARD, DONE = "next.success", "next.reward", "next.done"
 SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
 SHORTEST = 2  # rows in the shortest episode: a single row has no spread to normalise by
 
@@ -127,11 +125,11 @@ def _write(
     episodes = recordings.episodes
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
-    by_policy, labelled = any(e.by_policy for e in episodes), all(e.outcome for e in episodes)
+    by_policy = any(e.by_policy for e in episodes)
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=rate_hz,
-        features=_features(shape, video, by_policy, labelled),
+        features=_features(shape, video, by_policy),
         root=root,
         robot_type="rover",
         use_videos=video,
@@ -149,7 +147,7 @@ def _write(
                         left_out["too_short"] += len(rows)
                         continue
                     for sample, frame in rows:
-                        row = _row(episode, sample, frame, last=sample is rows[-1][0])
+                        row = _row(episode, sample, frame)
                         dataset.add_frame({k: v for k, v in row.items() if k in dataset.features or k == "task"})
                     dataset.save_episode()
                     written.append((episode, rows[0][0].row, len(rows)))
@@ -173,33 +171,25 @@ def _write(
         "faults_while_reading": [asdict(fault) for fault in recordings.faults],
         "episodes_are": [f"{episode.id} from frame {first}" for episode, first, _ in written],
         DRIVEN_BY: [POLICY if episode.by_policy else HUMAN for episode, _, _ in written],
-        "outcomes": [episode.outcome for episode, _, _ in written],
     }
 
 
-def _features(shape: tuple[int, ...], video: bool, by_policy: bool, labelled: bool) -> dict[str, Any]:
+def _features(shape: tuple[int, ...], video: bool, by_policy: bool) -> dict[str, Any]:
     """Return the dataset's columns, as LeRobot's own commands declare them."""
     picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
-    yes_or_no = {"dtype": "bool", "shape": (1,), "names": None}
     features = {f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers}
     if by_policy:
-        features[INTERVENTION] = yes_or_no
-    if labelled:
-        features |= {REWARD: yes_or_no | {"dtype": "float32"}, DONE: yes_or_no, SUCCESS: yes_or_no}
+        features[INTERVENTION] = {"dtype": "bool", "shape": (1,), "names": None}
     return features
 
 
-def _row(episode: Episode, sample: Sample, frame: np.ndarray, last: bool) -> dict[str, Any]:
-    """Return one frame's values of all columns that a dataset can have. last: whether its episode ends with it."""
-    hit = last and episode.outcome == HIT
+def _row(episode: Episode, sample: Sample, frame: np.ndarray) -> dict[str, Any]:
+    """Return one frame's values of all columns that a dataset can have."""
     return {
         f"{CAMERA}{NAME}": frame,
         STATE: sample.state,
         ACTION: sample.chunk[0],
         INTERVENTION: np.array([sample.driver == HUMAN and episode.by_policy]),
-        REWARD: np.array([hit], np.float32),
-        DONE: np.array([last]),
-        SUCCESS: np.array([hit]),
         "task": episode.label or "drive",
     }

@@ -163,7 +163,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
 def label_episodes(episodes: tuple[Path, ...], outcome: str) -> None:
     """Note in each EPISODE, a folder of one recorded drive, whether it hit or missed; `none` removes the note.
 
-    A drive that failed is kept: `rover inspect` counts outcomes, and `rover export-dataset` writes them.
+    A drive that failed is kept: `rover inspect` counts outcomes.
     """
     from rover_lib.onboard.recording.outcome import label
 

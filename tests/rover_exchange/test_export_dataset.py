@@ -16,7 +16,6 @@ from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
-from rover_lib.onboard.recording.outcome import label
 from rover_lib.workshop.recordings.samples import car_of
 
 CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
@@ -61,7 +60,7 @@ def test_lerobot_reads_it_back_edits_it_and_so_do_we(recorded, tmp_path):
     assert (report["episodes"], report["frames"], report["frames_a_second"]) == (3, 60, 30)
     theirs = theirs_of(tmp_path / "out")
     assert theirs.meta.robot_type == "rover" and theirs.num_episodes == 3
-    assert not [name for name in theirs.meta.features if name.startswith("next.") or name == "intervention"]
+    assert "intervention" not in theirs.meta.features
     for sample, item in zip(original.samples, theirs, strict=True):
         assert np.array_equal(item["observation.state"].numpy(), sample.state)
         assert np.array_equal(item["action"].numpy(), sample.chunk[0])
@@ -131,7 +130,7 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     assert np.array_equal([s.frame_bgr() for s in load(tmp_path / "out").samples], expected)
 
 
-# ---- who drove, and with what outcome
+# ---- who drove
 
 
 def driven(folder, *spans):
@@ -192,19 +191,6 @@ def test_a_report_of_another_dataset_is_not_used_and_said(mixed, tmp_path, chang
     again = load(tmp_path / "out")
     assert [f.kind for f in again.faults] == ["another_export"]
     assert {s.driver for s in again.episodes[0].samples} == {"policy"}
-
-
-def test_outcomes_are_lerobots_where_all_are_known(mixed, tmp_path):
-    folders = sorted(mixed.iterdir())
-    label(folders[:2], "hit")
-    assert export_dataset(mixed, tmp_path / "some")["outcomes"] == ["hit", "hit", None, None]
-    label(folders[2:], "missed")
-    export_dataset(mixed, tmp_path / "all")
-    theirs = theirs_of(tmp_path / "all")
-    ends = np.cumsum([e["length"] for e in theirs.meta.episodes]) - 1
-    for i, item in enumerate(theirs):
-        found = [item[f"next.{name}"].item() for name in ("done", "success", "reward")]
-        assert found == [i in ends, i in ends[:2], float(i in ends[:2])]
 
 
 # ---- whose car

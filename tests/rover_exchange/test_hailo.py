@@ -6,6 +6,7 @@ That such artifacts compute what the policy does is seen in tests/onboard/policy
 import json
 import shutil
 import zipfile
+from types import SimpleNamespace
 
 import hailo_standin
 import numpy as np
@@ -29,8 +30,7 @@ def test_the_network_has_fixed_shapes_of_few_ranks(tiny):
         sizes = [d.dim_value for d in value.type.tensor_type.shape.dim]
         assert all(sizes) and len(sizes) <= 4, value.name
     onnx.checker.check_model(network.model, full_check=True)
-    (end,) = (node.op_type for node in network.model.graph.node if node.name in network.outputs.values())
-    assert end == "Conv"
+    assert [node.op_type for node in network.model.graph.node if node.name == network.end] == ["Conv"]
 
 
 def test_a_kit_is_packed_with_what_was_recorded(hailo_kit, tiny, tmp_path):
@@ -46,12 +46,14 @@ def test_a_kit_is_packed_with_what_was_recorded(hailo_kit, tiny, tmp_path):
     assert set(manifest["parity"]["tolerance"].values()) == {2.5e-4}  # of what this kit's INT8 may be off
 
 
-def test_too_few_frames_or_a_folder_that_exists_or_a_failure_leave_nothing(tiny, tmp_path):
+def test_what_makes_no_kit_leaves_nothing(tiny, tmp_path):
+    """Too few frames; no run; two cameras; a folder that is there."""
     loaded = opened(normalised(tiny))
-    with pytest.raises(ArtifactError, match="1024 frames"):
-        kits.write_kit(loaded, tmp_path, tmp_path / "kit")
+    for samples in (1024, FRAMES):
+        with pytest.raises(ArtifactError):
+            kits.write_kit(loaded, tmp_path / "no run", tmp_path / "kit", samples=samples)
     with pytest.raises(ArtifactError):
-        kits.write_kit(loaded, tmp_path / "no run", tmp_path / "kit", samples=FRAMES)
+        networks(SimpleNamespace(config=SimpleNamespace(sees_state=True, cameras=("left", "right"))))
     assert not list(tmp_path.iterdir())
     (tmp_path / "link").symlink_to("gone")  # onto which no folder can be moved
     with pytest.raises(ArtifactError, match="exists"):
