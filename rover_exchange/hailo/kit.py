@@ -89,11 +89,7 @@ def _describe(policy: ACT, network: Network) -> dict[str, Any]:
     return {
         # Weights that are not on the chip stay in float.
         "weights_mb": sum(n if block in on_chip else 4 * n for block, n in parameters.items()) / 1e6,
-        "hailo": {
-            "network": NAME,
-            "outputs": {network.features: features},
-            "original_names": {network.features: network.end},
-        },
+        "hailo": {"network": NAME, "outputs": {network.features: features}},
     }
 
 
