@@ -70,10 +70,12 @@ def _line(fields: Row) -> str:
 
 
 def _demo(root: Path) -> list[Row]:
-    """The demo's policy, a row for each mode."""
+    """The demo's policy, a row for each mode; a mixed one without blocks in float is static."""
     compared = _metrics(root / "results" / "demo", "compare")
     timed = _metrics(root / "results" / "demo", "benchmark-*")["artifacts"]
     modes = {"fp32": compared["fp32"]} | compared["modes"]
+    if not _metrics(root / "results" / "demo", "quantize")["modes"].get("mixed", {}).get("float_blocks"):
+        modes.pop("mixed", None)
 
     def row(mode: str) -> Row:
         found = modes[mode]

@@ -78,7 +78,7 @@ drive_options = with_options(  # on the rover and in the balloon world
 @drive_options
 @click.pass_context
 def drive(ctx: click.Context, **options: Any) -> None:
-    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
+    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it after a fault.
 
     Exit codes: 0 ended as asked (--ticks, --max-seconds, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could not begin;
     2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with --service, which
