@@ -18,7 +18,7 @@ PHRASES = {  # what people call the parts of a gate's name
     "of_spread_pct": "error, % of how much the plans vary",
     "mae_pct": "error, % of the recorded range",
     "accuracy_loss_pct": "largest error, % of the recorded range, as the original promised",
-    "hits lost": "balloons missed that FP32 hits",
+    "hits lost, p": "chance that a policy as good as FP32 loses as many balloons to it",
     "hits": "balloons hit",
     "simd_g": "SIMD instructions, 10^9",
     "instructions_g": "instructions, 10^9",

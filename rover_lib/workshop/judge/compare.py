@@ -28,6 +28,7 @@ from rover_lib.workshop.act import Affine
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge import recorded_range as judge
+from rover_lib.workshop.judge.pairs import compare_pairs
 from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
@@ -255,6 +256,10 @@ def metrics(
     fp32, modes = own.pop("fp32"), {}
     for mode, found in own.items():
         modes[mode] = found | report.summary(mode) | {"size_ratio": fp32["size_mb"] / found["size_mb"]}
+        modes[mode]["pairs"] = None
+        if trials and mode in trials:  # the same worlds as FP32, in the same order
+            hits = ([drive.hit for drive in trials[each].per_world] for each in ("fp32", mode))
+            modes[mode]["pairs"] = compare_pairs(*hits)
     worst = []
     for w in (w for mode in report.chunks for w in report.worst(mode)):
         at = {"episode": getattr(w.sample, "episode", None), "frame": getattr(w.sample, "frame_name", None)}
@@ -289,13 +294,14 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     size_mb = judged["size_mb"]
     errors = [key for key in judged if key.endswith("_mae_pct")]
     spreads = [key for key in judged if key.endswith("_of_spread_pct") and judged[key] is not None]
-    lost = None if fp32["hits"] is None or judged["hits"] is None else fp32["hits"] - judged["hits"]
+    pairs = judged.get("pairs")
+    p = pairs and (pairs["p"] if pairs["only_first"] > pairs["only_second"] else 1.0)
     loss = judge.worst(judged[key] for key in errors)
     return [
         *(gate(f"{mode} {key}", judged[key], "<=", limits[key]) for key in errors if key in limits),
         *(gate(f"{mode} {key}", judged[key], "<=", limits["of_spread_pct"]) for key in spreads),
         gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
-        gate(f"{mode} hits lost", lost, "<=", limits["hits_lost"]),
+        gate(f"{mode} hits lost, p", p, ">=", limits["hits_lost_p"]),
         gate(f"{mode} size_mb", size_mb, "<=", limits["size_full_mb"]),
         gate(f"{mode} model_size_mb", size_mb, "<=", original["model_size_mb"]),
         gate(f"{mode} accuracy_loss_pct", loss, "<=", original["accuracy_loss_pct"]),

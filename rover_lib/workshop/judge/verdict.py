@@ -18,6 +18,7 @@ from rover_lib.workshop.judge import advice
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.advice import CALLED, Names, Stages, count, error_pct, gate_in_words
 from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates, hits_needed
+from rover_lib.workshop.judge.pairs import pairs_in_words
 
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
@@ -87,6 +88,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in found.items() if k.endswith("_mae_pct")},
             "hits": found["hits"],
             "trials": found["trials"],
+            "pairs": found.get("pairs"),
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
             "missed_gates": [] if mode == "fp32" else _list_missed(compared, params["gates"], mode),
         }
@@ -191,6 +193,8 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     lines = [f"It keeps every gate{differs}."]
     if best["trials"]:
         lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
+    if best["pairs"]:
+        lines.append(pairs_in_words(best["pairs"], best["trials"]))
     size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
     if best["instructions_g"] and fp32["instructions_g"]:
         size += f", and {fp32['instructions_g'] / best['instructions_g']:.1f} times fewer instructions ({COUNTED})"

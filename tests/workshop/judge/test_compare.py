@@ -18,7 +18,7 @@ from rover_lib.workshop.plots.style import Note
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
 LIMITS = {
-    "steering_mae_pct": 1.0, "throttle_mae_pct": 1.0, "of_spread_pct": 5.0, "hits_lost": 2, "fp32_hits": 36,
+    "steering_mae_pct": 1.0, "throttle_mae_pct": 1.0, "of_spread_pct": 5.0, "hits_lost_p": 0.1, "fp32_hits": 36,
     "size_full_mb": 70, "original": {"model_size_mb": 100, "accuracy_loss_pct": 5},
 }  # fmt: skip
 
@@ -140,7 +140,7 @@ def test_figures_leave_out_what_is_not_judged(still):
     for figure in (error, plots.worst_frames(report, count=1)):
         figure.draw_without_rendering()
     rows = {r["gate"]: r["passed"] for r in compare.gates(metrics, LIMITS)}
-    assert rows["static throttle_mae_pct"] is rows["fp32 hits"] is rows["static hits lost"] is None  # nor driven
+    assert rows["static throttle_mae_pct"] is rows["fp32 hits"] is rows["static hits lost, p"] is None  # nor driven
     steering, throttle = (ax for ax in error.axes if ax.get_title())
     assert steering.get_lines() and not throttle.get_lines() and len(throttle.texts) == 1
     nothing = replace(report, action_range={"steering": (0.1, 0.1), "throttle": (0.0, 0.0)})
@@ -174,7 +174,13 @@ def policies(tmp_path):
 
 
 def test_metrics_have_the_promised_keys(report, policies):
-    trials = {m: SimpleNamespace(hits=h, trials=40, wilson=(0.8, 1.0)) for m, h in (("fp32", 40), ("static", 39))}
+    drives = [SimpleNamespace(hit=True)] * 39
+    trials = {
+        mode: SimpleNamespace(
+            hits=39 + last, trials=40, wilson=(0.8, 1.0), per_world=[*drives, SimpleNamespace(hit=last)]
+        )
+        for mode, last in (("fp32", True), ("static", False))
+    }
     found = compare.metrics(report, policies, trials)
     assert {"hits": 40, "trials": 40, "size_mb": 4.0}.items() <= found["fp32"].items()
     static = found["modes"]["static"]
@@ -183,8 +189,11 @@ def test_metrics_have_the_promised_keys(report, policies):
     assert found["padded_steps_pct"] == pytest.approx(100 / 3)
 
 
+PAIRS = {"only_first": 2, "only_second": 0, "p": 0.5}
+
+
 def metrics_of(**changed):
-    static = {"steering_mae_pct": 0.3, "throttle_mae_pct": 0.7, "hits": 38, "size_mb": 66.4} | changed
+    static = {"steering_mae_pct": 0.3, "throttle_mae_pct": 0.7, "pairs": PAIRS, "size_mb": 66.4} | changed
     return {"fp32": {"hits": 40}, "modes": {"static": static}}
 
 
@@ -195,7 +204,8 @@ def metrics_of(**changed):
         ({"throttle_mae_pct": 1.01}, {"static throttle_mae_pct"}),
         ({"throttle_mae_pct": 1.0}, set()),  # exact at the limit
         ({"steering_mae_pct": 5.5}, {"static steering_mae_pct", "static accuracy_loss_pct"}),
-        ({"hits": 37}, {"static hits lost"}),
+        ({"pairs": PAIRS | {"only_first": 5, "p": 0.0625}}, {"static hits lost, p"}),
+        ({"pairs": PAIRS | {"only_second": 9, "p": 0.004}}, set()),  # it is better
         ({"size_mb": 266.0}, {"static size_mb", "static model_size_mb"}),
     ],
 )
