@@ -86,7 +86,7 @@ async def watch_and_stop(url: str) -> list[dict]:
 
 
 @real_time
-def test_a_page_shows_the_drive_and_its_button_ends_it(demo_run, tmp_path):
+def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
     pytest.importorskip("aiohttp", reason="needs the extra view")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
