@@ -258,14 +258,15 @@ def benchmark(
     artifacts: tuple[Path, ...], threads: int, output: Path | None, gates: bool, as_json: bool, **options: Any
 ) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
-    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
+    from rover_lib.onboard.artifact.manifest import content_hash
     from rover_lib.onboard.car.host import usable_cores
     from rover_lib.onboard.care.benchmark import benchmark_artifacts
     from rover_lib.onboard.care.limits import check_gates
     from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import write_stage
 
-    files = distinct_names(artifacts)
+    stems = [path.stem for path in artifacts]
+    files = {path.stem if stems.count(path.stem) == 1 else str(path): path for path in artifacts}
     contents = {name.removesuffix(path.suffix) + path.suffix: content_hash(path) for name, path in files.items()}
     metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if output:
