@@ -87,7 +87,6 @@ def examine(
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(dev):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device)
-        checks["cameras"] = lambda: cameras(dev)
     checks |= {
         "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
         "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev / "none"))),
@@ -121,14 +120,6 @@ def access(name: str, device: Path) -> Iterator[Check]:
         yield Check(name, "ok", f"{user} may use {device}")
     else:
         yield Check(name, "fail", f"{user} may not use {device}, of group {group}", remedy)
-
-
-def cameras(dev: Path = Path("/dev")) -> Iterator[Check]:
-    """Name each USB camera and the node that gives its pictures, as udev does."""
-    links = sorted((dev / "v4l" / "by-id").glob("*-video-index0"))
-    found = "; ".join(f"{link.resolve()}: {link.name.removesuffix('-video-index0')}" for link in links)
-    remedy = "plug it in; dmesg | tail says whether the kernel saw it"
-    yield warn_unless(bool(links), "cameras", found or "no USB camera", remedy)
 
 
 def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:

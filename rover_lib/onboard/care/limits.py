@@ -33,13 +33,12 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
 def _passes(gate: str, value: Any, limit: Any) -> bool | None:
     if isinstance(limit, str):
         return None if value is None else bool(value == limit)
-    is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
-    ends = list(limit) if is_range else [limit]
-    if not all(map(is_number, ends)) or ends != sorted(ends):
+    ends = limit if isinstance(limit, list) else [limit]
+    if not all(map(is_number, ends)) or len(ends) not in (1, 2) or ends != sorted(ends):
         what = f"gate {gate} must be a number, [low, high] or a text"
         raise ParamsError(what, found=repr(limit), remedy="see params.yml")
     if value is None:
         return None
     if gate in HIGHER_IS_BETTER:
         return bool(value >= ends[0])
-    return bool(value <= ends[1] if is_range else value < ends[0])
+    return bool(value <= ends[-1] if len(ends) == 2 else value < ends[0])

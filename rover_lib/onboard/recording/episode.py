@@ -52,7 +52,6 @@ LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers st
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
 BURST_SHARE = 0.3  # two controls that arrive within this share of the usual interval had waited in a buffer
 BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter than a frame, and left as they are
-SIMULATED = "playground"  # the port of the balloon world's Arduino
 
 
 @dataclass(frozen=True)
@@ -479,13 +478,8 @@ def read_car_of(folder: Path | str) -> Car:
 
 def car_in(metadata: Any, folder: Path | str) -> Car:
     """Return the car that an episode's metadata describe, or the default. Raises CarError for no car."""
-    if not isinstance(metadata, dict):
-        return Car()
-    described, said = metadata.get("car"), metadata.get("steering_positive")
-    before = metadata.get("arduino_port") == SIMULATED and said is None
-    car = Car() if described is None else Car.of(described, f"{folder}: its car")
-    # In the balloon world the default car turned left until recordings said which side is positive.
-    return replace(car, positive="left") if before and car.drives_like(Car()) else car
+    described = metadata.get("car") if isinstance(metadata, dict) else None
+    return Car() if described is None else Car.of(described, f"{folder}: its car")
 
 
 def _data_of(path: Path) -> bytes:

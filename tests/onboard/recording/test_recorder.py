@@ -2,13 +2,11 @@
 
 import json
 import os
-import pty
 import signal
 import subprocess
 import sys
 import threading
 import time
-import tty
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,10 +14,11 @@ import cv2
 import numpy as np
 import pytest
 from needs import until
+from pty_board import board_of
 
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry, frame
+from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import recorder as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
@@ -281,30 +280,22 @@ def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, virtual, monkeypatch
 
 @pytest.fixture
 def arduino():
-    """The port of a pty that talks as the firmware does, every 20 ms, and had been talking before anyone listened."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
+    """The port of a board that says a status every 20 ms, and had been saying them before anyone listened."""
     done = threading.Event()
 
-    def status(n):
-        return frame(f"<S 7 {20 * n} 0 - M r - 1456 120 238 {1456 + n % 50 * 4} 21316 {120 + n % 5 * 4} 1016 0 0 0 0")
+    def talk(board):
+        for n in range(100_000):
+            pulses = f"{1456 + n % 50 * 4} 21316 {120 + n % 5 * 4} 1016"
+            board.say(f"<S 7 {20 * n} 0 - M r - 1456 120 238 {pulses} 0 0 0 0")
+            if n >= 40 and done.wait(0.02):
+                return
 
-    def run():
-        os.write(master, b"".join(status(n) for n in range(40)))  # what waits in the buffer
-        for n in range(40, 100_000):
-            if done.wait(0.02):
-                break
-            if n % 25 == 15:
-                os.write(master, frame(f"<H 4 4.2.0 7 0 e {Car().id}"))
-            os.write(master, status(n))
-        os.close(master)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    yield os.ttyname(slave)
-    done.set()
-    thread.join()
-    os.close(slave)
+    with board_of() as board:
+        talking = threading.Thread(target=talk, args=[board])
+        talking.start()
+        yield board.port
+        done.set()
+        talking.join()
 
 
 @pytest.mark.slow
