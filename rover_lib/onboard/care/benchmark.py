@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
-from rover_lib.onboard.care.lower_bound import floor_ms
+from rover_lib.onboard.car.host import Host, usable_cores
+from rover_lib.onboard.care.pi5 import floor_ms
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.policy.confined import load_confined, run_confined
 
@@ -51,7 +51,6 @@ def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mappin
     """
     metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
     metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
-    metrics["throttled_means"] = throttled_means(metrics["throttled"])
     _add_memory(metrics, paths, threads)
     return metrics
 
@@ -93,10 +92,6 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     }
 
 
-def _silent(items: Iterable, **_: object) -> Iterable:
-    return items
-
-
 def benchmark(
     policies: Mapping[str, Any],
     frames: Sequence[Any],
@@ -111,7 +106,7 @@ def benchmark(
     host: Host | None = None,
     wall: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
-    progress: Progress = _silent,
+    progress: Progress = lambda items, **_: items,
 ) -> dict[str, Any]:
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
@@ -140,17 +135,15 @@ def benchmark(
     run.measure(progress(range(iterations), desc="timing", total=iterations), at_most_s)
     threads = getattr(policies[main], "threads", None)
 
-    artifacts = {name: run.metrics_of(name, cores) for name in names}
+    artifacts = {name: run.metrics_of(name) for name in names}
     top = dict(artifacts[main])
     if reference is not None:
         for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
-    process_mb = host.process_peak_memory_mb()
     metrics = {
         **top,
-        "peak_memory_mb": process_mb,
-        "process_peak_memory_mb": process_mb,
-        "cpu_pct": _share_pct(run.process_s, run.wall_s, cores),
+        "peak_memory_mb": host.process_peak_memory_mb(),
+        "cpu_pct": 100 * run.process_s / run.wall_s / cores if run.wall_s > 0 else None,
         **run.host_metrics(),
         "main": main,
         "reference": reference,
@@ -165,10 +158,6 @@ def benchmark(
         paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
         _add_memory(metrics, paths, threads)
     return metrics
-
-
-def _share_pct(cpu_s: float, wall_s: float, cores: int) -> float | None:
-    return 100 * cpu_s / wall_s / cores if wall_s > 0 else None
 
 
 class _Run:
@@ -186,7 +175,6 @@ class _Run:
         self.policies, self.frames, self.state = policies, frames, state
         self.host, self.wall, self.cpu = host, wall, cpu
         self.latencies_ms: dict[str, list[float]] = {name: [] for name in policies}
-        self.cpu_s = dict.fromkeys(policies, 0.0)
         self.readings: list[dict[str, Any]] = []
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
@@ -213,7 +201,7 @@ class _Run:
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
-    def metrics_of(self, name: str, cores: int) -> dict[str, Any]:
+    def metrics_of(self, name: str) -> dict[str, Any]:
         """Return the figures of one policy: those measured, and those known from its manifest and file."""
         policy, times_ms = self.policies[name], self.latencies_ms[name]
         manifest = getattr(policy, "manifest", None) or {}
@@ -222,7 +210,6 @@ class _Run:
         return {
             **latency_metrics(times_ms),
             "peak_memory_mb": None,
-            "cpu_pct": _share_pct(self.cpu_s[name], sum(times_ms) / 1000, cores),
             "floor_ms": floor_ms(gmac, mode) if mode else None,
             "gmac": gmac,
             "mode": mode,
@@ -241,19 +228,15 @@ class _Run:
         """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
         temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
         clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
-        throttled = self.readings[-1]["throttled"]
         return {
             "cpu_per_core_pct": self.per_core_pct,
             "temperature_c": max(temperatures_c, default=None),
             "clock_mhz": min(clocks_mhz, default=None),
-            "throttled": throttled,
-            "throttled_means": throttled_means(throttled),
+            "throttled": self.readings[-1]["throttled"],
         }
 
     def _time(self, name: str, frame: Any) -> None:
         predict = self.policies[name].predict_chunk
-        cpu_start_s, start_s = self.cpu(), self.wall()
+        start_s = self.wall()
         predict(frame, self.state)
-        end_s, cpu_end_s = self.wall(), self.cpu()
-        self.latencies_ms[name].append((end_s - start_s) * 1000)
-        self.cpu_s[name] += cpu_end_s - cpu_start_s
+        self.latencies_ms[name].append((self.wall() - start_s) * 1000)

@@ -41,7 +41,6 @@ SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB
 SIGNAL_S = 1.0
 RITUAL_S = 30.0  # time for a human to do what is asked
 REST_US = 32  # the firmware arms only with the throttle stick this near to neutral
-HOT_C = 75.0  # a Pi 5 slows down from 80 C
 MEMORY_MB = 700  # the real policy needs 358 MB while predicting and 424 while loading, the loop's process 100
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 
@@ -94,7 +93,6 @@ def examine(
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "artifact": lambda: policy(artifact),
-        "temperature": lambda: temperature(host),
         "power": lambda: power(host),
         "governor": lambda: governor(host.sys_root),
         "disk": lambda: disk(log_folder or Path.cwd(), Path.cwd()),
@@ -301,14 +299,6 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
     found = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
     remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
     yield warn_unless(median_s < fade_s / 2, "inference", found, remedy)
-
-
-def temperature(host: Host) -> Iterator[Check]:
-    """Check the processor's temperature."""
-    celsius = host.temperature_c()
-    found = "not reported" if celsius is None else f"{celsius:.0f} C"
-    fine = celsius is None or celsius < HOT_C
-    yield warn_unless(fine, "temperature", found, "a fan, or air: a Raspberry Pi slows down from 80 C")
 
 
 def power(host: Host) -> Iterator[Check]:

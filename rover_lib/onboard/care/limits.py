@@ -3,7 +3,6 @@
 rows = check_gates(metrics, params()["gates"]["original"])
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,8 +23,6 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
     rows = []
     for gate, limit in gates.items():
         value = metrics.get(gate, metrics.get(GATE_KEYS.get(gate, gate)))
-        if isinstance(value, float) and math.isnan(value):
-            value = None
         rows.append({"gate": gate, "limit": limit, "found": value, "passed": _passes(gate, value, limit)})
     return rows
 

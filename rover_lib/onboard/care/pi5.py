@@ -17,6 +17,9 @@ from typing import Any, NamedTuple
 
 FITTED = Path(__file__).with_name("pi5.json")  # its program: lab/a76/clock.py at commit 545214c
 DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view
+# Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
+# per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
+PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
 
 
 class Span(NamedTuple):
@@ -66,3 +69,12 @@ def predict_ms(work: Work) -> Span:
 def estimate_ms(gmac: float) -> float:
     """Return the high end for INT8 that was not counted, by its 10**9 multiply-accumulates: a rough estimate."""
     return 1e3 * gmac / fitted()["gmac_per_s"]
+
+
+def floor_ms(gmac: float | None, mode: str) -> float | None:
+    """Return the least time that a Pi 5 needs for one inference, by arithmetic alone; None where `gmac` is not known.
+
+    gmac: 10**9 multiply-accumulates of one inference. mode: an artifact's: `mixed` and `dynamic` count as INT8, a floor
+    that they cannot reach.
+    """
+    return None if gmac is None else gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
