@@ -5,6 +5,7 @@ ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
 PACKAGES := rover_lib rover_exchange rover_learn balloon_world lab lerobot_robot_rover
 READY := $(VENV)/.ready
+LOOK := runs/look
 # Each process runs whole test files or notebooks, and one waits while others compute. More than four processes would
 # cost more memory than they save time.
 # They go in the order of the folders: ansible and lab have the longest files, which would run alone if they came last.
@@ -17,15 +18,15 @@ export ROVER_AS_ROOT := 1
 # Some container images forbid Python to store its bytecode; then every process compiles torch again, which takes 2 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-more watch run notebooks-open flash docs test test-fast lint check-release mutants count notebooks
+.PHONY: help look demo demo-more watch run notebooks-open docs test test-fast lint check-release mutants count notebooks
 
 help:
+	@echo "make look                                   in two minutes: a policy drives, in your browser"
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
 	@echo "make watch                                  the demo's policy drives through that world, live in the browser"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
 	@echo "make notebooks-open NAME=mine [AS=try1]     JupyterLab on a copy of a run's notebooks, with its outputs; the run stays"
 	@echo "make demo-more                              late plans, and a smaller policy that the demo's teaches: half an hour"
-	@echo "make flash                                  build the Arduino's firmware, and put it on the board"
 	@echo "make docs                                   these pages and the notebooks as a site: runs/site/index.html"
 	@echo
 	@echo "For who changes something; CONTRIBUTING.md says what each proves and how long it takes:"
@@ -47,8 +48,13 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
 	$(VENV)/bin/python -m pip --version > /dev/null 2>&1 || $(VENV)/bin/python -m ensurepip --upgrade --default-pip > /dev/null || $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip
 	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,view,dev,docs]' -e ./lerobot_robot_rover
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,look,dev,docs]' -e ./lerobot_robot_rover
 	@touch $@
+
+# Without torch, in an environment of its own.
+look:
+	test -x $(LOOK)/bin/rover || { $(PYTHON) -m venv $(LOOK) && $(LOOK)/bin/pip install --quiet '.[look]'; }
+	$(LOOK)/bin/rover demo
 
 # It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)
@@ -103,7 +109,7 @@ check-release: lint $(DEMO)
 	$(VENV)/bin/pytest -m release tests
 	$(VENV)/bin/pytest notebooks
 	$(LAB) faults runs/faults.json
-	for car in crawler inverted gamepad; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done
+	for car in crawler inverted; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done
 	$(LAB) random runs/random.json
 	$(MAKE) mutants
 	$(LAB) pi runs/pi.json
@@ -118,9 +124,6 @@ count: $(READY)
 
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
-
-flash:
-	$(MAKE) -C firmware flash PORT='$(PORT)'
 
 # This opens a copy, so that cells that are run again there change no run; without NAME, of the repository's notebooks.
 notebooks-open: $(READY)

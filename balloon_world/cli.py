@@ -1,14 +1,23 @@
 """The balloon world's commands."""
 
+import gzip
 import json
+import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, show
+from rover_exchange.cli import open_browser
+from rover_lib.onboard.cli import ARTIFACT, AS_JSON, FILE, open_view, show, view_options
 from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
+
+# What this leaves is a student of the demo's policy, packed because an artifact is not:
+# rover distill runs/demo/best_model.pth runs/demo/episodes --name tiny --backbone-channels 0.02 --feedforward 64
+# --steps 3000 --samples 3000; rover run; rover export --onnx
+DEMO = Path(__file__).with_name("demo.onnx.zip.gz")
 
 
 def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str, Any]:
@@ -18,6 +27,23 @@ def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str
 
     execute(notebook, run_dir, **given)
     return read_stage(run_dir / f"{stage}.json", stage)
+
+
+@click.command(short_help="Watch a learned policy drive, and push its car.")
+@view_options
+def demo(**options: Any) -> None:
+    """Show a policy of 1 MB, part of this package, that drives through the balloon world, in your browser.
+
+    Push its car off its way: with the arrow keys, or by a tap on a side of the picture.
+    """
+    from balloon_world.show import Simulation
+    from rover_lib.onboard.policy.confine import AS_ROOT
+
+    os.environ[AS_ROOT] = "1"  # this artifact is part of the program that root has started
+    with tempfile.TemporaryDirectory() as folder:
+        artifact = Path(folder, "policy_static.onnx.zip")
+        artifact.write_bytes(gzip.decompress(DEMO.read_bytes()))
+        open_view(**options, opened=open_browser, shown=Simulation(artifact, title="rover demo"))
 
 
 @click.group(short_help="The balloon world: record, train, drive.")

@@ -36,6 +36,8 @@ PACE_S = 2.0  # the pace is that of the last seconds
 THREADS = 1
 SLOW = 0.9  # of the clock; the page speaks of a slower pace
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
+SIDES = {"push left": 1, "push right": -1}  # what the page of a simulation, and no other, can do to the car
+PUSHES = Path(__file__).with_name("push.js").read_bytes()
 SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
 
 Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
@@ -44,12 +46,17 @@ Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and
 class Simulation:
     """Drives an artifact through balloon worlds, for a view; what was chosen on its page arrives by `ask`.
 
+    Whoever watches can push the car off its way. A drive with pushes counts for the pushes, not for the policy.
+
     artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. seed: of the
-    first world. Raises what load_policy() raises.
+    first world. title: the page's; "": the name of the artifact's folder. Raises what load_policy() raises.
     """
 
-    def __init__(self, artifact: Path | str, seed: int = 10_000):
+    script = PUSHES  # for the page
+
+    def __init__(self, artifact: Path | str, seed: int = 10_000, title: str = ""):
         artifact = Path(artifact)
+        self._title = title or artifact.parent.name
         suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
         beside = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
         self._paths = {MODES[mode]: path for mode, path in beside.items() if path.is_file()}
@@ -59,7 +66,8 @@ class Simulation:
         self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
         self.car = self._policies[self._wanted].car
         self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
-        self._seed, self._artifact = seed, artifact
+        self._pushed = [0, 0]  # pushes that the policy recovered from, and all
+        self._seed = seed
         cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
         self._driving: PacedCar | None = None
@@ -86,7 +94,11 @@ class Simulation:
             self.ask("stop")
 
     def ask(self, what: str) -> None:
-        """Do what the page asks for: "stop", "next", or "drive <name>" of another mode. Anything else is ignored."""
+        """Do what the page asks for: "stop", "next", a push, or "drive <name>" of another mode. Ignore all else."""
+        if what in SIDES:
+            if self._driving:
+                self._driving.push(SIDES[what])
+            return
         name = what.removeprefix("drive ")
         if what != "stop" and what != "next" and name not in self._paths:
             return
@@ -112,8 +124,9 @@ class Simulation:
             _, outcome = car.drive(settings, car.log)
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                self._results[name][0] += car.world.hit
-                self._results[name][1] += 1
+                counted, by = (self._pushed, car.pushes) if car.pushes else (self._results[name], 1)
+                counted[0] += by * car.world.hit
+                counted[1] += by
                 self._seed += 1
             self._wait(car, outcome, post)
 
@@ -138,7 +151,7 @@ class Simulation:
                 f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
             )
         head: dict[str, Any] = {
-            "phase": "driving", "text": slow, "title": f"{self._artifact.parent.name}: {self._wanted}, balloon world",
+            "phase": "driving", "text": slow, "title": f"{self._title}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
             "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
             "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
@@ -149,6 +162,7 @@ class Simulation:
             head["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": plan.actions.tolist()}
         head["world"] = {
             "seed": world.seed,
+            "pushed": self._pushed,
             "results": self._results,
             "drives": self._wanted,
             "pace": round(pace, 2),
@@ -162,10 +176,16 @@ class PacedCar(TimedCar):
     """A car in a world whose time goes as fast as the clock, or slower. seen: called for each picture to be shown."""
 
     def __init__(self, world: World, policy: Any, seen: Callable[["PacedCar"], object]):
-        self.log, self._seen = NoLog(), seen
+        self.log, self._seen, self.pushes = NoLog(), seen, 0
         self._due_s = self._shown_s = time.monotonic()
         self._times = deque([(self._due_s, 0.0)], maxlen=round(PACE_S * RATE_HZ))
         super().__init__(world, policy, PLAN_S)
+
+    def push(self, side: int) -> None:
+        """Push the car once, unless its drive has ended. side: as in World.push()."""
+        if not self.world.done:
+            self.world.push(side)
+            self.pushes += 1
 
     def sleep(self, seconds: float) -> None:
         super().sleep(seconds)

@@ -48,6 +48,7 @@ BALLOON_HEIGHT_M = 0.24  # of its centre above the floor
 HIT_DISTANCE_M = 0.30  # from the camera to the balloon's centre; at this distance the bumper touches the balloon
 ARENA_RADIUS_M = 7.0
 
+PUSH_S, PUSH_RAD, PUSH_M = 0.15, 0.4, 0.1  # of somebody's push: its duration, the turn and the shift
 DECOY_ASIDE_RAD = 0.25  # the least angle between a decoy and the balloon, as seen from the start
 
 FLOOR_PX_PER_M = 160
@@ -136,6 +137,12 @@ class World:
     @property
     def done(self) -> bool:
         return self.outcome is not None
+
+    def push(self, side: int) -> None:
+        """Push the car from outside, from now on for PUSH_S: to the left if side is 1, to the right if it is -1."""
+        now_s = self.state.time_s
+        push = Shove(now_s, now_s + PUSH_S, side * PUSH_RAD / PUSH_S, side * PUSH_M / PUSH_S)
+        self._shoves = (*self._shoves, push)
 
     def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
         """Drive for dt seconds. Raises TrainingError for an action outside its range, or if the drive has ended."""

@@ -6,8 +6,6 @@ It repeats LeRobot's newest action for at most HOLD_S. After that the car is put
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
@@ -24,16 +22,13 @@ RATE_HZ = 50.0  # an action waits 20 ms at most
 # where the Arduino allows a silent host 150 ms.
 HOLD_S = 0.1
 ARMED_S = 3.0  # the answers to the cap and to arming, 0.5 s each, and time for a busy machine
-Clock = Callable[[], float]
 
 
 class Ride:
     """One drive, from arming to neutral: begin(), then put() at least every HOLD_S, then end()."""
 
-    def __init__(
-        self, camera: Camera, link: ServoLink, settings: Settings, log: FlightLog, clock: Clock = time.monotonic
-    ):
-        self._camera, self._link, self._settings, self._log, self._clock = camera, link, settings, log, clock
+    def __init__(self, camera: Camera, link: ServoLink, settings: Settings, log: FlightLog):
+        self._camera, self._link, self._settings, self._log = camera, link, settings, log
         self._sight = Sight(camera, settings)
         self._action = (0.0, 0.0)
         self._given_s = 0.0
@@ -63,10 +58,10 @@ class Ride:
         """Drive by this action from now on. Raises what ended the drive; DriveFault if no action came in time."""
         if self.over:
             self.check()
-            late_ms = (self._clock() - self._given_s) * 1e3
+            late_ms = (time.monotonic() - self._given_s) * 1e3
             what = f"LeRobot's loop gave no action for {late_ms:.0f} ms, and after {HOLD_S * 1e3:g} the car was stopped"
             raise DriveFault(what, remedy="is the policy too slow for it? `rover drive` plans while it drives")
-        self._action, self._given_s = (steering, throttle), self._clock()
+        self._action, self._given_s = (steering, throttle), time.monotonic()
 
     def check(self) -> None:
         """Raise what ended the drive, if it was a fault or the human's takeover."""
@@ -100,12 +95,12 @@ class Ride:
         self._sight.sent(at_s, order.throttle)
 
     def _late(self) -> str | None:
-        late = self._clock() - self._given_s > HOLD_S
+        late = time.monotonic() - self._given_s > HOLD_S
         return f"no action came from LeRobot for {HOLD_S * 1e3:g} ms" if late else None
 
     def _arm(self) -> Telemetry:
         telemetry = arm_capped(self._link, self._settings.throttle_limit, self._log.event)
-        self._given_s = self._clock()
+        self._given_s = time.monotonic()
         self._settled.set()
         return telemetry
 
@@ -113,9 +108,8 @@ class Ride:
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         until, hooks = Until(stop=self._stop, over=self._late), Hooks(self._arm, HealthWatch(self.report, self._link))
-        given: dict[str, Any] = {"rate_hz": RATE_HZ, "report": self.report, "clock": self._clock}
         try:
-            drive(self, self._link, self._log, until=until, hooks=hooks, **given)
+            drive(self, self._link, self._log, rate_hz=RATE_HZ, until=until, hooks=hooks, report=self.report)
         except BaseException as error:  # of any kind: LeRobot's loop must learn of it
             self._error = error
         finally:

@@ -22,7 +22,6 @@ from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.arming import arm_when_ready
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
-from rover_lib.onboard.drive.opening import check_no_film
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
 from rover_lib.onboard.errors import CameraError, PolicyError
@@ -35,7 +34,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 class RoverConfig(RobotConfig):
     """The rover's settings in LeRobot.
 
-    port: of the Arduino. camera: a number, /dev/videoN, or, with film, a folder or a FIFO of JPEGs. camera_name: of
+    port: of the Arduino. camera: a number, /dev/videoN, csi, or a FIFO of JPEGs. camera_name: of
     `observation.images.<camera_name>`. width, height: of the pictures that LeRobot gets, in pixels. throttle_limit: in
     [0, 1]; None: that of params.yml. log: file of the flight log; None: where `rover drive` writes it.
     """
@@ -46,7 +45,6 @@ class RoverConfig(RobotConfig):
     width: int = 640
     height: int = 360
     throttle_limit: float | None = None
-    film: bool = False
     log: Path | None = None
 
 
@@ -88,8 +86,6 @@ class Rover(CarPart, Robot):
             raise DeviceAlreadyConnectedError(f"the rover at {self.config.port} is connected already")
         if rollout := find_rollout():
             check_rollout(rollout)
-        if not self.config.film:
-            check_no_film(self.config.camera)
         with ExitStack() as stack:
             self._log = stack.enter_context(self._flight_log())
             wanted = self.config.width, self.config.height

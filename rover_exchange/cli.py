@@ -90,19 +90,8 @@ def open_browser(url: str) -> None:
 @LOG_DRIVE
 @click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
 @click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures if it was recorded.")
-@click.option(
-    "--pictures", type=PathTo("recordings"), help="The drive's episode [default: the one that the log names]."
-)
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
-def log(
-    file: Path,
-    output: Path | None,
-    drive: int,
-    video: Path | None,
-    mcap: Path | None,
-    pictures: Path | None,
-    as_json: bool,
-) -> None:
+def log(file: Path, output: Path | None, drive: int, video: Path | None, mcap: Path | None, as_json: bool) -> None:
     """Summarize the flight log FILE of `rover drive`, and draw it.
 
     Older parts of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation.
@@ -115,12 +104,12 @@ def log(
     if video:
         from rover_exchange.film import write_film
 
-        count = write_film(video, flight, pictures, terminal_bar())
+        count = write_film(video, flight, terminal_bar())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
     if mcap:
         from rover_exchange.mcap_log import write_mcap
 
-        counts = ", ".join(f"{count} of {topic}" for topic, count in write_mcap(mcap, flight, pictures).items())
+        counts = ", ".join(f"{count} of {topic}" for topic, count in write_mcap(mcap, flight).items())
         click.echo(f"written: {mcap}, {counts}, {mcap.stat().st_size / 1e6:.2f} MB", err=as_json)
     if output or not (as_json or video or mcap):
         output = output or file.with_name(f"{file.name}.png")

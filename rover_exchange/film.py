@@ -43,15 +43,15 @@ FORMATS = {
 }
 
 
-def write_film(path: Path, flight: Flight, episode: Path | None = None, progress: Progress = silent) -> int:
+def write_film(path: Path, flight: Flight, progress: Progress = silent) -> int:
     """Write a film of a drive, .mp4 or .webp, at its own pace, and return how many pictures it has.
 
-    episode: None takes the one that the log names. Raises RoverError for another kind of file, or if every picture is
-    damaged; RoverError and EpisodeError as moments_of.
+    Raises RoverError for another kind of file, or if every picture is damaged; RoverError and EpisodeError as
+    moments_of.
     """
     if path.suffix not in FORMATS:
         raise RoverError(f"{path}: a film ends in {' or '.join(FORMATS)}", found=path.suffix or "no ending")
-    form, moments = FORMATS[path.suffix], moments_of(flight, episode)
+    form, moments = FORMATS[path.suffix], moments_of(flight)
     count = 0
     stream: VideoStream | None = None
     with atomic_path(path) as temporary:
@@ -127,7 +127,7 @@ def _draw_panel(draw: ImageDraw.ImageDraw, moment: Moment, top: int, car: Car) -
     lines = [f"{moment.t_s:7.2f} s   {WHO.get(tick['state'], '')}"]
     if tick["plan_age_ms"] is not None:
         lines.append(f"plan {tick['plan_age_ms']:.0f} ms old, took {tick['latency_ms'] or 0:.0f} ms")
-    lines.append(f"command {tick['late_ms'] or 0:.1f} ms late, {moment.missed} missed")
+    lines.append(f"command {tick['late_ms'] or 0:.1f} ms late")
     draw.multiline_text((404, top + 8), "\n".join(lines), INK, font, spacing=6)
     below = f"{moment.event[:96]}\nahead: where the commands of the next second led"
     draw.multiline_text((10, top + 76), below, (154, 164, 173), ImageFont.load_default(12))

@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.onboard.car.host import THROTTLED_BITS
 from rover_lib.onboard.car.pwm import Channel
 from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.drive.flight_log import Flight
-from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, NOW_BITS, RED, SLATE, new_figure
+from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, RED, SLATE, new_figure
 
 STATES = {
     State.MANUAL.value: ("human", GREY),
@@ -19,18 +18,15 @@ STATES = {
     State.STOPPED.value: ("nobody, stopped", RED),
     "": ("not known", "#F2F2F2"),
 }
-HEIGHTS = {"driven by": 0.4, "steering": 1.6, "throttle": 1.6, "plan (ms)": 1.6, "late (ms)": 1.3, "°C": 0.9}  # inches
-EVENTS_LISTED = 14
-TEXT_LENGTH = 105
+HEIGHTS = {"driven by": 0.4, "steering": 1.6, "throttle": 1.6, "plan (ms)": 1.6, "late (ms)": 1.3}  # inches
 
 
 def flight_figure(flight: Flight) -> Figure:
-    """Draw one drive: panels over the same seconds, a dotted line for each event, and below them the last events."""
-    ticks, machine, t_s = flight.ticks, flight.machine, flight.ticks["t_s"]
-    listed = flight.events[-EVENTS_LISTED:]  # the last ones say why it ended
-    height_in = sum(HEIGHTS.values()) + 3.4 + 0.19 * len(listed)
+    """Draw one drive: panels over the same seconds, and a dotted line for each event."""
+    ticks, t_s = flight.ticks, flight.ticks["t_s"]
+    height_in = sum(HEIGHTS.values()) + 3
     fig, axes = new_figure(len(HEIGHTS), height_in=height_in, height_ratios=[*HEIGHTS.values()], sharex=True)
-    who, steering, throttle, plan, late, processor = axes[:, 0]
+    who, steering, throttle, plan, late = axes[:, 0]
     _draw_who(who, ticks)
     _draw_pulses(steering, flight.car.pwm.steering, ticks, COLOURS["steering"])
     _draw_pulses(throttle, flight.car.pwm.throttle, ticks, COLOURS["throttle"])
@@ -40,25 +36,17 @@ def flight_figure(flight: Flight) -> Figure:
         throttle.fill_between(t_s, ticks["fade"], 1, label="faded for the plan's age", **options)
     _draw_plan(plan, ticks, flight.header.get("drive", {}))
     late.plot(t_s, ticks["late_ms"], ".", color=SLATE, ms=2.5, label="lateness of a command")
-    _draw_processor(processor, machine)
     for ax, name in zip(axes[:, 0], HEIGHTS, strict=True):
         ax.set_ylabel(name, fontsize=10)
         for event in flight.events:
             ax.axvline(event.t_s, color=BLACK, lw=0.8, ls=":", zorder=0.5)
         if ax.get_legend_handles_labels()[0]:  # above the axes, where no line can run through it
             ax.legend(loc="lower left", bbox_to_anchor=(0, 0.97), ncols=4, frameon=False, fontsize=9)
-    times_s = [t_s, machine["t_s"], np.array([e.t_s for e in flight.events])]
-    end_s = max((float(t.max()) for t in times_s if len(t)), default=1.0) or 1.0
-    start_s = float(t_s[0]) if len(t_s) else 0.0  # events before the first tick are listed, not drawn
-    axes[-1, 0].set_xlim(max(0.0, start_s - 0.02 * (end_s - start_s)), end_s)
+    start_s, end_s = (float(t_s[0]), max(t_s[-1], *(e.t_s for e in flight.events), 1.0)) if len(t_s) else (0.0, 1.0)
+    axes[-1, 0].set_xlim(max(0.0, start_s - 0.02 * (end_s - start_s)), end_s)  # without what was before the first tick
     axes[-1, 0].set_xlabel("time since the start (s)", fontsize=10)
     fig.align_ylabels(axes[:, 0])
     fig.suptitle(f"{flight.path.name}: {flight.header.get('start', 'start not known')}", fontsize=11)
-    lines = [f"{event.t_s:7.2f} s   {str(event)[:TEXT_LENGTH]}" for event in listed]
-    if earlier := len(flight.events) - len(listed):
-        lines.insert(0, f"{earlier} earlier events: rover log --json lists them")
-    text = "\n".join(lines).replace("$", r"\$")  # no formula
-    fig.supxlabel(text, fontsize=9, x=0.01, ha="left", linespacing=1.4)
     return fig
 
 
@@ -98,15 +86,3 @@ def _draw_plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, An
         if isinstance(value, (int, float)):
             ax.axhline(1000 * value, color=colour, lw=1.2, ls="--", label=f"{label} {1000 * value:g} ms on")
     ax.set_ylim(0, None)
-
-
-def _draw_processor(ax: Axes, machine: Mapping[str, Any]) -> None:
-    """Draw the processor's temperature, empty on a machine without a sensor, and when the machine was throttled."""
-    t_s, celsius = machine["t_s"], machine["temperature_c"]
-    if np.isfinite(celsius).any():
-        ax.plot(t_s, celsius, color=RED, lw=1.4, label="processor")
-    bits = np.array([int(v or "0", 16) & NOW_BITS for v in machine["throttled"]], int)
-    if bits.any():
-        names = [name for bit, name in THROTTLED_BITS.items() if (bits >> bit & 1).any()]
-        options: dict[str, Any] = {"step": "post", "transform": ax.get_xaxis_transform()}
-        ax.fill_between(t_s, 0, bits > 0, label=", ".join(names), color=RED, alpha=0.4, lw=0, **options)

@@ -1,7 +1,7 @@
 """Write a flight log as MCAP, the file format of Foxglove and Rerun: `rover log FILE --mcap out.mcap`.
 
 Every message is JSON, with its schema, at the time that the system's clock showed. If an episode was recorded with the
-drive, the file has its pictures and controls too, which continue after a takeover.
+drive, the file has its pictures too, which continue after a takeover.
 """
 
 import base64
@@ -15,10 +15,9 @@ from rover_exchange.moments import began_s, find_recording, pictures_of
 from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.drive.flight_log import Flight, Tick
 from rover_lib.onboard.errors import CameraError, EpisodeError
-from rover_lib.onboard.recording.episode import CONTROL_FIELDS, DRIVERS, json_controls, number_of
 from rover_lib.onboard.stage import atomic_path, plain
 
-TICK, EVENT, MACHINE, CONTROL, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/control", "/camera")
+TICK, EVENT, MACHINE, PICTURE = TOPICS = ("/tick", "/event", "/machine", "/camera")
 INFO = 2  # a level of foxglove.Log
 MOST_S = 1.8e10  # the latest time: MCAP counts nanoseconds in 64 bits
 TICK_TEXTS = ("state", "reason")
@@ -32,22 +31,21 @@ SCHEMAS = {  # by topic: the schema's name, and its properties
     TICK: ("rover.Tick", {name: _TEXT if name in TICK_TEXTS else _NUMBER for name in Tick._fields}),
     EVENT: ("foxglove.Log", _LOG),
     MACHINE: ("rover.Machine", {"temperature_c": _NUMBER, "throttled": _TEXT}),
-    CONTROL: ("rover.Control", {**dict.fromkeys(CONTROL_FIELDS, _NUMBER), "driver": {"enum": [*DRIVERS, None]}}),
     PICTURE: ("foxglove.CompressedImage", _IMAGE),
 }
 
 Message = tuple[int, str, dict[str, Any] | Path]  # nanoseconds by the system's clock, topic, content or picture's file
 
 
-def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[str, int]:
+def write_mcap(path: Path, flight: Flight) -> dict[str, int]:
     """Write a drive as MCAP, in order of time, and return how many messages each topic has, without the empty ones.
 
-    episode: None takes the one that the log names, if it is there. Raises RoverError if the log does not say when it
-    began, and EpisodeError if the episode's list of pictures cannot be read.
+    Raises RoverError if the log does not say when it began, and EpisodeError if the list of the pictures recorded with
+    it cannot be read.
     """
     from mcap.writer import Writer  # imported here, so that only this export needs it
 
-    messages = [*_of_flight(flight), *_of_episode(episode or _find(flight))]
+    messages = [*_of_flight(flight), *_pictures_with(flight)]
     messages.sort(key=lambda message: message[0])
     counts: Counter[str] = Counter()
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -70,13 +68,6 @@ def write_mcap(path: Path, flight: Flight, episode: Path | None = None) -> dict[
     return {topic.removeprefix("/"): counts[topic] for topic in TOPICS if counts[topic]}
 
 
-def _find(flight: Flight) -> Path | None:
-    try:
-        return find_recording(flight)
-    except EpisodeError:
-        return None
-
-
 def _of_flight(flight: Flight) -> Iterator[Message]:
     begin_s = began_s(flight)
     ticks, machine = flight.ticks, flight.machine
@@ -90,16 +81,14 @@ def _of_flight(flight: Flight) -> Iterator[Message]:
         yield _ns(begin_s + t_s), MACHINE, plain({name: machine[name][i] for name in ("temperature_c", "throttled")})
 
 
-def _of_episode(episode: Path | None) -> Iterator[Message]:
-    if episode is None:
+def _pictures_with(flight: Flight) -> Iterator[Message]:
+    try:
+        episode = find_recording(flight)
+    except EpisodeError:
         return
     for at_s, picture in pictures_of(episode):
         if 0 <= at_s < MOST_S:
             yield _ns(at_s), PICTURE, picture
-    for row in json_controls(episode / "episode_data.json"):
-        control_s = number_of(row.get("system_timestamp"))
-        if control_s is not None and 0 <= control_s < MOST_S:  # not NaN either
-            yield _ns(control_s), CONTROL, plain(row)
 
 
 def _image(at_ns: int, file: Path) -> dict[str, Any] | None:

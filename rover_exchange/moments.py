@@ -28,32 +28,29 @@ class Moment:
     """One picture of a drive, t_s seconds after it began.
 
     frame: its file. tick: the tick before it, by the names of Tick; None where nothing was measured. ahead: (n, 2),
-    [steering, throttle] of the next second. missed: ticks until then. event: the newest, as text, or "".
+    [steering, throttle] of the next second. event: the newest, as text, or "".
     """
 
     t_s: float
     frame: Path
     tick: dict[str, Any]
     ahead: np.ndarray
-    missed: int
     event: str
 
 
-def moments_of(flight: Flight, episode: Path | None = None) -> list[Moment]:
+def moments_of(flight: Flight) -> list[Moment]:
     """Return a moment for each picture of a drive, at least one, in order of time.
 
-    episode: None takes the one that the log names. Raises RoverError if nothing was driven or the log's header is
-    damaged, and EpisodeError if there are no pictures of this drive.
+    Raises RoverError if nothing was driven or the log's header is damaged, and EpisodeError if there are no pictures of
+    this drive.
     """
     ticks = flight.ticks
     t_s, period_ms = ticks["t_s"], flight.period_ms or PERIOD_MS
     if not len(t_s):
         raise RoverError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
     begin_s = began_s(flight)
-    gaps = np.rint(np.diff(t_s * 1000 - ticks["late_ms"]) / period_ms) - 1
-    missed = np.concatenate([[0], np.cumsum(gaps.clip(0))])
     commanded = np.stack([ticks["steering"], ticks["throttle"]], axis=1)
-    episode = episode or find_recording(flight)
+    episode = find_recording(flight)
     moments = []
     for at_s, frame in pictures_of(episode):
         now_s = at_s - begin_s
@@ -63,7 +60,7 @@ def moments_of(flight: Flight, episode: Path | None = None) -> list[Moment]:
         tick = plain({name: ticks[name][i] for name in Tick._fields})
         ahead = commanded[i : i + round(1000 / period_ms)]
         events = [f"{e.t_s:.1f} s  {e}" for e in flight.events if e.t_s <= now_s]
-        moments.append(Moment(now_s, frame, tick, ahead, int(missed[i]), events[-1] if events else ""))
+        moments.append(Moment(now_s, frame, tick, ahead, events[-1] if events else ""))
     if not moments:
         raise EpisodeError(f"{episode}: none of its pictures is of the drive in {flight.path}", remedy="choose --drive")
     return moments
@@ -77,11 +74,10 @@ def find_recording(flight: Flight) -> Path:
             for path in (named, flight.path.parent / named, flight.path.parent / "episodes" / named.name):
                 if path.is_dir():
                     return path
-            raise EpisodeError(f"{named}: the drive's pictures are not there", remedy="name them by --pictures")
-    raise EpisodeError(
-        f"{flight.path}: no pictures were recorded with this drive",
-        remedy="`rover drive --record FOLDER` records them; those of elsewhere are named by --pictures",
-    )
+            remedy = f"copy that folder to {flight.path.parent / 'episodes'}"
+            raise EpisodeError(f"{named}: the drive's pictures are not there", remedy=remedy)
+    remedy = "`rover drive --record FOLDER` records them"
+    raise EpisodeError(f"{flight.path}: no pictures were recorded with this drive", remedy=remedy)
 
 
 def began_s(flight: Flight) -> float:

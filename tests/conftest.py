@@ -27,12 +27,9 @@ _frozen_with = [0]  # modules
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests that use the demo's run or Hailo's kit as slow.
-
-    Driving with the demo's policy starts processes that import torch, and a kit takes ten seconds to make.
-    """
+    """Mark the tests that use the demo's run as slow: driving with its policy starts processes that import torch."""
     for item in items:
-        if {"demo_run", "hailo_kit"} & set(getattr(item, "fixturenames", ())):
+        if "demo_run" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
 
 
@@ -181,18 +178,6 @@ def artifacts(made_once, request) -> dict[str, Path]:
 
     folder = made_once("artifacts", make)
     return {mode: folder / f"policy_{mode}.pt" for mode in ("fp32", "dynamic", "static", "mixed")}
-
-
-@pytest.fixture(scope="session")
-def hailo_kit(made_once, request) -> Path:
-    """A kit of the tiny policy for Hailo's compiler. A test that writes into it must copy it first."""
-
-    def make(folder: Path) -> None:
-        from hailo_kit import make_kit, normalised
-
-        make_kit(normalised(request.getfixturevalue("tiny")), folder)
-
-    return made_once("hailo", make) / "kit"
 
 
 @pytest.fixture(scope="session")

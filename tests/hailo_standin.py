@@ -9,7 +9,6 @@ import json
 import re
 import sys
 import types
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -24,29 +23,24 @@ class HailoRTException(Exception):
     pass
 
 
-class FormatType(Enum):
-    UINT8 = np.uint8
-    FLOAT32 = np.float32
-
-
 class Stream:
-    """One input or output, of a model and of its bindings."""
+    """An input or output, of a model and of its bindings."""
 
     def __init__(self, name: str, shape: list[int]):
-        self.name, self.shape, self.type = name, shape, FormatType.UINT8
+        self.name, self.shape, self.type = name, shape, np.uint8
 
-    def set_format_type(self, type: FormatType) -> None:
-        self.type = FormatType(type)
+    def set_format_type(self, type: type) -> None:
+        self.type = type
 
     def set_buffer(self, buffer: np.ndarray) -> None:
-        wanted = int(np.prod(self.shape)) * np.dtype(self.type.value).itemsize
+        wanted = int(np.prod(self.shape)) * np.dtype(self.type).itemsize
         if not buffer.flags.c_contiguous or buffer.nbytes != wanted:
             raise HailoRTException(f"Buffer size {buffer.nbytes} is different than expected {wanted} for '{self.name}'")
         self.buffer = buffer
 
 
 class InferModel:
-    """A network of one input on the chip: also what configure() and create_bindings() return of it, and its HEF."""
+    """A network of one input on the chip: also what configure() and create_bindings() return of it."""
 
     fails = False  # True: the chip no longer answers
 
@@ -54,18 +48,15 @@ class InferModel:
         if not hef.startswith(MAGIC):
             raise HailoRTException("Invalid HEF. See hailort.log for more information")
         about, _, model = hef.removeprefix(MAGIC).partition(b"\0")
-        self.about, self.hef = json.loads(about), self
+        self.about = json.loads(about)
         self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-        self.inputs, self.outputs = ([Stream(name, shape)] for name, shape, _ in self.about["streams"])
-
-    def get_original_names_from_vstream_name(self, name: str) -> list[str]:
-        return [original for stream, _, original in self.about["streams"] if stream == name]
+        self.inputs, self.outputs = ([Stream(*stream)] for stream in self.about["streams"])
 
     def input(self, name: str) -> Stream:
-        return next(s for s in self.inputs if s.name == name)
+        return {s.name: s for s in self.inputs}[name]
 
     def output(self, name: str) -> Stream:
-        return next(s for s in self.outputs if s.name == name)
+        return {s.name: s for s in self.outputs}[name]
 
     def configure(self) -> "InferModel":
         return self
@@ -78,7 +69,7 @@ class InferModel:
         (given,), (answer,), (mean, std) = self.inputs, self.outputs, self.about["normalization"]
         x = given.buffer.reshape(given.shape).astype(np.float32)
         x = (x - np.array(mean, np.float32)) / np.array(std, np.float32)
-        (y,) = self.session.run(None, {self.about["streams"][0][2]: x.transpose(2, 0, 1)[None]})
+        (y,) = self.session.run(None, {self.about["picture"]: x.transpose(2, 0, 1)[None]})
         answer.buffer[...] = y[0].transpose(1, 2, 0).reshape(answer.buffer.shape)
 
 
@@ -90,11 +81,13 @@ class VDevice:
 def compile_kit(kit: Path) -> Path:
     """Do what Hailo's compiler would, and return the path of the HEF."""
     content, model = json.loads((kit / "kit.json").read_text()), onnx.load(kit / "backbone.onnx")
-    ((original, (_, _, height, width)),), (end,) = content["inputs"].items(), content["end_nodes"]
-    _, *grid = (d.dim_value for d in model.graph.output[0].type.tensor_type.shape.dim)
-    streams = [("input", [height, width, 3], original), ("output", [*grid[1:], grid[0]], end)]
+    _, depth, *grid = (d.dim_value for d in model.graph.output[0].type.tensor_type.shape.dim)
     found = re.search(NORMALIZATION, (kit / "backbone.alls").read_text())
-    about = {"streams": streams, "normalization": [json.loads(found[1]), json.loads(found[2])]}
+    about = {
+        "streams": [("input", [*content["shape"][2:], 3]), ("output", [*grid, depth])],
+        "picture": content["input"],
+        "normalization": [json.loads(found[1]), json.loads(found[2])],
+    }
     path = kit / "backbone.hef"
     path.write_bytes(MAGIC + json.dumps(about).encode() + b"\0" + model.SerializeToString())
     return path
@@ -102,6 +95,5 @@ def compile_kit(kit: Path) -> Path:
 
 def install(monkeypatch) -> None:
     """Install the package until the test ends."""
-    platform = types.ModuleType("hailo_platform")
-    platform.VDevice, platform.FormatType = VDevice, FormatType
-    monkeypatch.setitem(sys.modules, "hailo_platform", platform)
+    formats = types.SimpleNamespace(UINT8=np.uint8, FLOAT32=np.float32)
+    monkeypatch.setitem(sys.modules, "hailo_platform", types.SimpleNamespace(VDevice=VDevice, FormatType=formats))

@@ -8,9 +8,8 @@ import time
 import tty
 from contextlib import contextmanager
 
-from uno import body_of, line
-
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.protocol import frame
 
 DEFAULT = Car().id
 
@@ -47,7 +46,7 @@ class Board:
 
     def say(self, body):
         if not self._closing:
-            os.write(self.master, line(body))
+            os.write(self.master, frame(body))
 
     def status(self, state="M", reason="r", result="k", **fields):
         """Say a status line; fields: of the line, see FIELDS."""
@@ -68,8 +67,8 @@ class Board:
                 continue
             *lines, pending = (pending + os.read(self.master, 4096)).split(b"\n")
             for said in lines:
-                body = body_of(said[said.rindex(b">") :])  # as the firmware: a '>' starts a line
-                assert body, said
+                body = said[said.rindex(b">") : -9].decode()  # as the firmware: a '>' starts a line
+                assert said.endswith(frame(body)[:-1]), said
                 self.heard.append(body)
                 if body == ">Q" and self.hello:
                     self.greet()

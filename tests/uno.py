@@ -5,12 +5,13 @@ import ctypes
 import functools
 import shutil
 import tempfile
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
 from lab.arduino import emulator as arduino
 from rover_lib.onboard.car import car
+from rover_lib.onboard.car.protocol import Hello, parse
+from rover_lib.onboard.car.protocol import frame as line
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
 REPOSITORY = arduino.REPOSITORY
@@ -74,34 +75,11 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-def line(body: str) -> bytes:
-    """Return a line of the protocol. zlib makes its CRC, independently of both sides' own code."""
-    return f"{body}*{zlib.crc32(body.encode()):08X}\n".encode()
-
-
-def body_of(text: bytes) -> str | None:
-    """Return a line without its CRC, or None if the CRC is wrong."""
-    body, _, crc = text.decode("ascii", "replace").rpartition("*")
-    return body if crc == f"{zlib.crc32(body.encode()):08X}" else None
-
-
-FIELDS = [
-    *("boot", "uptime_ms", "sequence", "result", "state", "reason", "missing", "steering_us", "throttle_us", "cap_us"),
-    *("receiver_steering_us", "receiver_steering_period_us", "receiver_throttle_us", "receiver_throttle_period_us"),
-    *("bad", "old", "out_of_range", "lost"),
-]
-
-
-def status_of(body: str) -> SimpleNamespace:
-    kind, *values = body.split(" ")
-    assert kind == "<S"
-    return SimpleNamespace(**{k: int(v) if v.isdigit() else v for k, v in zip(FIELDS, values, strict=True)})
-
-
 class Uno:
     """The board, which runs only when told to.
 
     events: all measurements, in the order in which they ended. lines: all lines that it sent, without their CRC.
+    status: the newest, as the host reads it, with the state's letter.
     """
 
     def __init__(self, eeprom: bytes | None = None, human: str = "receiver"):
@@ -140,12 +118,15 @@ class Uno:
             self._rest += text.raw[:n]
         *whole, self._rest = self._rest.split(b"\n")
         for text_line in filter(None, whole):
-            body = body_of(text_line)
-            assert body is not None or any(e.kind == RESET for e in new), f"the firmware sent {text_line!r}"
-            if body:
-                self.lines.append(body)
-                if body.startswith("<H "):
-                    self.boot, self.sequence = int(body.split()[3]), int(body.split()[4])
+            message = parse(text_line, 0.0)
+            assert message or any(e.kind == RESET for e in new), f"the firmware sent {text_line!r}"
+            if message:
+                self.lines.append(text_line.decode().rpartition("*")[0])
+            if isinstance(message, Hello):
+                self.boot, self.sequence = message.boot, message.sequence
+            elif message:
+                counted = {"old": message.old_commands, "lost": message.lost_bytes}
+                self.status = SimpleNamespace(**vars(message) | {"state": message.state.value} | counted)
         return new
 
     def send(self, data: bytes) -> None:
@@ -202,11 +183,6 @@ class Uno:
     def longest_ms(self) -> float:
         """The longest turn of loop() since watch_loop()."""
         return self._c.uno_longest_us(self._uno) / 1000
-
-    @property
-    def status(self) -> SimpleNamespace:
-        """The newest status."""
-        return status_of(next(body for body in reversed(self.lines) if body.startswith("<S ")))
 
     def drive(self, steering_us: int, throttle_us: int, ms: float, every_ms: float = 33) -> list[SimpleNamespace]:
         """Send drive commands every `every_ms` for `ms`, and return the events."""

@@ -22,8 +22,7 @@ def hit_bars(ax: Axes, x: Sequence[float], rows: Sequence[Mapping[str, Any]], ke
 
 def hits_by_latency(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the balloons hit, with Wilson's 95 % interval, against how long an inference takes. rows: of drive.json."""
-    late = [r for r in rows if r["ensemble"] is None]
-    sets = [("left alone", [r for r in late if not r["pushes"]]), ("pushed", [r for r in late if r["pushes"]])]
+    sets = [("left alone", [r for r in rows if not r["pushes"]]), ("pushed", [r for r in rows if r["pushes"]])]
     sets = [(title, drives) for title, drives in sets if drives]
     counts = [len({r["latency_ms"] for r in drives}) for _, drives in sets]
     fig, axes = new_figure(1, len(sets), height_in=4.1, sharey=True, width_ratios=[c + 1 for c in counts])

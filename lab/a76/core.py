@@ -15,10 +15,9 @@ import subprocess
 import sys
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
@@ -29,7 +28,6 @@ from lab.debian import fetch_packages, install_packages, missing_packages, unpac
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cache_folder, key_of
-from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run_program import last_words, run
 
 REPOSITORY = Path(__file__).parents[2]
@@ -46,6 +44,7 @@ NEEDS = {  # commands and files, each with the Debian package that it comes from
 RECIPE = 1  # raise it when the userland is made in another way, so that older ones are not used
 GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
 PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
+INTERPRETER, SITE = f"usr/bin/python{PYTHON}", "opt/site"  # in the emulated Pi
 FOR_GUEST = ("--python-platform", PLATFORM, "--python-version", PYTHON)  # options for `fetch_wheels`
 CORES = 4  # as on the Pi: with fewer cores or others in /proc/cpuinfo, XNNPACK would choose other kernels
 CPUINFO = """processor\t: {core}
@@ -74,14 +73,15 @@ class Core:
     plugin: Path
 
 
-def prepare(progress: Progress = silent) -> Core:
+def prepare() -> Core:
     """Return what counting needs, from the cache or made now, in half a minute. Raises RoverError if it cannot be had.
 
     Missing Debian packages are installed if this runs as root.
     """
-    steps = (partial(install_packages, missing_packages(NEEDS), "counting"), build_plugin, _userland)
-    _, plugin, root = [step() for step in progress(steps, desc=f"emulated {A76}", total=len(steps))]
-    return Core(root, plugin)
+    install_packages(missing_packages(NEEDS), "counting")
+    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
+    root = cache_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
+    return Core(root, build_plugin())
 
 
 def build_plugin() -> Path:
@@ -94,15 +94,10 @@ def build_plugin() -> Path:
     return cache_folder("arm-plugin", key_of({}, PLUGIN), make) / "count.so"
 
 
-def _userland() -> Path:
-    recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}
-    return cache_folder("arm-userland", key_of(recipe, REQUIREMENTS), _make_userland)
-
-
 def _make_userland(root: Path) -> None:
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
         unpack_packages(fetch_packages(Path(scratch), GUEST_PACKAGES), root)
-    fetch_wheels(_site(root), "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
+    fetch_wheels(root / SITE, "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
     (root / "proc" / "cpuinfo").write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
@@ -112,7 +107,7 @@ def _make_userland(root: Path) -> None:
         (cpus / name).write_text(f"0-{CORES - 1}\n")
     # This proves that the packages work, and leaves the bytecode of everything that they import. To compile that takes
     # a third of a minute in the emulator.
-    imports = [_python(root), "-c", "import torch, cv2, serial"]
+    imports = [root / INTERPRETER, "-c", "import torch, cv2, serial"]
     run(*_qemu(root), *imports, error=RoverError, env=_environment(root, root))
 
 
@@ -134,14 +129,6 @@ def _qemu(root: Path) -> list[str]:
     return ["setpriv", "--pdeathsig", "KILL", "qemu-aarch64", "-L", str(root), "-cpu", A76, *place]
 
 
-def _python(root: Path) -> Path:
-    return root / "usr" / "bin" / f"python{PYTHON}"
-
-
-def _site(root: Path) -> Path:
-    return root / "opt" / "site"
-
-
 def _environment(root: Path, home: Path) -> dict[str, str]:
     """Return the environment of an emulated Python, which has nothing from the host's and uses one thread."""
     return {
@@ -150,7 +137,7 @@ def _environment(root: Path, home: Path) -> dict[str, str]:
         "HOME": str(home),
         "TMPDIR": str(home),
         "PYTHONHOME": str(root / "usr"),
-        "PYTHONPATH": str(_site(root)),
+        "PYTHONPATH": str(root / SITE),
         "PYTHONHASHSEED": "0",  # the same hashes every time, so that the count is the same
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
@@ -185,17 +172,17 @@ class Emulation:
 
 
 def emulate_script(
-    core: Core, script: Path, arguments: Sequence[object], folder: Path, packages: Path | None, **options: Any
+    core: Core, script: Path, arguments: Sequence[object], folder: Path, packages: Path | None, watch: str
 ) -> Emulation:
     """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
 
-    packages: a folder of packages that come before the Pi's own on the path. options: for `emulate`.
+    packages: a folder of packages that come before the Pi's own on the path.
     """
     environment = _environment(core.root, folder)
     places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
     environment["PYTHONPATH"] = ":".join(map(str, places))
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
-    return emulate(core, [_python(core.root), script, *arguments], folder, environment=environment, **options)
+    return emulate(core, [core.root / INTERPRETER, script, *arguments], folder, environment=environment, watch=watch)
 
 
 def emulate(
@@ -204,14 +191,12 @@ def emulate(
     folder: Path,
     *,
     environment: dict[str, str] | None = None,
-    on_line: Callable[[str], None] = lambda line: None,
     watch: str = "",
 ) -> Emulation:
     """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 
-    folder: takes the counts, and what the program leaves. on_line: called with each line on its stdout. watch:
-    "memory=SECTION", see guest/count.c. Raises RoverError with the end of its stderr if it fails. Whatever ends this
-    function also ends the emulator.
+    folder: takes the counts, and what the program leaves. watch: "memory=SECTION", see guest/count.c. Raises RoverError
+    with the end of its stderr if it fails. Whatever ends this function also ends the emulator.
     """
     plugin = ",".join([str(core.plugin), f"folder={folder}", *([watch] if watch else [])])
     qemu = [str(word) for word in (*_qemu(core.root), "-plugin", plugin, *command)]
@@ -223,7 +208,6 @@ def emulate(
         with _Watched(process.pid) as watched:
             for line in process.stdout:
                 watched.begin(line.rstrip("\n"))
-                on_line(watched.step)
         code = process.wait()
     finally:
         process.kill()

@@ -7,21 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lab.a76.core import FOR_GUEST, GUEST, Core, emulate_script, fetch_wheels
+from lab.a76.core import FOR_GUEST, GUEST, Core, Emulation, emulate_script, fetch_wheels
+from lab.a76.report import alone_of
 from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.artifact.manifest import read_manifest
+from rover_lib.onboard.care.pi5 import DRIVING, Work, predict_ms
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
 
 COUNTED = 10  # how many inferences after loading are counted, each by itself
 STEADY = 3  # the number of the first inference whose count is that of all later ones too
+SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if nothing but SDOT ran
 
 
 @dataclass(frozen=True)
@@ -48,27 +50,11 @@ def guest_of(artifact: Path) -> Guest:
     return Guest(packages=cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make))
 
 
-@dataclass(frozen=True, eq=False)
-class Counted:
-    """What an artifact executed in the emulated Pi.
+class Counted(NamedTuple):
+    """What an artifact did in the emulated Pi. row: its part of arm.json. chunks: (n, C, A) float32."""
 
-    inferences[0] is the first after loading. chunks: (n, C, A) float32.
-    """
-
-    load: int  # instructions of load_policy: integrity check, unpacking, parity vectors
-    inferences: tuple[int, ...]  # instructions of each
-    sdot: int  # SDOT instructions of the steady inference
-    work: dict[str, float]  # of the steady inference: simd, cycles, near_lines and far_lines, see Emulation
-    kernels: dict[str, tuple[int, int]]  # (instructions, SDOT) of the steady inference by function
-    peak_mb: float
-    peak_loading_mb: float
+    row: dict[str, Any]
     chunks: np.ndarray
-    versions: dict[str, Any]
-
-    @property
-    def steady(self) -> int:
-        """Instructions of the STEADY-th inference."""
-        return self.inferences[STEADY - 1]
 
 
 def write_observations(path: Path, samples: Sequence[Any]) -> Path:
@@ -84,57 +70,62 @@ def write_observations(path: Path, samples: Sequence[Any]) -> Path:
 
 def count_artifact(
     core: Core,
-    artifact: Path | str,
+    artifact: Path,
+    manifest: dict[str, Any],
     samples: Sequence[Any],
     *,
     guest: Guest = OURS,
     counted: int = COUNTED,
-    on_line: Callable[[str], None] = lambda line: None,
 ) -> Counted:
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
-    samples: have frame_bgr() and state; if there are fewer than `counted`, at least STEADY, they are repeated. on_line:
-    called with each line that the guest prints. Raises RoverError if it fails.
+    manifest: the policy's. samples: have frame_bgr() and state; if there are fewer than `counted`, at least STEADY,
+    they are repeated. Raises RoverError if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
         folder = Path(scratch)
         observations = write_observations(folder / "observations.npz", samples)
-        given = [Path(artifact).resolve(), observations, folder, counted, *guest.arguments]
-        watch = f"memory={STEADY}"
-        done = emulate_script(core, guest.script, given, folder, guest.packages, on_line=on_line, watch=watch)
-        work = {"simd": done.total(STEADY, "simd"), "cycles": done.cycles(STEADY)}
-        work["near_lines"], work["far_lines"] = done.lines(STEADY)
-        return Counted(
-            load=done.total(0),
-            inferences=tuple(done.total(i) for i in range(1, counted + 1)),
-            sdot=done.total(STEADY, "sdot"),
-            work=work,
-            kernels=by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text())),
-            peak_mb=done.peak_mb["predict"],
-            peak_loading_mb=done.peak_mb["load"],
-            chunks=np.load(folder / "chunks.npy"),
-            versions=json.loads((folder / "versions.json").read_text()),
-        )
+        given = [artifact.resolve(), observations, folder, counted, *guest.arguments]
+        done = emulate_script(core, guest.script, given, folder, guest.packages, f"memory={STEADY}")
+        return Counted(_row(done, folder, counted, manifest), np.load(folder / "chunks.npy"))
 
 
-def side_by_side(
-    counts: Mapping[str, Callable[..., Counted]], inferences: int, what: str, progress: Progress
-) -> dict[str, Counted]:
-    """Count in several emulated machines, one for each of this machine's cores at a time.
+def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return an artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
+    kernels = by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text()))
+    kernels_g = {name: instructions / 1e9 for name, (instructions, _) in kernels.items()}
+    inferences_g = [done.total(i) / 1e9 for i in range(1, counted + 1)]
+    counts: dict[str, float] = {"instructions": done.total(STEADY), "sdot": done.total(STEADY, "sdot")}
+    counts |= {"simd": done.total(STEADY, "simd"), "cycles": done.cycles(STEADY)}
+    counts["near_lines"], counts["far_lines"] = done.lines(STEADY)
+    work = {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels_g)}
+    floor_g = manifest["gmac"] / SDOT_MACS
+    versions = json.loads((folder / "versions.json").read_text())
+    return work | {
+        "floor_g": floor_g,
+        "x_floor": work["instructions_g"] / floor_g,
+        "first_g": inferences_g[0],
+        "second_g": inferences_g[1],
+        "tenth_g": inferences_g[9] if counted >= COUNTED else None,
+        "load_instructions_g": done.total(0) / 1e9,
+        "gmac": manifest["gmac"],
+        "image_height": manifest["cameras"][0]["height"],
+        "image_width": manifest["cameras"][0]["width"],
+        "instructions_by_kernel": kernels_g,
+        "sdot_by_kernel": {name: sdot / 1e9 for name, (_, sdot) in kernels.items()},
+        "peak_memory_mb": done.peak_mb["predict"],
+        "peak_memory_loading_mb": done.peak_mb["load"],
+        "threads": versions["threads"],
+        "versions": versions,
+        "computed_pi5_ms": predict_ms(Work.of(work))._asdict() | {"threads": DRIVING},
+    }
 
-    counts: functions by name, each called with on_line. inferences, what: all of them, and a label, for the bar.
-    """
-    bar = iter(progress(range(inferences), desc=what, total=inferences))
-    one_at_a_time = Lock()
 
-    def on_line(line: str) -> None:
-        if line == "predict":
-            with one_at_a_time:
-                next(bar, None)
-
+def side_by_side(counts: Mapping[str, Callable[[], Counted]], what: str, progress: Progress) -> dict[str, Counted]:
+    """Count in several emulated machines, one for each of this machine's cores at a time. what: a label for the bar."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        started = {name: pool.submit(count, on_line=on_line) for name, count in counts.items()}
+        started = {name: pool.submit(count) for name, count in counts.items()}
         try:
-            return {name: future.result() for name, future in started.items()}
+            return {name: started[name].result() for name in progress(started, desc=what, total=len(started))}
         finally:
             pool.shutdown(cancel_futures=True)  # if one failed, those that run end, and no more begin

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lab.a76.core import A76, Core, prepare
+from lab.a76.core import A76, prepare
 from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, guest_of, side_by_side
-from lab.a76.report import LABEL, artifact_metrics, gates
+from lab.a76.report import LABEL, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
 from rover_lib.onboard.errors import RoverError
@@ -52,11 +52,14 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
         raise RoverError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
-    core = prepare(progress)
-    plans = plans_of(manifests, len(samples))
-    counts = _count_all(core, artifacts, plans, samples, progress)
+    core, plans = prepare(), plans_of(manifests, len(samples))
+    jobs = {}
+    for stem, plan in plans.items():
+        chosen, how = [samples[i] for i in plan.frames], {"guest": guest_of(artifacts[stem]), "counted": plan.counted}
+        jobs[stem] = partial(count_artifact, core, artifacts[stem], manifests[stem], chosen, **how)
+    counts = side_by_side(jobs, "artifacts, emulated", progress)
     judged = _judge(artifacts, plans, counts, samples, again, progress)
-    rows = {stem: artifact_metrics(counts[stem], manifests[stem]) | judged[stem] for stem in artifacts}
+    rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
@@ -77,17 +80,6 @@ def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[st
         else:
             plans[stem] = Plan(tuple(every))
     return plans
-
-
-def _count_all(
-    core: Core, artifacts: Mapping[str, Path], plans: Mapping[str, Plan], samples: Sequence[Any], progress: Progress
-) -> dict[str, Counted]:
-    counts = {}
-    for stem, plan in plans.items():
-        chosen, guest = [samples[i] for i in plan.frames], guest_of(artifacts[stem])
-        counts[stem] = partial(count_artifact, core, artifacts[stem], chosen, guest=guest, counted=plan.counted)
-    inferences = sum(max(len(plan.frames), plan.counted) for plan in plans.values())
-    return side_by_side(counts, inferences, "emulated inferences", progress)
 
 
 def _judge(

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from lab.a76.core import FOR_GUEST, GUEST, fetch_wheels, prepare
-from lab.a76.count import COUNTED, Counted, Guest, count_artifact, side_by_side
+from lab.a76.count import Counted, Guest, count_artifact, side_by_side
 from lab.a76.count_run import REFERENCE, chunks_here, errors_pct
-from lab.a76.report import artifact_metrics
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.artifact.manifest import car_of, read_manifest
 from rover_lib.onboard.errors import RoverError
@@ -133,14 +132,14 @@ def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress
 
     metrics.peers has rows like those of metrics.artifacts, with `file_mb` and `made_with`, the versions of their tools.
     A peer's chunks come from the emulated Pi, the reference from this machine. What the engines make is kept in
-    run_dir/peers. frames: how many held-out frames judge. Raises RoverError if arm.json is missing or was counted from
-    other artifacts, or if a peer cannot be had or run.
+    run_dir/peers. frames: how many held-out frames judge. Raises RoverError if arm.json is missing, or if a peer cannot
+    be had or run.
     """
     run_dir = Path(run_dir)
-    content, reference = open_counted_run(run_dir)
-    again = open_run(run_dir)
+    content, reference = read_stage(run_dir / "arm.json", "arm"), run_dir / f"{REFERENCE}.pt"
+    again, manifest = open_run(run_dir), read_manifest(reference)
     samples = pick_evenly(again.parts.held_out, frames)
-    core = prepare(progress)
+    core = prepare()
     given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
     made, counts = {}, {}
@@ -148,10 +147,9 @@ def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress
         size, packages = again.checkpoint.config.image_sizes[0], packages_there(engine)
         guest = Guest(FOLDER / "guest.py", (engine.name, *size), packages)
         made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
-        counts[engine.name] = partial(count_artifact, core, made[engine.name][0], samples, guest=guest)
-    counted = side_by_side(counts, max(len(samples), COUNTED) * len(made), "peers, emulated", progress)
-
-    here, manifest = chunks_here(reference, samples, progress), read_manifest(reference)
+        counts[engine.name] = partial(count_artifact, core, made[engine.name][0], manifest, samples, guest=guest)
+    counted = side_by_side(counts, "peers, emulated", progress)
+    here = chunks_here(reference, samples, progress)
     ranges = again.recordings.action_range()
     peers, inputs = {}, dict(content["inputs"])
     for name, (path, versions) in made.items():
@@ -160,15 +158,6 @@ def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress
         inputs[f"peers/{path.name}"] = sha256_of(path)
     metrics = content["metrics"] | {"peers": peers}
     return write_stage(run_dir / "arm.json", "arm", params=content["params"], metrics=metrics, inputs=inputs)
-
-
-def open_counted_run(run_dir: Path) -> tuple[dict[str, Any], Path]:
-    """Return a run's arm.json and its FP32 artifact. Raises RoverError unless the one was counted from the other."""
-    reference = run_dir / f"{REFERENCE}.pt"
-    content = read_stage(run_dir / "arm.json", "arm")
-    if not reference.exists() or content["inputs"].get(reference.name) != sha256_of(reference):
-        raise RoverError(f"{run_dir}/arm.json: counted from another {reference.name}", remedy="make count")
-    return content, reference
 
 
 def peer_metrics(
@@ -184,4 +173,4 @@ def peer_metrics(
     low, high = action_limits(names, car_of(manifest))
     errors = errors_pct(reference, np.clip(counted.chunks, low, high), names, ranges)  # as predict_chunk clips
     frames = {"frames": len(reference), "frames_on_the_core": len(counted.chunks)}
-    return artifact_metrics(counted, manifest) | errors | {"reference": REFERENCE} | frames
+    return counted.row | errors | {"reference": REFERENCE} | frames

@@ -1,18 +1,16 @@
-"""Turn counts into arm.json: the numbers of each artifact, gates, groups of kernels, computed times, and a table."""
+"""Judge and show what was counted: gates, groups of kernels, and a table."""
 
 import re
 from collections.abc import Mapping
 from typing import Any
 
-from lab.a76.count import Counted
-from rover_lib.onboard.care.pi5 import DRIVING, Work, predict_ms
+from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.columns import align
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst
 
 LABEL = "counted on an emulated Cortex-A76"
 STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"
-SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if nothing but SDOT ran
 
 # The gates of instructions are for one policy: one whose multiply-accumulates differ by less than this share.
 SAME_POLICY = 0.01
@@ -45,33 +43,6 @@ COLUMNS = {  # the table's, each with the key of arm.json and how it is written
     "MB": ("peak_memory_mb", ".0f"),
     "loading": ("peak_memory_loading_mb", ".0f"),
 }
-
-
-def artifact_metrics(counted: Counted, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return one artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
-    floor_g = manifest["gmac"] / SDOT_MACS
-    inferences_g = [n / 1e9 for n in counted.inferences]
-    kernels_g = {name: row[0] / 1e9 for name, row in counted.kernels.items()}
-    counts = {"instructions": counted.steady, "sdot": counted.sdot} | counted.work
-    work = {f"{name}_g": count / 1e9 for name, count in counts.items()} | {"alone": alone_of(kernels_g)}
-    return work | {
-        "floor_g": floor_g,
-        "x_floor": counted.steady / 1e9 / floor_g,
-        "first_g": inferences_g[0],
-        "second_g": inferences_g[1],
-        "tenth_g": inferences_g[9] if len(inferences_g) >= 10 else None,
-        "load_instructions_g": counted.load / 1e9,
-        "gmac": manifest["gmac"],
-        "image_height": manifest["cameras"][0]["height"],
-        "image_width": manifest["cameras"][0]["width"],
-        "instructions_by_kernel": kernels_g,
-        "sdot_by_kernel": {name: row[1] / 1e9 for name, row in counted.kernels.items()},
-        "peak_memory_mb": counted.peak_mb,
-        "peak_memory_loading_mb": counted.peak_loading_mb,
-        "threads": counted.versions["threads"],
-        "versions": counted.versions,
-        "computed_pi5_ms": predict_ms(Work.of(work))._asdict() | {"threads": DRIVING},
-    }
 
 
 def alone_of(instructions_by_kernel: Mapping[str, float]) -> float:
@@ -130,7 +101,7 @@ def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
 def table(content: dict[str, Any]) -> str:
     """Show arm.json as text: the counts, fewest instructions first; then the computed times and the gates."""
     metrics = content["metrics"]
-    counted = metrics["artifacts"] | {n: m for n, m in metrics.get("peers", {}).items() if "artifact" not in m}
+    counted = metrics["artifacts"] | metrics.get("peers", {})
     ordered = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
     for name, found in ordered:

@@ -9,6 +9,7 @@
  *                          all: every pulse of a servo pin, every line of the host, every event
  *                          changes: of the pulses those that differ from the one before on their pin, and no lines
  *                          monotonic_s is when the pin rose; a log that nobody reads is lost, "lost" then has how many
+ *                          a line that commands a drive has its pulses, steering and throttle, in the last two fields
  *         --reset-on-open  what DTR's edge does to an Uno when its port is opened; there is none if who closed it last had
  *                          HUPCL off
  *         --boot-ms        the boot loader's time: nothing runs for so long
@@ -18,7 +19,7 @@
  *         --eeprom         its first bytes; all others are erased
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
  *     Standard input takes, a line each: transmitter STEERING_US THROTTLE_US (0: no signal), wiggle, ready 0|1, reset,
- *     power (off and on), hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
+ *     power (off and on), unplug (the port's other end hangs up; the link then leads to another), hang ADDRESS, quit. ready 1: there is a human who wiggles the stick whenever that is all that arming lacks, but not
  *     in a stopped car that nobody has opened the port of since.
  *     It ends with whoever started it.
  *
@@ -48,6 +49,7 @@ static double period_us_of[CHANNELS] = {21316, 1016}; /* the transmitter's, unle
 struct uno_event {
     double at_us; /* PULSE, CUT: when the pin rose. LINE_IN: when the host's line was wholly in. */
     double pulse_us, period_us; /* period_us: since the pin rose before that, 0 for the first after a reset */
+    /* LINE_IN: the two pulses that a drive command asks for, otherwise 0 */
     int32_t kind, channel;
 };
 
@@ -69,6 +71,8 @@ struct uno {
     avr_uart_t *uart;
     struct channel channels[CHANNELS];
     uint16_t queue[QUEUE];
+    char line[128]; /* of the host, so far */
+    size_t line_length;
     uint8_t output[QUEUE];
     struct uno_event events[QUEUE];
     unsigned queue_head, queue_tail, output_head, output_tail, event_head, event_tail;
@@ -187,8 +191,16 @@ static avr_cycle_count_t feed(avr_t *avr, avr_cycle_count_t when, void *param) {
     if (uno->queue_head == uno->queue_tail) return 0;
     uint16_t byte = uno->queue[uno->queue_tail++ % QUEUE];
     avr_raise_irq(uno->serial_in, byte);
-    /* The byte is with the program one byte's time after simavr was given it. */
-    if (byte == '\n') event(uno, LINE_IN, -1, us(avr->cycle + BYTE_CYCLES), 0, 0);
+    if (byte != '\n') {
+        if (uno->line_length < sizeof uno->line - 1) uno->line[uno->line_length++] = (char)byte;
+    } else {
+        unsigned steering_us, throttle_us;
+        uno->line[uno->line_length] = 0;
+        uno->line_length = 0;
+        if (sscanf(uno->line, ">D %*u %*u %*u %u %u*", &steering_us, &throttle_us) != 2) steering_us = throttle_us = 0;
+        /* The byte is with the program one byte's time after simavr was given it. */
+        event(uno, LINE_IN, -1, us(avr->cycle + BYTE_CYCLES), steering_us, throttle_us);
+    }
     return when + (uno->uart->cycles_per_byte > BYTE_CYCLES ? uno->uart->cycles_per_byte : BYTE_CYCLES);
 }
 
@@ -474,6 +486,32 @@ static void human_reads(struct uno *uno, uint8_t byte) {
     uno_wiggle(uno);
 }
 
+static const char *link_path;
+static int master = -1; /* of the pty */
+static char pty_name[64];
+
+/* Plug the serial cable in, for the first time or after pulling it out. */
+static bool plug(void) {
+    int slave;
+    struct termios raw;
+    memset(&raw, 0, sizeof raw);
+    cfmakeraw(&raw);
+    raw.c_cflag |= HUPCL | CREAD | CLOCAL; /* as a serial port's is */
+    if (master >= 0) close(master);
+    if (openpty(&master, &slave, pty_name, &raw, NULL)) {
+        perror("arduino: openpty");
+        return false;
+    }
+    close(slave); /* so that POLLHUP tells whether somebody has the port open */
+    fcntl(master, F_SETFL, O_NONBLOCK);
+    unlink(link_path);
+    if (symlink(pty_name, link_path)) {
+        perror(link_path);
+        return false;
+    }
+    return true;
+}
+
 /* false: quit. */
 static bool obey(struct uno *uno, const char *line) {
     double steering_us, throttle_us;
@@ -492,6 +530,8 @@ static bool obey(struct uno *uno, const char *line) {
         uno_reset(uno);
     } else if (!strncmp(line, "power", 5)) {
         uno_power(uno);
+    } else if (!strncmp(line, "unplug", 6)) {
+        return plug();
     } else if (!strncmp(line, "quit", 4)) {
         return false;
     } else {
@@ -501,9 +541,9 @@ static bool obey(struct uno *uno, const char *line) {
 }
 
 /* Whether DTR stays up although the port was closed. What a real port forgets then, a pty is made to forget too. */
-static bool stays_up(int master, const char *name) {
+static bool stays_up(void) {
     struct termios now;
-    int port = open(name, O_RDWR | O_NOCTTY);
+    int port = open(pty_name, O_RDWR | O_NOCTTY);
     if (port >= 0) {
         ioctl(port, TIOCNXCL);
         close(port);
@@ -512,7 +552,7 @@ static bool stays_up(int master, const char *name) {
 }
 
 int main(int argc, char **argv) {
-    const char *elf = NULL, *link_path = NULL, *log = NULL, *eeprom = "";
+    const char *elf = NULL, *log = NULL, *eeprom = "";
     bool reset_on_open = false;
     double boot_s = 0;
     for (int i = 1; i < argc; i++) {
@@ -548,23 +588,7 @@ int main(int argc, char **argv) {
     for (unsigned byte; bytes_kept < sizeof kept && sscanf(eeprom + 2 * bytes_kept, "%2x", &byte) == 1;)
         kept[bytes_kept++] = (uint8_t)byte;
     uno_eeprom(uno, kept, bytes_kept, true);
-    int master, slave;
-    char name[64];
-    struct termios raw;
-    memset(&raw, 0, sizeof raw);
-    cfmakeraw(&raw);
-    raw.c_cflag |= HUPCL | CREAD | CLOCAL; /* as a serial port's is */
-    if (openpty(&master, &slave, name, &raw, NULL)) {
-        perror("arduino: openpty");
-        return 1;
-    }
-    close(slave); /* so that POLLHUP tells whether somebody has the port open */
-    fcntl(master, F_SETFL, O_NONBLOCK);
-    unlink(link_path);
-    if (symlink(name, link_path)) {
-        perror(link_path);
-        return 1;
-    }
+    if (!plug()) return 1;
     double start = monotonic(); /* when simulated time was 0 */
     bool open = false, running = true, dtr = false;
     int state = 0;
@@ -592,7 +616,7 @@ int main(int argc, char **argv) {
                 ahead += boot_s * slow;
             }
         }
-        if (open && !open_now) dtr = stays_up(master, name);
+        if (open && !open_now) dtr = stays_up();
         open = open_now;
         if (files[0].revents & POLLIN) {
             uint8_t bytes[512];

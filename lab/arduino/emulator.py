@@ -178,6 +178,10 @@ class EmulatedArduino:
         """Switch its power off and on again."""
         self._process.send_line("power")
 
+    def unplug(self) -> None:
+        """Pull the serial cable out, and plug it in again: who had the port open has to open it anew."""
+        self._process.send_line("unplug")
+
     def hang(self) -> None:
         """Make the firmware's loop() an endless loop until the next reset."""
         self._process.send_line(f"hang {symbol('loop'):x}")

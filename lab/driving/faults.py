@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from lab.driving.on_pins import pin_rows, run_on_pins
-from lab.driving.pins import STOPPED, Gates
-from lab.driving.rows import rows_of, run_row
+from lab.driving.pins import DEFAULT, GATES, STOPPED
+from lab.driving.rows import all_rows, run_row
 from rover_lib.onboard.car import servo_link
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import RoverError
@@ -26,12 +26,14 @@ def run_faults(output: Path | None, only: Collection[str], car: Car, echo: Calla
     """Inject all faults, or those named in `only`; return the metrics, and write them to `output` as stage `faults`.
 
     A fault of the default car that is on pins is not repeated in virtual time; other cars have all in virtual time.
-    echo: called with a line when a fault is done. Raises RoverError for unknown names, if the bench does not drive, or
-    if there is no emulated Arduino or no gcc here.
+    echo: called with a line when a fault is done. Raises RoverError for unknown names, for a car with a gamepad, if the
+    bench does not drive, or if there is no emulated Arduino or no gcc here.
     """
-    begin, gates = time.monotonic(), Gates.of_params(car)
-    on_pins = pin_rows() if car == Car() else ()
-    rows = [row for row in rows_of(car) if row.name not in {row.name for row in on_pins}]
+    if car.human != DEFAULT.human:
+        raise RoverError(f"{car.name}: its human holds a gamepad", remedy="'python -m lab random' drives with one, too")
+    begin = time.monotonic()
+    on_pins = pin_rows() if car == DEFAULT else ()
+    rows = [row for row in all_rows().values() if row.name not in {row.name for row in on_pins}]
     names = [row.name for row in (*rows, *on_pins)]
     if unknown := set(only) - set(names):
         raise RoverError("no such fault", found=sorted(unknown), remedy=f"choose from {names}")
@@ -39,14 +41,14 @@ def run_faults(output: Path | None, only: Collection[str], car: Car, echo: Calla
     chosen = set(only or names)
     done = []
     in_stories = (run_row(fault, car) for fault in rows if fault.name in chosen)
-    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in chosen], gates)):
+    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in chosen])):
         done.append(row)
         echo(row_text(row))
     summary = summary_of(done) | {"seconds": round(time.monotonic() - begin, 1)}
     wrong = [f"{row['fault']}: {sentence}" for row in done for sentence in row["wrong"]]
     metrics = {"faults": done, "summary": summary, "wrong": wrong}
     if output:
-        write_stage(output, "faults", params=vars(gates), metrics=metrics)
+        write_stage(output, "faults", params=GATES, metrics=metrics)
     return metrics
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.driving.virtual import HELD, LIVE, LOST, Asked, Seen
+from lab.driving.virtual import DROPPING, GONE, HELD, LIVE, LOST, SILENT, Asked, Hand, Seen
 
 # What firmware/README.md and params.yml promise, with numbers that are written here anew.
 RESTING_US = 124  # a throttle pulse up to this moves no car
@@ -104,7 +104,7 @@ def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
     checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
-    with_pad, with_receiver = (_armed_at_rest,), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
+    with_pad, with_receiver = (_armed_at_rest, _pad_lost), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
     for check in (*(with_pad if seen.gamepad else with_receiver), *checks, _answered, _in_time):
         if (what := check(run)) is not None:
             yield f"{check.__name__[1:]}: {what}"
@@ -224,6 +224,19 @@ def _armed_at_rest(run: Run) -> str | None:
             if _for_ms(holds, UNSEEN_MS)[armed]:
                 return f"armed at {armed} ms with a gamepad's throttle {what}"
     return None
+
+
+def _pad_lost(run: Run) -> str | None:
+    """A gamepad that is let go of, silent or gone ends autonomy."""
+
+    def lost(hand: Hand) -> bool:
+        return hand.pad in (GONE, SILENT) or (hand.receiver == LOST and hand.pad != DROPPING)
+
+    must_end = _each_ms(run.seen.hands, len(run.throttle), lost) == 1
+    for hung_ms, until_ms in run.seen.hung:
+        must_end[hung_ms:until_ms] = False
+    ms = _first(_for_ms(must_end, UNSEEN_MS) & run.autonomous)
+    return None if ms is None else f"autonomous at {ms} ms, {UNSEEN_MS} ms without the gamepad"
 
 
 def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:

@@ -1,20 +1,20 @@
 """Twelve faults of a drive in real time: what only processes, clocks and the pins of an emulated Arduino show.
 
 Everything that drives is what drives the real car: `rover drive` as a process, pyserial, and the real firmware, in
-simavr. Three pieces of hardware are replaced. The camera is a FIFO of JPEGs, the cable a pair of ptys with this program
-between them, and the transmitter's pulses come from simavr. All other faults are in rows.py, in virtual time.
+simavr. Three pieces of hardware are replaced. The camera is a FIFO of JPEGs, the cable a pty, and the transmitter's
+pulses come from simavr. All other faults are in rows.py, in virtual time.
 """
 
 import contextlib
-import ctypes
 import functools
-import platform
+import os
 import re
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -24,8 +24,7 @@ from balloon_world.car import CameraFeed
 from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import REST_US, PinEvent
 from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.cable import PRIORITY, Cable, boost
-from lab.driving.pins import BEFORE_S, CONTINUES, STOPPED_THROTTLE_US, Gates, Observation, judge, row_of
+from lab.driving.pins import BEFORE_S, CONTINUES, Command, Observation, judge, most_throttle_us, row_of
 from lab.driving.policy import RATE_HZ, make_artifact, pictures
 from lab.driving.rows import FaultRow
 from lab.driving.stories import read_stories
@@ -40,25 +39,24 @@ ATTEMPTS = 5  # how often a row is tried if this machine was too busy
 KILLED = -signal.SIGKILL
 LINE_S = 1.5  # within which a line must come
 LATE_COMMAND_S = 0.1  # three ticks of a drive
+PRIORITY = 3  # of real-time scheduling, above that of rover drive: hardware does not wait for this machine
 # A drive waits for its human's gesture only if stdin is a terminal.
 IN_TERMINAL = "import os, pty; kept, terminal = pty.openpty(); os.dup2(terminal, 0); "
-THREAD_ENDS = f"from {__name__} import end_thread_on_signal; end_thread_on_signal(); "
-
-
-def end_thread_on_signal() -> None:
-    """Make SIGUSR2 end only the main thread of this process, which is the loop's, by the system call exit."""
-    number = {"x86_64": 60, "aarch64": 93}[platform.machine()]
-    signal.signal(signal.SIGUSR2, lambda *_: ctypes.CDLL(None).syscall(number, 0))
+# SIGUSR2 ends only the main thread, which is the loop's, by the system call exit.
+THREAD_ENDS = (
+    "import ctypes, platform, signal; exit = {'x86_64': 60, 'aarch64': 93}[platform.machine()]; "
+    "signal.signal(signal.SIGUSR2, lambda *_: ctypes.CDLL(None).syscall(exit, 0)); "
+)
 
 
 class Drive(Child):
-    """`rover drive` with the bench's artifact, camera and cable. prepared: code that runs in its process before."""
+    """`rover drive` with the bench's artifact, camera and cable."""
 
-    def __init__(self, bench: "PinBench", prepared: str):
-        self.prepared, self._marked = prepared, 0
-        code = f"{IN_TERMINAL}{prepared}from rover_lib.onboard.cli import main; main()"
-        devices = "--camera", bench.camera, "--port", bench.cable.port, "--view", bench.folder / "view"
-        options = "--film", "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
+    def __init__(self, bench: "PinBench"):
+        self._marked = 0
+        code = f"{IN_TERMINAL}{THREAD_ENDS}from rover_lib.onboard.cli import main; main()"
+        devices = "--camera", bench.camera, "--port", bench.arduino.port, "--view", bench.folder / "view"
+        options = "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
         command = (sys.executable, "-c", code, "drive", bench.artifact, *devices, *options)
         super().__init__("rover drive", *command, error=RoverError)
 
@@ -76,7 +74,7 @@ class Drive(Child):
 
 
 class PinBench:
-    """An Arduino, a camera, a cable, and the drive that uses them; a context manager. undo: what ends the fault."""
+    """An Arduino, a camera, and the drive that uses them; a context manager. undo: what ends the fault."""
 
     def __enter__(self) -> "PinBench":
         self.undo, self.events = contextlib.ExitStack(), list[PinEvent]()
@@ -86,10 +84,9 @@ class PinBench:
             self.artifact, self.camera = self.folder / "policy.pt", self.folder / "camera"
             make_artifact(self.artifact)
             self.arduino = stack.enter_context(EmulatedArduino(transmitter=REST_US, nice=NICE))
-            boost(self.arduino.pid)
+            with contextlib.suppress(OSError):  # if this user may not
+                os.sched_setscheduler(self.arduino.pid, os.SCHED_RR, os.sched_param(PRIORITY))
             stack.enter_context(CameraFeed(self.camera, *pictures()))
-            self.cable = Cable(self.arduino.port)
-            stack.callback(lambda: self.cable.unplug())
             stack.enter_context(real_time(PRIORITY))
             stack.callback(self._end_drive)
             stack.callback(self.undo.close)
@@ -114,35 +111,25 @@ class PinBench:
                 return
             time.sleep(min(left, 0.1))
 
-    @property
-    def driving(self) -> bool:
-        """Whether each of the latest throttle pulses moves the car."""
-        since_s = time.monotonic() - BEFORE_S
+    def driving(self, seconds: float = BEFORE_S) -> bool:
+        """Whether each throttle pulse of the last seconds, at most 1.5, moves the car."""
+        since_s = time.monotonic() - seconds
         latest = [e.pulse_us for e in self.events[-2000:] if e.pin == "throttle" and e.end_s > since_s]
-        return bool(latest) and min(latest) > STOPPED_THROTTLE_US
+        return bool(latest) and min(latest) > most_throttle_us()
 
-    def at_speed(self, prepared: str = "") -> None:
-        """Make sure that a drive has been driving for a while: the present one if it was prepared so, or a new one."""
-        if self._drive and self._drive.running and self._drive.prepared == prepared:
+    def at_speed(self) -> None:
+        """Make sure that a drive has been driving for a while: the present one, or a new one."""
+        if self._drive and self._drive.running:
             self.wait(AT_SPEED_S)
-            if self.driving:
+            if self.driving():
                 return
-        self._start(prepared)
-
-    def _start(self, prepared: str) -> None:
-        """Start a new drive with a new cable, let the human arm it, and wait until it has been driving for a while."""
         self._end_drive()
         self.clear_faults()
-        self.cable.unplug()
-        self.cable = Cable(self.arduino.port)
         self.arduino.ready(True)
-        self._drive = drive = Drive(self, prepared)
+        self._drive = drive = Drive(self)
         deadline = time.monotonic() + START_S
-        first_s = None  # the time of its first command
-        while first_s is None or time.monotonic() - first_s < AT_SPEED_S or not self.driving:
+        while not self.driving(AT_SPEED_S):
             self.wait(0.02)
-            if first_s is None and self.cable.commands:
-                first_s = self.cable.commands[0].at_s
             if not drive.running or time.monotonic() > deadline:
                 raise RoverError("rover drive did not drive", found=drive.errors()[-3:], remedy="drive it by hand")
         self.arduino.ready(False)  # from here on the human only does what a fault says
@@ -171,6 +158,14 @@ def _signal(name: str) -> Callable[[PinBench], object]:
     return lambda bench: bench.drive.process.send_signal(signal.Signals[name])
 
 
+def _stick(bench: PinBench) -> None:
+    """Let the port take no more bytes, so that whoever writes has to wait."""
+    port = os.open(bench.arduino.port, os.O_RDWR | os.O_NOCTTY)
+    bench.undo.callback(os.close, port)
+    bench.undo.callback(termios.tcflow, port, termios.TCOON)
+    termios.tcflow(port, termios.TCOOFF)
+
+
 def _starve(bench: PinBench) -> None:
     for _ in range(4):
         busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
@@ -187,8 +182,8 @@ INJECT: dict[str, Callable[[PinBench], object]] = {
     "Arduino reset": lambda bench: bench.arduino.reset(),
     "Arduino's power cut": lambda bench: bench.arduino.power(),
     "Arduino loop hung": lambda bench: bench.arduino.hang(),
-    "serial unplugged": lambda bench: bench.cable.unplug(),
-    "serial stuck": lambda bench: bench.cable.stick(),
+    "serial unplugged": lambda bench: bench.arduino.unplug(),
+    "serial stuck": _stick,
     "human takes over by steering": lambda bench: bench.arduino.transmitter(REST_US[0] + 144, REST_US[1]),
     "host process stopped": _stop_process,
     "loop thread killed": _signal("SIGUSR2"),
@@ -197,7 +192,6 @@ INJECT: dict[str, Callable[[PinBench], object]] = {
     "CPU starved": _starve,
     "disk full while logging": _fill_disk,
 }
-PREPARED = {"loop thread killed": THREAD_ENDS}
 STARVES = "CPU starved"  # takes the drive's time
 
 
@@ -207,14 +201,10 @@ def pin_rows() -> list[FaultRow]:
     return [FaultRow(**row) for row in read_stories("pins")]
 
 
-def _human_us(fault: FaultRow) -> tuple[float, float]:
-    return REST_US[0] + fault.moved_us[0], REST_US[1] + fault.moved_us[1]
-
-
 # ---- judging
 
 
-def run_pin_row(bench: PinBench, fault: FaultRow, gates: Gates) -> dict[str, Any]:
+def run_pin_row(bench: PinBench, fault: FaultRow) -> dict[str, Any]:
     """Inject a fault into a drive at speed, judge it, and return the row of metrics.faults.
 
     If this machine was too busy for the fault to be judged, it is repeated, up to ATTEMPTS times in all.
@@ -222,19 +212,18 @@ def run_pin_row(bench: PinBench, fault: FaultRow, gates: Gates) -> dict[str, Any
     attempts, spoilt = 0, True
     while spoilt and attempts < ATTEMPTS:
         attempts += 1
-        bench.at_speed(PREPARED.get(fault.name, ""))
+        bench.at_speed()
         seen, code, line = _inject(bench, fault)
-        spoilt = _spoilt(fault, seen, gates)
-    verdict = judge(fault.expected, seen, gates, human_us=_human_us(fault))
-    if code != fault.wanted_code:
-        verdict.wrong.append(f"rover drive ended with {code}, expected {fault.wanted_code}")
+        spoilt = _spoilt(fault, seen)
+    human_us = REST_US[0] + fault.moved_us[0], REST_US[1] + fault.moved_us[1]
+    judged = judge(fault.expected, seen, human_us=human_us)
     with contextlib.suppress(RoverError):  # then it is not recovered
         bench.at_speed()
     if code == KILLED:  # the next drive tells of it
         line = bench.drive.line_of(fault.message)
     more = {"attempts": attempts, "stalled_ms": round(seen.stalled_ms(), 1)}
     line = line and line.replace(f"{bench.folder}/", "")
-    return row_of(fault, verdict, code, line, bench.driving, "on pins", **more)
+    return row_of(fault, judged, code, line, bench.driving(), "on pins", **more)
 
 
 def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
@@ -247,23 +236,24 @@ def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, 
     bench.wait(fault.watch_ms / 1e3)
     end_s = time.monotonic()
     bench.wait(KNOWN_S)
-    commands = [c for c in bench.cable.commands if at_s - 1 < c.at_s <= end_s]
+    lines = [e for e in bench.events if e.kind == "line" and e.pulse_us and e.monotonic_s <= end_s]
+    commands = [Command(e.monotonic_s, round(e.pulse_us), round(e.period_us)) for e in lines]
     code = drive.process.poll() if fault.wanted_code is None else drive.wait(END_S)
     line = None if code == KILLED else drive.line_of(fault.message)
     bench.clear_faults()
     return Observation(bench.events, commands, at_s, end_s), code, line
 
 
-def _spoilt(fault: FaultRow, seen: Observation, gates: Gates) -> bool:
+def _spoilt(fault: FaultRow, seen: Observation) -> bool:
     """Whether this machine had no time for the Arduino or the drive, so that there is nothing to judge."""
-    if seen.stalled_ms() or not seen.was_driving(gates.throttle_max_us):
+    if seen.stalled_ms() or not seen.was_driving(most_throttle_us()):
         return True
     return fault.expected == CONTINUES and fault.name != STARVES and seen.longest_pause_s() > LATE_COMMAND_S
 
 
-def run_on_pins(faults: Sequence[FaultRow], gates: Gates) -> Iterator[dict[str, Any]]:
+def run_on_pins(faults: Sequence[FaultRow]) -> Iterator[dict[str, Any]]:
     """Yield a row for each fault. Raises RoverError if the bench does not drive, or without an emulator."""
     if faults:
         with PinBench() as bench:
             for fault in faults:
-                yield run_pin_row(bench, fault, gates)
+                yield run_pin_row(bench, fault)

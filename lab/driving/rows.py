@@ -9,16 +9,16 @@ what only a real process can have, are on the pins of an emulated Arduino too (o
 import functools
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from balloon_world.simulated_arduino import PinEvent
 from lab.driving.invariants import Run, broken
-from lab.driving.pins import CONTINUES, DEFAULT, HUMAN, REFUSED, STOPPED, Command, Gates, Observation, judge, row_of
-from lab.driving.stories import TOLD, Happening, Stage, Story, drive_story, during, read_stories
-from lab.driving.virtual import STUCK, Killed, Seen
+from lab.driving.pins import CONTINUES, DEFAULT, HUMAN, REFUSED, STOPPED, Command, Observation, judge, row_of
+from lab.driving.stories import TOLD, Happening, Stage, Story, drive_story, read_stories
+from lab.driving.virtual import Killed, Seen
 from lab.driving.virtual_host import scenery
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import DriveFault, RoverError
@@ -26,9 +26,7 @@ from rover_lib.onboard.errors import DriveFault, RoverError
 AT_MS = 3000  # of a fault, when the car has been at speed for a while
 END_MS, WIGGLE_MS, AGAIN_MS, STOP_MS = 5200, 5600, 7000, 8400  # the drive's end, and then another without the fault
 WATCH_MS = 1000
-GAMEPAD_MS = 1000
 EXIT_CODES = {STOPPED: 3, HUMAN: 4, CONTINUES: None, REFUSED: 1}
-LOST_SIGNAL = "transmitter's signal was lost"
 H = Happening
 
 
@@ -37,10 +35,9 @@ class FaultRow:
     """One fault, and what is expected of the car.
 
     message: a regular expression for the line that tells of the fault. exit_code: of the drive, None if it goes on;
-    "usual": that of EXIT_CODES. at_ms, watch_ms: when it happens, and for how long the car is watched. until_limit:
-    whether a car that `continues` is stopped by the plan's age. wiggled: whether a human made the gesture before. late:
-    whether the drive is started 3.6 s later. human: the only one of car.yml's humans who has this fault; "": both.
-    moved_us: the human's sticks, from rest, where `human` is expected.
+    "usual": that of EXIT_CODES. watch_ms: for how long the car is watched. until_limit: whether a car that `continues`
+    is stopped by the plan's age. wiggled: whether a human made the gesture before. late: whether the drive is started
+    3.6 s later. moved_us: the human's sticks, from rest, where `human` is expected.
     """
 
     name: str
@@ -49,12 +46,10 @@ class FaultRow:
     message: str
     happenings: tuple[Happening, ...] = ()
     exit_code: int | str | None = "usual"
-    at_ms: int = AT_MS
     watch_ms: int = WATCH_MS
     until_limit: bool = False
     wiggled: bool = True
     late: bool = False
-    human: str = ""
     moved_us: Sequence[int] = (0, 0)
 
     @property
@@ -62,34 +57,19 @@ class FaultRow:
         """The exit code that is expected of the drive."""
         return EXIT_CODES[self.expected] if self.exit_code == "usual" else self.exit_code
 
-    def story(self, gamepad: bool = False) -> Story:
-        """The fault, and after it another drive, which nothing happens to.
-
-        gamepad: the human has one, which counts only while a link is open. So both drives begin later: by a policy that
-        takes long for its first plan, while the human makes the gesture.
-        """
-        later_ms, wiggles_ms = (GAMEPAD_MS, AGAIN_MS + GAMEPAD_MS + 500) if gamepad else (0, WIGGLE_MS)
-        happenings = [replace(h, at_ms=h.at_ms + later_ms * (h.at_ms > 2000)) for h in self.happenings]
+    def story(self) -> Story:
+        """The fault, and after it another drive, which nothing happens to."""
+        happenings = list(self.happenings)
         if self.expected != REFUSED:
-            happenings.append(H(END_MS + later_ms, "the operator says stop"))
-        happenings += [H(wiggles_ms, "the human wiggles the stick"), H(AGAIN_MS + later_ms, "the operator starts it")]
-        if gamepad:
-            happenings += [H(ms, "the policy is slow", 1800, 300) for ms in (1400, AGAIN_MS + later_ms - 100)]
-            happenings += [H(2000, "the human wiggles the stick")] * self.wiggled
-        longer_ms = STOP_MS + 2 * later_ms - 4800
-        wiggled = self.wiggled and not gamepad
-        return Story(tuple(happenings), wiggled, longer_ms=longer_ms, late=self.late, steady=True)
+            happenings.append(H(END_MS, "the operator says stop"))
+        happenings += [H(WIGGLE_MS, "the human wiggles the stick"), H(AGAIN_MS, "the operator starts it")]
+        return Story(tuple(happenings), self.wiggled, longer_ms=STOP_MS - 4800, late=self.late, steady=True)
 
 
 @functools.cache
 def all_rows() -> dict[str, FaultRow]:
     """Read the faults of stories.yml, by their names."""
     return {row["name"]: FaultRow(**row) for row in read_stories("rows")}
-
-
-def rows_of(car: Car) -> list[FaultRow]:
-    """Return the rows that this car can have."""
-    return [row for row in all_rows().values() if row.human in ("", car.human)]
 
 
 # ---- what only these rows have
@@ -134,7 +114,6 @@ def _flip(stage: Stage, h: Happening) -> None:
 
 
 TOLD["a bit of 1 % of the bytes"] = _flip
-TOLD[f"the gamepad: {STUCK}"] = during("hand", pad=STUCK)
 
 
 # ---- judging
@@ -142,28 +121,22 @@ TOLD[f"the gamepad: {STUCK}"] = during("hand", pad=STUCK)
 
 def run_row(fault: FaultRow, car: Car = DEFAULT) -> dict[str, Any]:
     """Drive a fault's story with a car; return the row of metrics.faults."""
-    gates = Gates.of_params(car)
-    gamepad = car.human == "gamepad"
-    later_ms = GAMEPAD_MS * gamepad
-    seen = drive_story(fault.story(gamepad), car)
+    seen = drive_story(fault.story(), car)
     human_us = car.numbers[2] + fault.moved_us[0], car.numbers[6] + fault.moved_us[1]
-    refused = fault.expected == REFUSED
-    at_ms, over_ms = (0, AGAIN_MS) if refused else (fault.at_ms + later_ms, END_MS + later_ms)
-    watch_ms = 120 if gamepad and fault.expected == HUMAN else fault.watch_ms  # the drive ends, and with it his way
-    watched = _observe(seen, car, at_ms, over_ms if refused else at_ms + watch_ms)
-    verdict = judge(fault.expected, watched, gates, car, human_us=human_us, until_limit=fault.until_limit)
+    at_ms, end_ms, over_ms = AT_MS, AT_MS + fault.watch_ms, END_MS
+    if fault.expected == REFUSED:
+        at_ms, end_ms, over_ms = 0, AGAIN_MS, AGAIN_MS
+    watched = _observe(seen, car, at_ms, end_ms)
+    figures, wrong = judge(fault.expected, watched, car, human_us=human_us, until_limit=fault.until_limit)
     code = next((_exit_code(error) for ms, error in seen.errors if ms < over_ms), None)
-    if code != fault.wanted_code:
-        verdict.wrong.append(f"the drive ended with {code}, expected {fault.wanted_code}")
     said = [text for ms, text in seen.log if ms >= at_ms] + [words for _, ms, words in seen.drives if words]
-    message = fault.message + f"|{LOST_SIGNAL}" * (gamepad and fault.expected == STOPPED)  # its sticks stop, too
-    line = next((text for text in said if re.search(message, text)), None)
+    line = next((text for text in said if re.search(fault.message, text)), None)
     run = Run(seen)
     recovered = bool((run.autonomous & (run.throttle != car.numbers[6]))[AGAIN_MS:].any())
     if car == DEFAULT:  # the invariants' numbers are this car's
-        verdict.wrong += broken(seen)
+        wrong += broken(seen)
     method = ", ".join(dict.fromkeys(h.what for h in fault.happenings)) or "nothing happens"
-    return row_of(fault, verdict, code, line, recovered, f"in virtual time: {method}")
+    return row_of(fault, (figures, wrong), code, line, recovered, f"in virtual time: {method}")
 
 
 def _observe(seen: Seen, car: Car, at_ms: int, end_ms: int) -> Observation:

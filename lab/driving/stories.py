@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from lab.driving.virtual import DROPPING, GONE, HELD, LIVE, LOST, PRESET, SILENT, Killed, Seen, World
+from lab.driving.virtual import DROPPING, GONE, HELD, LIVE, LOST, PRESET, SILENT, STUCK, Killed, Seen, World
 from lab.driving.virtual_host import PLAN, Process
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import frame
@@ -103,7 +103,7 @@ class Stage:
 
 Happen = Callable[[Stage, Happening], object]
 HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
-TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone (rows.py): no random drive has them
+TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone: no random drive has them
 A_WHILE, LONG, ONCE = (20, 2500), (20, 4000), (0, 0)
 AMOUNT = object()  # of a value: the happening's amount
 
@@ -254,6 +254,7 @@ def _pull(stage: Stage, h: Happening) -> None:
 
 for _fault in (GONE, SILENT, DROPPING):
     _may(f"the gamepad: {_fault}", for_ms=A_WHILE)(during("hand", pad=_fault))
+TOLD[f"the gamepad: {STUCK}"] = during("hand", pad=STUCK)
 _may("the human wiggles the stick")(lambda stage, h: stage.wiggle())
 _may("the process is stopped", for_ms=A_WHILE)(lambda stage, h: stage.world.pause(h.for_ms))
 _may("the machine is suspended", for_ms=(200, 40_000))(lambda stage, h: stage.world.suspend(h.for_ms))
@@ -308,7 +309,7 @@ def read_stories(section: str) -> list[dict[str, Any]]:
     return [row | {"happenings": tuple(Happening(*each) for each in row.pop("happens", ()))} for row in rows]
 
 
-# Stories that once broke an invariant, and how a drive ends in them: a regular expression.
+# Those to be kept, and how a drive ends in them: a regular expression.
 KEPT: dict[str, tuple[Story, str]] = {}
 for _row in read_stories("kept"):
     _name, _end = _row.pop("name"), _row.pop("end")

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.pins import STOPPED_THROTTLE_US
+from lab.driving.pins import most_throttle_us
 from lab.driving.policy import PLAIN, make_artifact, pictures
 from lab.pi import playbooks
 from lab.pi.container import CAMERA, PORT, Container
@@ -85,7 +85,7 @@ class Deployment:
         self.gates: list[dict[str, Any]] = []
         self.wrong: list[str] = []
         self.variables: dict[str, Any] = {f"rover_{name}": str(folder / name) for name in ("wheels", "fetched")}
-        self.variables |= {"rover_camera": CAMERA, "rover_film": True, "rover_port": PORT}
+        self.variables |= {"rover_camera": CAMERA, "rover_port": PORT}
         self.variables |= {"rover_hz": HZ, "rover_ready_s": READY_S}
 
     def gate(self, name: str, wanted: str, found: Any, holds: bool) -> None:
@@ -171,7 +171,8 @@ class Deployment:
         driven = sum(state == "A" for state in read_log(log).ticks["state"]) if log else 0
         self.gate("ticks driven", f"at least {LEAST_TICKS}", driven, driven >= LEAST_TICKS)
         throttle_us = [e.pulse_us for e in self.board.pulses() if e.kind == "pulse" and e.pin == "throttle"]
-        moved = max(throttle_us, default=0.0) > STOPPED_THROTTLE_US >= (throttle_us or [STOPPED_THROTTLE_US + 1])[-1]
+        most_us = most_throttle_us()
+        moved = max(throttle_us, default=0.0) > most_us >= (throttle_us or [most_us + 1])[-1]
         self.gate("throttle's pulses", "moved the car, and stopped it", throttle_us[-1:], moved)
 
 

@@ -7,15 +7,12 @@ digits of a number after its sixth. What quotes a number reads it there.
 """
 
 import hashlib
-import io
 import json
 import re
-from base64 import b64decode, b64encode
 from pathlib import Path
 from typing import Any
 
 import nbformat
-from PIL import Image
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
@@ -23,7 +20,6 @@ from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
 RESULTS_OF = {"05_benchmark": "benchmark-*", "08_distill": "students"}  # the others' stages are their names
 OF_LABORATORY = ("faults*.json", "random.json", "mutants.json")  # in runs/, where make leaves them
-LARGE = 120_000  # bytes of a picture
 LIMIT = 1_000_000  # bytes, of a committed notebook or JSON
 DIGITS = 6  # of each number: pages, notebooks and tests read four
 MANY_INPUTS = 40  # hashes of files; more of them are summed up in one
@@ -91,20 +87,10 @@ def _plain(output: Any) -> Any:
     if "execution_count" in output:
         output.execution_count = None
     if picture := output.get("data", {}).get("image/png"):
-        output.data = {"image/png": _smaller(picture)}  # without "<Figure size ...>"
+        output.data = {"image/png": picture}  # without "<Figure size ...>"
     if "metadata" in output:
         output.metadata = {kind: how for kind, how in output.metadata.items() if kind == "image/png"}  # its size
     return output
-
-
-def _smaller(picture: str) -> str:
-    """Return a base64 PNG, with 256 colours if it is large."""
-    raw = b64decode(picture)
-    if len(raw) > LARGE:
-        buffer = io.BytesIO()
-        Image.open(io.BytesIO(raw)).convert("RGB").quantize(256).save(buffer, "PNG", optimize=True)
-        raw = buffer.getvalue()
-    return b64encode(raw).decode()
 
 
 def result(path: Path) -> str:

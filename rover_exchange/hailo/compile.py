@@ -1,7 +1,6 @@
 """Compile this kit's network for one chip, and pack what the rover loads.
 
-    python3 compile.py hailo8                     # parse, quantize, compile, pack
-    python3 compile.py hailo8 --hef mine.hef      # only pack a HEF that was compiled otherwise
+    python3 compile.py hailo8       # parse, quantize, compile, pack
 
 It needs Hailo's Dataflow Compiler, 3.x for Hailo-8 and 8L, 5.x for Hailo-10H, and nothing else of the project. Nobody
 who wrote this had that compiler. It makes the same calls as Hailo's tutorials and model zoo.
@@ -21,15 +20,12 @@ NAME = "backbone"  # of the network
 def main() -> None:
     parser = argparse.ArgumentParser(description="Compile this kit's network for a chip, and pack it.")
     parser.add_argument("chip", choices=CHIPS)
-    parser.add_argument("--hef", type=Path, help="do not compile: pack this one")
-    given = parser.parse_args()
-    kit = Path(__file__).resolve().parent
-    hef = given.hef or compile_network(kit, given.chip)
-    print(f"{pack(kit, given.chip, hef)}: take it to the rover, and run `rover doctor` there")
+    chip, kit = parser.parse_args().chip, Path(__file__).resolve().parent
+    print(f"{pack(kit, chip, compile_network(kit, chip))}: take it to the rover, and run `rover doctor` there")
 
 
 def compile_network(kit: Path, chip: str) -> Path:
-    """Compile the network and return the path of its HEF. Ends the program if its inputs are numbered otherwise."""
+    """Compile the network and return the path of its HEF."""
     from hailo_sdk_client import ClientRunner
 
     network = json.loads((kit / "kit.json").read_text())
@@ -37,18 +33,12 @@ def compile_network(kit: Path, chip: str) -> Path:
     runner.translate_onnx_model(
         str(kit / f"{NAME}.onnx"),
         NAME,
-        start_node_names=list(network["inputs"]),
-        end_node_names=network["end_nodes"],
-        net_input_shapes=network["inputs"],
+        start_node_names=[network["input"]],
+        end_node_names=[network["end"]],
+        net_input_shapes={network["input"]: network["shape"]},
     )
-    layers, data = runner.get_hn_dict()["layers"], {}
-    for number, key in enumerate(network["inputs"], 1):
-        layer = f"{NAME}/input_layer{number}"
-        if key not in layers.get(layer, {}).get("original_names", []):
-            raise SystemExit(f"{NAME}.alls takes {layer} for '{key}', and the layers are {', '.join(layers)}")
-        data[layer] = np.load(kit / f"calibration_{key}.npy", mmap_mode="r")
     runner.load_model_script(str(kit / f"{NAME}.alls"))
-    runner.optimize(data if len(data) > 1 else next(iter(data.values())))
+    runner.optimize(np.load(kit / f"calibration_{network['input']}.npy", mmap_mode="r"))
     runner.save_har(str(kit / f"{NAME}_{chip}.har"))
     hef = kit / f"{NAME}_{chip}.hef"
     hef.write_bytes(runner.compile())

@@ -48,37 +48,30 @@ def write_kit(
         manifest = _manifest(Path(run_dir), samples, folder) | _describe(policy, front)
         onnx.save(rest, folder / "transformer.onnx")
         onnx.save(front.model, folder / f"{NAME}.onnx")
-        (folder / f"{NAME}.alls").write_text(model_script(front, policy.config, samples))
+        (folder / f"{NAME}.alls").write_text(model_script(policy.config, samples))
         for name in ("KIT.md", "compile.py"):
             shutil.copyfile(Path(__file__).with_name(name), folder / name)
-        write_calibration(policy, chosen, folder, progress)
-        content = {"schema": 1, "inputs": front.inputs, "end_nodes": list(front.outputs.values()), "manifest": manifest}
+        write_calibration(policy.config, chosen, folder / f"calibration_{front.picture}.npy", progress)
+        content = {"schema": 1, "input": front.picture, "shape": front.shape, "end": front.end, "manifest": manifest}
         (folder / "kit.json").write_text(json.dumps(content, indent=1))
 
 
-def write_calibration(policy: ACT, samples: Sequence[Sample], folder: Path, progress: Progress) -> None:
-    """Write calibration_frame_<camera>.npy, (n, height, width, 3) uint8 RGB."""
-    config = policy.config
-    arrays = [
-        open_memmap(folder / f"calibration_frame_{name}.npy", "w+", np.uint8, (len(samples), *size, 3))
-        for name, size in zip(config.cameras, config.image_sizes, strict=True)
-    ]
+def write_calibration(config: ActConfig, samples: Sequence[Sample], path: Path, progress: Progress) -> None:
+    """Write the calibration set, (n, height, width, 3) uint8 RGB."""
+    frames = open_memmap(path, "w+", np.uint8, (len(samples), *config.image_sizes[0], 3))
     for i, sample in enumerate(progress(samples, desc="calibration set")):
-        for array, frame in zip(arrays, inputs_of(sample, config)[1:], strict=True):
-            array[i] = frame.numpy()
-    for array in arrays:
-        array.flush()
+        frames[i] = inputs_of(sample, config)[1].numpy()
+    frames.flush()
 
 
-def model_script(network: Network, config: ActConfig, samples: int) -> str:
+def model_script(config: ActConfig, samples: int) -> str:
     """Return the network's .alls file. Comments in it give its sources; zoo means hailo_model_zoo."""
-    lines = [f"# {NAME}; compiled by nobody yet"]
-    for i, norm in enumerate(config.image_norm, 1):  # the parser numbers the inputs in this order
-        mean = [round(v, 6) for v in zero_colour(norm)]
-        std = [round(255 / s, 6) for s in norm.scale]
-        layer = f", {NAME}/input_layer{i}" if len(network.inputs) > 1 else ""
-        lines.append(f"normalization{i} = normalization({mean}, {std}{layer})")
-    lines += [
+    (norm,) = config.image_norm
+    mean = [round(v, 6) for v in zero_colour(norm)]
+    std = [round(255 / s, 6) for s in norm.scale]
+    lines = [
+        f"# {NAME}; compiled by nobody yet",
+        f"normalization1 = normalization({mean}, {std})",
         f"model_optimization_config(calibration, batch_size=8, calibset_size={samples})",
         "# zoo, detr_resnet_v1_18_bn and vit_small; 0 needs no GPU, with one try optimization_level=2",
         "model_optimization_flavor(optimization_level=0, compression_level=0)",
@@ -92,12 +85,11 @@ def _describe(policy: ACT, network: Network) -> dict[str, Any]:
     """Return the manifest's part for the rover's engine, with shapes as HailoRT gives them."""
     parameters = parameters_by_block(policy)
     on_chip = {block for block in parameters if block.startswith("backbone") or block == "image_project"}
-    shapes = [[*policy.config.grid(*size), policy.config.dim] for size in policy.config.image_sizes]
-    outputs = dict(zip(network.outputs, shapes, strict=True))
+    features = [*policy.config.grid(*policy.config.image_sizes[0]), policy.config.dim]
     return {
         # Weights that are not on the chip stay in float.
         "weights_mb": sum(n if block in on_chip else 4 * n for block, n in parameters.items()) / 1e6,
-        "hailo": {"network": NAME, "outputs": outputs, "original_names": network.outputs},
+        "hailo": {"network": NAME, "outputs": {network.features: features}},
     }
 
 

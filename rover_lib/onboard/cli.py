@@ -68,7 +68,6 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option("--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in your state folder]."),
     click.option("--json", "json_file", type=Output(appended=True), help="Write a summary to this file; - prints it."),
-    click.option("--film", is_flag=True, help="The camera may be recorded pictures: a folder or a FIFO."),
     click.option("--view", type=FILE, help="Socket of the view that shows it [default: that of your `rover view`]."),
     click.option("--service", is_flag=True, help="Run as a systemd service, disarmed until `rover arm-car`."),
 )
@@ -78,7 +77,7 @@ drive_options = with_options(  # on the rover and in the balloon world
 @drive_options
 @click.pass_context
 def drive(ctx: click.Context, **options: Any) -> None:
-    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it whatever fails.
+    """Drive by ARTIFACT: arm the car once camera, plan and Arduino are ready, and stop it after a fault.
 
     Exit codes: 0 ended as asked (--ticks, --max-seconds, SIGINT, SIGTERM, SIGHUP, SIGQUIT); 1 could not begin;
     2 usage; 3 a fault stopped the car; 4 the human took over. Only another start arms it again; with --service, which
@@ -197,10 +196,11 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
 
     Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """
-    from rover_lib.onboard.car.calibrate import measure, write_car
+    from rover_lib.onboard.car.calibrate import measure
     from rover_lib.onboard.car.car import Car, default_place, read_car, yaml_of
     from rover_lib.onboard.car.servo_link import LinkError, ServoLink
     from rover_lib.onboard.errors import CarError
+    from rover_lib.onboard.stage import atomic_path
 
     path = output or default_place()
     if path.exists() and not force:
@@ -217,7 +217,8 @@ def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, f
         with contextlib.suppress(LinkError):
             link.tell(car)
     click.echo(yaml_of(car), nl=False)  # before writing: if that fails, it can be copied from here
-    write_car(car, path)
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml_of(car))
     notify(f"rover: written to {path}")
 
 
@@ -273,7 +274,7 @@ def benchmark(artifacts: tuple[Path, ...], threads: int, output: Path | None, as
 def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     """Arm the car, whose service (rover-drive.service) then drives at once. Needs root.
 
-    Says what the Arduino still wants, and waits for it. Moving a stick takes the car back;
+    If it is refused, it says what the Arduino still wants. Moving a stick takes the car back;
     `sudo systemctl restart rover-drive` disarms it.
     """
     from rover_lib.onboard.drive.service import Request, ask_service
@@ -288,7 +289,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    click.echo(arm(Request(**limits), model=model, confirm=confirm, notify=click.echo))
+    click.echo(arm(Request(**limits), model=model, confirm=confirm))
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")
@@ -417,8 +418,8 @@ def open_view(
 
     token = read_token(token_file) if token_file else secrets.token_urlsafe(16)
     place = None if shown else feed or default_view()
-    address, ask = Address(web_port, interface), getattr(shown, "ask", None)
-    view = View(address, token, place, drive_user=drive_user, car=shown and shown.car, ask=ask)
+    of_simulation = {"car": shown.car, "ask": shown.ask, "script": shown.script} if shown else {}
+    view = View(Address(web_port, interface), token, place, drive_user=drive_user, **of_simulation)
 
     def tell(url: str) -> None:
         # The journal may have other readers than the token's file.

@@ -18,7 +18,7 @@ ARTIFACT = PathTo("artifact")
 MOST_THREADS = 256  # torch takes any number, and the process crashes where the system has no more
 LONG_LIST = 12  # longer lists are for programs, and not printed for people
 # Options that several commands share:
-CAMERA = click.option("--camera", default="0", show_default=True, help="A number, /dev/videoN, csi, a folder or FIFO.")
+CAMERA = click.option("--camera", default="0", show_default=True, help="A number, /dev/videoN, csi or a FIFO.")
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option("--drive", type=int, default=-1, show_default=True, help="Of FILE: 0 the first, -1 the last.")

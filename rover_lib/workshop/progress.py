@@ -42,6 +42,7 @@ def lines(stream: TextIO, items: Iterable[T], *, desc: str = "", total: int | No
 def notebook_bar() -> Progress:
     """A bar in the terminal where `rover run` was started, lines in its log, or a bar in JupyterLab; else none."""
     from tqdm import tqdm
+    from tqdm.auto import tqdm as widget
 
     if name := os.environ.get(LOG_VARIABLE):
         with suppress(OSError):
@@ -50,5 +51,5 @@ def notebook_bar() -> Progress:
         with suppress(OSError):  # open as long as the kernel lives
             return partial(tqdm, file=Path(name).open("w"), leave=False)
     if "JPY_SESSION_NAME" in os.environ:
-        return partial(tqdm, leave=False)
+        return partial(widget, leave=False)  # else each step leaves red text below the cell
     return silent

@@ -25,7 +25,6 @@ pytestmark = pytest.mark.slow  # Ansible takes a second to start
 ROOT = Path(__file__).parents[2]
 ANSIBLE = ROOT / "ansible"
 ROLE = ANSIBLE / "roles" / "rover"
-SPECS = yaml.safe_load((ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
 DEFAULTS = yaml.safe_load((ROLE / "defaults" / "main.yml").read_text())
 DRIVE, CHECK, BENCHMARK, VIEW = (f"rover-{name}.service" for name in ("drive", "check@", "benchmark", "view"))
 EXPOSURE = {DRIVE: 20, CHECK: 20, BENCHMARK: 20, VIEW: 25}
@@ -79,7 +78,8 @@ def test_lint_finds_nothing(tmp_path):
 
 
 def test_the_defaults_are_those_of_the_specs():
-    options = {name: option for s in SPECS.values() for name, option in s["options"].items()}
+    specs = yaml.safe_load((ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
+    options = {name: option for s in specs.values() for name, option in s["options"].items()}
     assert {n: o["default"] for n, o in options.items() if not o.get("required")} == DEFAULTS
     assert (DEFAULTS["rover_start_at_boot"], DEFAULTS["rover_while_driving"]) == (False, "refuse")
 

@@ -10,7 +10,6 @@ import pytest
 
 from balloon_world import drives
 from balloon_world.drives import drive_in, drive_missing, pair_worlds, sign_test
-from balloon_world.latency import beside_path
 from balloon_world.world import World, expert
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, TrainingError
@@ -50,6 +49,12 @@ class Foresees:
 
 def late(seconds, pushes=0, policy=None, **settings):
     return drive_in(policy or Foresees(), Seen(CURVE, pushes), seconds, replace(SETTINGS, **settings))
+
+
+def beside_path(drive, other):
+    """How far a drive's path is from another one's at most, in metres. Times do not matter, only places."""
+    a, b = drive.trajectory, other.trajectory
+    return np.hypot(a.x_m[:, None] - b.x_m, a.y_m[:, None] - b.y_m).min(1).max()
 
 
 def ages_in_ticks(drive):

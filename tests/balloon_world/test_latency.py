@@ -28,9 +28,9 @@ HOW = {"worlds": 2, "latencies_ms": [0, 150, 600], "pushes": 2, "pushed_latencie
 def test_a_run_is_measured_once_for_each_policy_and_question(run_dir):
     first = latency.measure_latencies(run_dir.path, **HOW)
     assert run_dir.loaded and read_stage(run_dir.path / "drive.json", "drive") == first
-    rows = [(r["latency_ms"], r["compensate"], r["pushes"], r["ensemble"]) for r in first["metrics"]["rows"]]
+    rows = [(r["latency_ms"], r["compensate"], r["pushes"]) for r in first["metrics"]["rows"]]
     calm = [(0, True), (150, True), (150, False), (600, True), (600, False)]
-    assert rows == [(*c, 0, None) for c in calm] + [(150, True, 2, None), (150, False, 2, None), (0, True, 0, 0.01)]
+    assert rows == [(*c, 0) for c in calm] + [(150, True, 2), (150, False, 2)]
     fresh, stopped = first["metrics"]["rows"][0], first["metrics"]["rows"][3]
     assert (fresh["hits"], fresh["trials"], fresh["stopped"], fresh["plan_age_max_ms"]) == (2, 2, 0, 0)
     assert (stopped["hits"], stopped["stopped"], stopped["time_to_hit_p50_s"]) == (0, 2, None)
@@ -56,7 +56,7 @@ def test_what_cannot_be_measured_is_refused(run_dir):
 def test_the_gate_is_of_compensated_drives_that_nobody_pushes(hits_at, lost, passed):
     rows = []
     for ms, hits in hits_at.items():
-        calm = {"latency_ms": ms, "pushes": 0, "ensemble": None, "compensate": True, "hits": hits}
+        calm = {"latency_ms": ms, "pushes": 0, "compensate": True, "hits": hits}
         rows += [calm, calm | {"compensate": False, "hits": 0}, calm | {"pushes": 4, "hits": 0}]
     (row,) = gates(rows, 2)
     assert (row["found"], row["passed"], row["limit"]) == (lost, passed, 2)

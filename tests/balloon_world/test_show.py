@@ -52,7 +52,7 @@ def drive(simulation, worlds=1, each=lambda head: None):
 @pytest.mark.slow
 def test_a_slow_machine_slows_time_and_changes_nothing_else(simulation, monkeypatch):
     fast = drive(simulation)
-    slow_one = Simulation(simulation._artifact)
+    slow_one = Simulation(simulation._paths["INT8"])
     slow_one._policies["INT8"].seconds = 0.15  # for a plan, which the simulation needs ten times a second
     slow = drive(slow_one)
     assert fast[-1]["world"]["path"] == slow[-1]["world"]["path"] and len(fast[-1]["world"]["path"]) > 10
@@ -76,6 +76,18 @@ def test_what_a_page_asks_for(simulation):
     assert ("ended", "stopped here; nobody drives", "INT8") in said and said[-1][2] == "FP32"
     assert [results[1] for results in simulation._results.values()] == [0, 1]  # what was stopped counts for nobody
     assert simulation._seed == 10_002
+
+
+@pytest.mark.slow
+def test_whoever_watches_pushes_the_car(simulation):
+    """A drive that somebody pushed counts for its pushes, and for no policy."""
+    alone = drive(simulation)[-1]["world"]
+    simulation._seed -= 1
+    asked = iter(["push left", "push right", "push left", "push up"])
+    seen = drive(simulation, 1, lambda head: head["phase"] == "driving" and simulation.ask(next(asked, "")))
+    pushed = seen[-1]["world"]
+    assert pushed["path"] != alone["path"] and pushed["results"] == alone["results"]
+    assert pushed["pushed"][1] == 3 and pushed["pushed"][0] in (0, 3)
 
 
 @pytest.mark.slow

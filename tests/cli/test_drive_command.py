@@ -9,12 +9,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from needs import real_time, until
 
-from balloon_world.car import VirtualCar
+from balloon_world.car import CameraFeed, VirtualCar
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.cli import main
 from rover_lib.onboard.car.servo_link import ServoLink
@@ -87,8 +86,7 @@ async def watch_and_stop(url: str) -> list[dict]:
         while not heads or heads[-1]["phase"] != "ended":
             message = await page.receive(timeout=120)
             if message.type == aiohttp.WSMsgType.BINARY:
-                line, _, jpeg = message.data.partition(b"\n")
-                heads.append(json.loads(line) | {"jpeg_bytes": len(jpeg)})
+                heads.append(json.loads(message.data.partition(b"\n")[0]))
                 await page.send_str(f"shown {heads[-1]['n']}")
                 if sum(head["phase"] == "driving" for head in heads) == 20:
                     await page.send_str("stop")
@@ -96,8 +94,8 @@ async def watch_and_stop(url: str) -> list[dict]:
 
 
 @real_time
-def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
-    pytest.importorskip("aiohttp", reason="needs the extra view")
+def test_a_page_shows_the_drive_and_its_button_ends_it(demo_run, tmp_path):
+    pytest.importorskip("aiohttp", reason="needs the extra look")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]
     with subprocess.Popen(served, stdout=subprocess.PIPE, text=True) as view:
@@ -109,27 +107,24 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp
     ended = json.loads((folder / "drive.json").read_text())["ended"]
     assert ended == heads[-1]["text"] == "stopped from the view (127.0.0.1)"
     assert heads[-1]["stopped"] and heads[-1]["pins"][1] == 120
-    ticks = read_log(folder / "flight.log").ticks
-    for head in (head for head in heads if head["phase"] == "driving"):
-        assert head["jpeg_bytes"] > 1000 and head["size"] == [640, 360]
-        row = int(np.argmin(np.abs(ticks["t_s"] - head["tick"]["t_s"])))
-        for name in ("steering_us", "throttle_us", "pins_steering_us", "pins_throttle_us", "plan", "frame"):
-            assert head["tick"][name] == ticks[name][row]
+    assert any(head["ribbon"] for head in heads if head["phase"] == "driving")
 
 
 @real_time
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
-    """A camera of some seconds, which torch may take to load, the car being another world's."""
+    """A camera that is unplugged, the car being another world's."""
     folder = fresh(tmp_path)
-    for i, picture in enumerate(pictures(0) * 14):
-        (folder / f"{i:05}.jpg").write_bytes(picture)
-    with VirtualCar() as car:
-        options = ["--film", "--camera", folder, "--port", car.port]
-        options += ["--log", folder / "l", "--json", folder / "j"]
-        done = subprocess.run([*ROVER, artifact, *map(str, options)], capture_output=True, text=True)
+    with VirtualCar() as car, CameraFeed(folder / "camera", *pictures(0)) as feed:
+        options = ["--camera", folder / "camera", "--port", car.port, "--log", folder / "l", "--json", folder / "j"]
+        with subprocess.Popen([*ROVER, artifact, *map(str, options)], stderr=subprocess.PIPE, text=True) as process:
+            for line in process.stderr:
+                if line.strip() == "rover: armed":
+                    break
+            feed.close()
+            _, stderr = process.communicate(timeout=20)
         with ServoLink(car.port) as link:  # the car stands after it
             until(lambda: link.latest() and link.latest().throttle_us == 120)
-    assert done.returncode == 3 and "Traceback" not in done.stderr, done.stderr
+    assert process.returncode == 3 and "Traceback" not in stderr, stderr
     assert "unplugged" in json.loads((folder / "j").read_text())["ended"]
 
 

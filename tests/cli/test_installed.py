@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import venv
 from pathlib import Path
 
@@ -117,27 +118,35 @@ def lines_of(name: str) -> list[str]:
     """The lines between <!-- name --> and <!-- end --> in docs/install.md."""
     page = (ROOT / "docs" / "install.md").read_text()
     blocks = re.findall(rf"<!-- {name} -->\n(.*?)<!-- end -->", page, re.S)
-    return [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
+    return [line.partition(" #")[0].strip() for block in blocks for line in block.splitlines() if line.strip()]
 
 
 def test_the_small_way(tmp_path, onnx_static):
-    """docs/install.md's lines: what they install of others is linked, and our wheel is built as pip would."""
+    """docs/install.md's lines: our wheel is built as pip would, and what it needs of others is linked."""
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", tmp_path]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    made, others, own, view = lines_of("look")
-    assert made == "python3 -m venv look" and own == "look/bin/pip install --no-deps ."
-    names = with_needs(others.removeprefix("look/bin/pip install ").split())
+    made, own, *shown = lines_of("look")
+    assert made == "python3 -m venv look" and own == "look/bin/pip install '.[look]'"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    needs = project["dependencies"] + extras["view"] + extras["look"]
+    names = with_needs([re.match(r"[\w.-]+", need)[0] for need in needs if not need.startswith("rover-policy")])
+    assert "torch" not in names
     look = Installed(tmp_path, next(tmp_path.glob("*.whl")), names)
     assert not [name for name in ("lab", "tests") if (look.packages / name).exists()]
+    about = (next(look.packages.glob("rover_policy-*.dist-info")) / "METADATA").read_text()
+    assert "License-Expression: Apache-2.0" in about
+    assert {"look", "torch", "view", "workshop"} <= set(re.findall(r"^Provides-Extra: (\w+)$", about, re.M))
     assert look.run("python", "-m", "rover_lib.cli", "--help").returncode == 0
     assert {"calibration", "drive"} <= set(json.loads(look.run("python", "-c", SCRIPT).stdout))
     shutil.copy(onnx_static, tmp_path / "policy_static.onnx.zip")
-    process = look.start("rover", *view.removeprefix("look/bin/rover ").split(), "--web-port", 0)
-    try:
-        assert process.stdout.readline().startswith("http://127.0.0.1:"), process.stderr.read()
-    finally:
-        process.terminate()
-        process.communicate()
+    for line in shown:
+        process = look.start("rover", *line.removeprefix("look/bin/rover ").split(), "--web-port", 0)
+        try:
+            assert process.stdout.readline().startswith("http://127.0.0.1:"), process.stderr.read()
+        finally:
+            process.terminate()
+            process.communicate()
 
 
 def test_the_way_by_hand(tmp_path, artifacts):

@@ -4,7 +4,7 @@ import needs
 import pytest
 from test_vehicle import CAP_US, NEUTRAL, moved_after_ms
 
-from lab.driving.native import STEERING, THROTTLE, NativeArduino
+from lab.driving.native import THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State, frame
 
 pytestmark = needs.gcc
@@ -63,16 +63,6 @@ def test_each_loss_stops_within_200_ms(board, stop, autonomous):
     assert not moved_after_ms(board.run(500))
 
 
-def test_arming_wants_a_young_whole_gesture(board):
-    assert board.command("A") == "w"  # a button that is stuck is none
-    board.sticks[STEERING] = 2012
-    board.run(5000)
-    assert board.command("A") == "w"
-    board.sticks[STEERING] = 1456
-    board.wiggle()
-    assert board.command("A") == "k"
-
-
 def test_no_line_counts_twice(board):
     """Nor an older one, one of another start, one that is too old, or one from the future."""
     board.sticks = [0, 0]
@@ -92,15 +82,6 @@ def test_no_other_pulses(board):
         board.send_sticks(*pulses, board.now_ms)
         assert board.status.out_of_range == n
         assert board.run(1) == [NEUTRAL]
-
-
-@pytest.mark.parametrize("stick", [STEERING, THROTTLE])
-def test_a_moved_stick_takes_over(armed, stick):
-    armed.drive(1600, 200, 200)
-    armed.sticks[stick] += 80
-    pins = armed.drive(1600, 200, 100)
-    assert (armed.status.state, armed.status.reason) == (State.MANUAL, "h")
-    assert moved_after_ms(pins) <= 40
 
 
 @pytest.mark.parametrize("throttle_us", [190, 60])

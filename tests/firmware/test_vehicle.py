@@ -50,17 +50,6 @@ def test_a_receivers_preset_pulses_drive_nothing(armed, gap_ms, preset_us):
     assert armed.status.state is not State.AUTONOMOUS
 
 
-def test_a_takeover_by_throttle_passes_once_it_was_at_rest(armed):
-    armed.drive(1600, 200, 200)
-    armed.sticks[THROTTLE] = 400
-    pins = armed.drive(1600, 200, 500)
-    assert moved_after_ms(pins) <= HUMAN_MS
-    armed.sticks[THROTTLE] = 124
-    armed.run(20)
-    armed.sticks[THROTTLE] = 180
-    assert throttles(armed.run(20))[-1] == 180
-
-
 # ---- arming as a ritual
 
 

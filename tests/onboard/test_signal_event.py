@@ -44,12 +44,3 @@ def test_a_handler_may_come_at_any_line():
         log.event("one")
 
     assert interrupted(work, lambda: (event.set(), log.event("another"))) > 10
-
-
-def test_it_wakes_whoever_waits():
-    event = SignalEvent()
-    assert not event.wait(0.02)
-    threading.Timer(0.02, event.set).start()
-    assert event.wait() and event.is_set()
-    event.clear()
-    assert not event.is_set() and not event.wait(0)

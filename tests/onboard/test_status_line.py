@@ -1,35 +1,10 @@
 """The status line: on a terminal, elsewhere, and where nobody reads it."""
 
-import logging
-import os
-import pty
-import select
 import subprocess
 import sys
 import time
 
 import pytest
-
-from rover_lib.onboard.status_line import StatusLine
-
-
-def record(text):
-    return logging.makeLogRecord({"msg": text})
-
-
-def test_a_terminal_has_one_line_that_is_overwritten():
-    master, slave = pty.openpty()
-    seen = ""
-    with os.fdopen(slave, "w") as stream:
-        with StatusLine(lambda: "tick " + "x" * 300, stream, every_s=0.02) as status:
-            time.sleep(0.2)
-            status.handle(record("camera unplugged"))
-        while select.select([master], [], [], 0.1)[0]:
-            seen += os.read(master, 65536).decode()
-    os.close(master)
-    assert seen.count("\n") == 2  # the record's, and the end's
-    assert "\r\x1b[Kcamera unplugged\r\n" in seen and seen.count("\r\x1b[Ktick") > 2
-    assert all(len(part) <= 80 for part in seen.replace("\x1b[K", "").split("\r"))
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def bench(tmp_path, noise):
         folder = Path(tempfile.mkdtemp(dir=tmp_path))
         with CameraFeed(folder / "camera", *noise) as feed, contextlib.ExitStack() as stack:
             board = board or stack.enter_context(StandIn())
-            given = {"film": True, "width": 96, "height": 48, "log": folder / "flight.log", "port": board.port}
+            given = {"width": 96, "height": 48, "log": folder / "flight.log", "port": board.port}
             given |= {"camera": str(folder / "camera"), "calibration_dir": folder} | options
             robot = Rover(RoverConfig(**given))
             stack.callback(lambda: robot.is_connected and robot.disconnect())

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,17 +12,11 @@ from click.testing import CliRunner
 from rover_exchange.export_dataset import usual_rate_hz
 from rover_exchange.tub import read_tub
 from rover_lib.cli import main
-from rover_lib.onboard.car.car import Car, yaml_of
+from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.recordings.samples import frame_rate_hz
 
-LEFT = Car.of(
-    {
-        "name": "reverses, and turns left",
-        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
-        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
-    }
-)
+LEFT = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")  # reverses, and turns left
 
 
 def angle(i):
@@ -43,26 +38,18 @@ def records(count, session="21-08-21_0", first=0, start_ms=1_629_500_000_000):
     ]  # fmt: skip
 
 
-def picture(folder, row, number):
-    folder.mkdir(exist_ok=True)
-    rng = np.random.default_rng(number)
-    frame = cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (160, 120))
-    cv2.imwrite(str(folder / row["cam/image_array"]), frame)
-
-
 def tub(root, rows, deleted=(), per_catalog=30, lines=lambda rows: [json.dumps(row) for row in rows]):
     """A tub of donkeycar 4 on."""
-    root.mkdir(parents=True)
+    (root / "images").mkdir(parents=True)
     paths = []
     for k, at in enumerate(range(0, len(rows), per_catalog)):
         paths.append(f"catalog_{k}.catalog")
         (root / paths[-1]).write_text("\n".join(lines(rows[at : at + per_catalog])) + "\n")
-        (root / f"catalog_{k}.catalog_manifest").write_text("{}")
     for row in rows:
-        picture(root / "images", row, row["_index"])
+        frame = np.random.default_rng(row["_index"]).integers(0, 255, (6, 8, 3), np.uint8)
+        cv2.imwrite(str(root / "images" / row["cam/image_array"]), cv2.resize(frame, (160, 120)))
     last = {"paths": paths, "current_index": len(rows), "max_len": per_catalog, "deleted_indexes": list(deleted)}
-    head = [["cam/image_array", "user/angle", "user/throttle", "user/mode"], ["image_array", "float", "float", "str"]]
-    (root / "manifest.json").write_text("\n".join(map(json.dumps, [*head, {}, {"created_at": 1.0}, last])) + "\n")
+    (root / "manifest.json").write_text("\n".join(map(json.dumps, [[], [], {}, {"created_at": 1.0}, last])) + "\n")
     return root
 
 
@@ -70,7 +57,7 @@ def kinds(recordings):
     return {fault.kind: fault.count for fault in recordings.faults}
 
 
-@pytest.mark.parametrize(("car", "side"), [(Car(), 1), (LEFT, -1)], ids=["ours", "left, with reverse"])
+@pytest.mark.parametrize(("car", "side"), [(Car(), 1), (LEFT, -1)])
 def test_a_whole_tub(tmp_path, car, side):
     recordings = read_tub(tub(tmp_path / "tub", records(70)), car)
     (episode,) = recordings.episodes

@@ -59,9 +59,13 @@ def test_the_rover_needs_the_same_on_both_sides():
 
     rovers = dependencies(v.ONBOARD / "pyproject.toml")
     assert dependencies(ROOT / "pyproject.toml") == rovers
-    views = [tomllib.loads(p.read_text())["project"]["optional-dependencies"]["view"]
-             for p in (ROOT / "pyproject.toml", v.ONBOARD / "pyproject.toml")]  # fmt: skip
-    assert views[0] == views[1] and re.search(r"^aiohttp==", w.VIEW.read_text(), re.MULTILINE)
+    ours, theirs = (
+        tomllib.loads(p.read_text())["project"]["optional-dependencies"]
+        for p in (ROOT / "pyproject.toml", v.ONBOARD / "pyproject.toml")
+    )
+    assert theirs["view"] == ours["view"] and re.search(r"^aiohttp==", w.VIEW.read_text(), re.MULTILINE)
+    assert ours["torch"] == theirs["torch"] and set(ours["torch"]) < set(ours["workshop"])
+    rovers += theirs["torch"]
     pinned = set(re.findall(r"^([\w-]+)==", w.REQUIREMENTS["torch"].read_text(), re.MULTILINE))
     assert {re.split(r"[=<>]", line)[0] for line in rovers} <= pinned
 

@@ -22,37 +22,16 @@ UNCONFINED = {HAILO: "HailoRT talks to the chip through its driver"}
 
 
 class Engine(Protocol):
-    """An artifact's graph in one engine."""
+    """An artifact's graph in one engine. threads: how many compute."""
+
+    threads: int
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         """(S,) float32 and one (height, width, 3) uint8 per camera in, (1, chunk, A) out. Raises RuntimeError."""
 
     def give_back(self) -> bool:
         """Free the memory that only loading needed, after a first run; return whether to check predictions again."""
-
-    @property
-    def threads(self) -> int:
-        """How many threads compute."""
-
-    def set_threads(self, threads: int) -> None:
-        """Compute with that many threads from now on. XNNPACK's pool keeps the number of its first plan."""
-
-
-class SessionEngine:
-    """Base of the engines that compute in a session of ONNX Runtime. They have no memory to give back."""
-
-    threads = 0
-
-    def _make_session(self, threads: int) -> None:
-        """Make the session with that many threads. Raises ArtifactError, and then keeps the present session."""
-        raise NotImplementedError
-
-    def give_back(self) -> bool:
         return False
-
-    def set_threads(self, threads: int) -> None:
-        self._make_session(threads)
-        self.threads = threads
 
 
 def module_of(name: str) -> Any:

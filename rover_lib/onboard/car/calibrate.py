@@ -10,13 +10,11 @@ the neutral of each. So the wheels must be off the ground and the motor unplugge
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rover_lib.onboard.car.car import DEFAULT, FAST_PULSE_MAX_US, PERIOD_MIN_US, Car, yaml_of
+from rover_lib.onboard.car.car import DEFAULT, FAST_PULSE_MAX_US, PERIOD_MIN_US, Car
 from rover_lib.onboard.car.protocol import Telemetry
 from rover_lib.onboard.errors import CarError
-from rover_lib.onboard.stage import atomic_path
 
 if TYPE_CHECKING:
     from rover_lib.onboard.car.servo_link import ServoLink
@@ -134,9 +132,3 @@ def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list
             found = f"{min(column)} to {max(column)} us"
             raise CarError(f"{name} moved while it was measured {where}", found=found, remedy="hold the stick still")
     return [round(statistics.median(column)) for column in columns]
-
-
-def write_car(car: Car, path: Path) -> None:
-    """Write car.yml atomically. Raises OSError if it cannot be written."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(yaml_of(car))

@@ -3,13 +3,12 @@
     with Camera(0) as camera:
         frame = camera.wait(after=0, timeout_s=1)
 
-Substitutes for a camera are a folder of JPEGs, and JPEGs through a FIFO. Single bad pictures are left out; a few bad
-ones in a row mean that the camera has failed.
+Another program may be the camera by writing JPEGs into a FIFO. Single bad pictures are left out; a few bad ones in a
+row mean that the camera has failed.
 """
 
 import contextlib
 import os
-import select
 import stat
 import threading
 import time
@@ -20,11 +19,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.csi import is_csi, newest_jpeg, read_csi
+from rover_lib.onboard.car.csi import is_csi, newest_jpegs, read_csi
 from rover_lib.onboard.car.picture import (
     COLUMNS,
     LEAST,
-    MOST_BYTES,
     ROWS,
     block_sums,
     brightness,
@@ -37,7 +35,6 @@ FIRST_FRAME_S = 5.0
 STALLED_S = 1.0
 CLOSE_S = 1.0
 UNPLUGGED = "is the camera unplugged?"
-PICTURES = (".jpg", ".jpeg")
 MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 MONOTONIC, NO_CLOCK = "monotonic", "no"  # the clock that time stamps come from
 REFUSED_MOST = 4  # bad pictures in a row mean that the camera has failed; 0.13 s at 30 Hz
@@ -90,9 +87,8 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), csi (see csi.py), a folder of JPEGs (or of an episode), or a FIFO of JPEGs.
-    size: (width, height) to request from a camera. rate_hz: to request, or at which a folder is shown. held: a folder
-    is repeated until begin() is called, and from then on shown once. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), or a FIFO of JPEGs. size: (width, height) to request from
+    a camera. rate_hz: to request. Any thread may call any method.
     """
 
     def __init__(
@@ -102,7 +98,6 @@ class Camera:
         size: tuple[int, int] = (640, 360),
         rate_hz: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
-        held: bool = False,
     ):
         self.source = str(source)
         self.size, self.wanted_hz = size, rate_hz
@@ -112,10 +107,7 @@ class Camera:
         self._shown = np.zeros((REMEMBERED, ROWS * COLUMNS), np.uint64)  # block_sums() of the newest pictures, by row
         self._remembered = 0  # how many pictures have been stored there in all
         self._refusal: CameraError | None = None
-        self._closing, self._begun = threading.Event(), threading.Event()
-        if not held:
-            self._begun.set()
-        self._held = held
+        self._closing = threading.Event()
         self._changed = threading.Condition()  # guards the three below
         self._frame: Frame | None = None
         self._arrived_s = 0.0  # when it came, by `clock`
@@ -130,7 +122,7 @@ class Camera:
 
     def open(self) -> "Camera":
         """Start reading. Raises CameraError if there is no such source, or if no frame comes within 5 s."""
-        reader = _reader(self.source, self.size, self.wanted_hz, self._closing, self._begun)
+        reader = _reader(self.source, self.size, self.wanted_hz, self._closing)
         self._thread = threading.Thread(target=self._read, args=(reader,), name=f"camera {self.source}", daemon=True)
         self._thread.start()
         try:
@@ -144,10 +136,6 @@ class Camera:
 
     def _failed(self, what: str, why: CameraError) -> CameraError:
         return CameraError(f"{self.source}: {what}: {why.what}", found=why.found, remedy=why.remedy)
-
-    def begin(self) -> None:
-        """Start held pictures from the first one. Has no effect on a camera."""
-        self._begun.set()
 
     def close(self) -> None:
         """Stop reading. Waits at most 1 s for a camera that hangs inside its driver."""
@@ -240,8 +228,6 @@ class Camera:
         if w < LEAST[0] or h < LEAST[1]:
             raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
         shown, number = block_sums(image), self.frames + 1
-        if self._held and self._begun.is_set():  # a film starts: it may show the earlier pictures again
-            self._held, self._remembered = False, 0
         same = (self._shown[: self._remembered] == shown).mean(axis=1).max(initial=0.0)
         self._shown[self._remembered % REMEMBERED] = shown
         self._remembered += 1
@@ -257,9 +243,7 @@ def path_of(source: str, dev: Path = Path("/dev")) -> Path:
     return dev / f"video{source}" if source.isdigit() else Path(source)
 
 
-def _reader(
-    source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event, begun: threading.Event
-) -> Reader:
+def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
     if is_csi(source):
         return read_csi(source, size, rate_hz, closing)
     path = path_of(source)
@@ -272,10 +256,7 @@ def _reader(
         return _v4l2(str(path), size, rate_hz)
     if stat.S_ISFIFO(mode):
         return _fifo(path, closing)
-    if stat.S_ISDIR(mode):
-        return _folder(path, rate_hz, closing, begun)
-    remedy = f"ffmpeg -i {path.name} -q:v 3 FOLDER/%06d.jpg makes pictures of a video"
-    raise CameraError(f"{path}: neither a camera nor a folder or a FIFO of JPEGs", remedy=remedy)
+    raise CameraError(f"{path}: neither a camera nor a FIFO of JPEGs", remedy="give /dev/videoN")
 
 
 def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
@@ -300,39 +281,10 @@ def _v4l2(source: str, size: tuple[int, int], rate_hz: float) -> Reader:
         device.release()
 
 
-def _folder(path: Path, rate_hz: float, closing: threading.Event, begun: threading.Event) -> Reader:
-    """Yield a folder's JPEGs at a camera's rate, repeatedly until `begun` is set, and then once."""
-    folder = path / "frames" if (path / "frames").is_dir() else path
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURES and f.is_file())
-    if not files:
-        raise CameraError(f"{folder}: no JPEGs in it", remedy="give /dev/videoN or another folder")
-    last = False
-    while not last:
-        last, start = begun.is_set(), time.monotonic()
-        for count, file in enumerate(files):
-            if closing.wait(max(0.0, start + count / rate_hz - time.monotonic())):
-                return
-            if begun.is_set() and not last:
-                break
-            with file.open("rb") as opened:
-                yield opened.read(MOST_BYTES + 1), None
-
-
 def _fifo(path: Path, closing: threading.Event) -> Reader:
-    """Yield JPEGs from a FIFO; of several that wait there, only the last. The camera ends when the FIFO does."""
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    began, pending = False, bytearray()
+    """Yield the newest JPEG of a FIFO, which ends when its writer does."""
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # does not wait for the writer
     try:
-        while not closing.wait(0 if select.select([fd], [], [], 0.05)[0] else 0.01):
-            try:
-                data = os.read(fd, 1 << 20)
-            except BlockingIOError:
-                continue
-            if not data and began:
-                return
-            began = began or bool(data)  # else no writer has opened the FIFO yet
-            pending += data
-            if jpeg := newest_jpeg(pending)[0]:
-                yield jpeg, None
+        yield from newest_jpegs(fd, closing)
     finally:
         os.close(fd)

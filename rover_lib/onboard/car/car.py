@@ -105,10 +105,8 @@ class Car:
     @property
     def numbers(self) -> tuple[int, ...]:
         """The numbers sent to the Arduino: each channel's period, least, neutral and longest pulse, and the cap; us."""
-        numbers: list[int] = []
-        for c in (self.pwm.steering, self.pwm.throttle):
-            numbers += round(c.period_us), c.ends_us[0], c.neutral_us, c.ends_us[1]
-        return (*numbers, self.cap_us)
+        steering_us, *steering, throttle_us, low_us, neutral_us, high_us = self.pulses_us
+        return steering_us, *sorted(steering), throttle_us, *sorted((low_us, neutral_us, high_us)), self.cap_us
 
     @property
     def id(self) -> int:
@@ -133,35 +131,26 @@ class Car:
 
     def drives_like(self, other: "Car") -> bool:
         """Whether both are equal but for the name, the cap, the human, and which side is called left."""
-        descriptions = []
-        for car in (self, other):
-            description = {**car.description(), "name": "", "human": "", "steering": car.steering_us}
-            descriptions.append({**description, "throttle": {**description["throttle"], "cap_us": 0}})
-        return descriptions[0] == descriptions[1]
+        mine, others = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
+        return mine == others
 
     @property
-    def steering_us(self) -> tuple[int, ...]:
-        """Steering's period, and its pulses at -1, 0 and 1, in microseconds."""
-        c = self.pwm.steering
-        return round(c.period_us), c.pulse_us(c.low), c.neutral_us, c.pulse_us(c.high)
+    def pulses_us(self) -> tuple[int, ...]:
+        """Of steering and then of throttle: the period, and the pulses of the lowest action, 0 and the highest; us."""
+        steering, throttle = self.pwm.steering, self.pwm.throttle
+        return round(steering.period_us), *steering.pulses_us, round(throttle.period_us), *throttle.pulses_us
 
     def description(self) -> dict[str, Any]:
         """The content of its car.yml, from which Car.of() makes the same car."""
-        throttle = self.pwm.throttle
-        period_us, *ends_us = self.steering_us
+        period_us, *ends_us, throttle_us, back_us, rest_us, forward_us = self.pulses_us
         right_us, neutral_us, left_us = ends_us if self.positive == "left" else ends_us[::-1]
         steering = {"period_us": period_us, "left_us": left_us, "neutral_us": neutral_us, "right_us": right_us}
-        reverse = {"reverse_us": throttle.pulse_us(throttle.low)} if self.reverses else {}
+        throttle = {"period_us": throttle_us, "neutral_us": rest_us, "forward_us": forward_us}
+        reverse = {"reverse_us": back_us} if self.reverses else {}
         return {
             "name": self.name,
             "steering": {**steering, "positive": self.positive},
-            "throttle": {
-                "period_us": round(throttle.period_us),
-                "neutral_us": throttle.neutral_us,
-                "forward_us": throttle.pulse_us(throttle.high),
-                **reverse,
-                "cap_us": self.cap_us,
-            },
+            "throttle": {**throttle, **reverse, "cap_us": self.cap_us},
             "camera": {"field_of_view_deg": self.field_of_view_deg},
             "wheelbase_m": self.wheelbase_m,
             **({"human": self.human} if self.human != HUMANS[0] else {}),
@@ -193,15 +182,13 @@ class Car:
             car = cls(pwm=pwm, positive=positive, **given)
         except CarError as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
-        if car.steering_us == _DEFAULT_CAR.steering_us and (
-            {**car.description()["throttle"], "cap_us": 0} == {**DEFAULT["throttle"], "cap_us": 0}
-        ):
+        if car.pulses_us == _DEFAULT_CAR.pulses_us:
             # The checked constants themselves, because whole microseconds are slightly less precise.
             car = cls(positive=steering.get("positive", _DEFAULT_CAR.positive), **given)
         return car
 
 
-_US, _NUMBER = whole(0, 65535, " microseconds"), Rule(is_number, "a number")
+_US, _NUMBER = whole(1, 65535, " microseconds"), Rule(is_number, "a number")
 _MAPPING = Rule(lambda value: isinstance(value, Mapping), "a mapping")
 _NAME = Rule(lambda v: isinstance(v, str) and 0 < len(v) <= 60 and v.isprintable(), "1 to 60 characters")
 # What each section of a car.yml must have, and what it may have
@@ -241,9 +228,6 @@ def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) 
         found = f"{low_us}, {neutral_us} and {high_us}"
         what = f"{name}'s neutral_us must lie between its two ends"
         raise CarError(what, found=found, remedy="measure them with `rover calibrate`")
-    longest = max(neutral_us, high_us, low_us or 0)
-    if longest >= period_us:
-        raise CarError(f"{name}'s period_us must be longer than its pulses", found=f"{period_us} and {longest}")
     neutral_pct, high_pct = neutral_us / period_us * 100, (high_us - neutral_us) / period_us * 100
     if low_us is None:
         return Channel(name, period_us, neutral_pct, high_pct, 0.0, 1.0, by_pulse=True)

@@ -160,7 +160,7 @@ class ServoLink:
         while not (hello := self._await(lambda: self.hello, REPEAT_S)):
             now, running = self._clock(), self._telemetry
             if now - opened > self.boot_s:
-                remedy = f"is it the rover's, and is the firmware on it (make flash PORT={self.port})?"
+                remedy = f"is it the rover's, and is the firmware on it (make -C firmware flash PORT={self.port})?"
                 raise LinkError(f"{self.port}: no hello from an Arduino within {self.boot_s:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2

@@ -13,14 +13,14 @@ from dataclasses import replace
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import Artifact, seen_size
-from rover_lib.onboard.car.camera import Camera, check_shape, path_of, size_like
+from rover_lib.onboard.car.camera import Camera, check_shape, size_like
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import default_view
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.drive.opening import DriveOptions, another_car, check_no_film, open_flight_log
+from rover_lib.onboard.drive.opening import DriveOptions, another_car, open_flight_log
 from rover_lib.onboard.drive.plan import Commanded, Settings
 from rover_lib.onboard.drive.service import Service
 from rover_lib.onboard.drive.session import Session
@@ -44,8 +44,6 @@ def drive_car(
         # Resolved: `current` may point to another one later. Opened first: it may be missing, or no artifact.
         artifact = stack.enter_context(Artifact(options.artifact.resolve()))
         seen = seen_size(artifact.manifest)
-        if not (car or options.dry_run or options.film):
-            check_no_film(options.camera)
         log = stack.enter_context(open_flight_log(options, settings, report))
         most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
         log.event(f"one picture drives the car for {most_m:.1f} m at most, at throttle {settings.throttle_limit:g}")
@@ -62,8 +60,8 @@ def drive_car(
         place = options.view or default_view()
         feed = stack.enter_context(contextlib.closing(Feed(place, log, options.artifact.name)))
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port, car=this_car()))
-        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen), held=options.film))
-        if (frame := camera.latest()) and not path_of(options.camera).is_dir():  # a folder is of an episode, for a look
+        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen)))
+        if frame := camera.latest():
             check_shape(options.camera, frame.image, seen)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:

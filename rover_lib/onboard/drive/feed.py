@@ -7,8 +7,7 @@ The view is another process; on a rover, another user runs it. It listens at a U
 messages. Neither side waits for the other: a message is dropped while the previous one has not been read, so that a
 view that hangs, floods or dies costs a drive no more than a failed system call.
 
-A message is a line of JSON, followed by the camera's newest picture: a JPEG if the camera delivers JPEGs, otherwise
-every nth pixel of every nth row, (h, w, 3) uint8 BGR, whose size is the line's "shape".
+A message is a line of JSON, followed by the camera's newest picture, a JPEG; none if the camera delivers raw pictures.
 """
 
 import contextlib
@@ -23,8 +22,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import REASONS, ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
@@ -37,7 +34,6 @@ AGAIN_S = 1.0  # between two checks whether a view listens
 LAST_S = 0.2  # for delivering the last message of a drive; the car has stopped by then
 ASKED_MOST = 8  # messages of the view that are read at a tick
 STOP = re.compile(rb"stop ([0-9a-f.:]{1,45})", re.ASCII)  # with the address that asked
-RAW_BYTES = 120_000  # of a picture that is not a JPEG
 MOST_BYTES = 400_000  # of a message; a larger one is sent without its picture
 DRIVING, WAITING, TAKEN, ENDED = "driving", "waiting", "taken over", "ended"
 
@@ -162,11 +158,7 @@ class Feed:
             return {}, b""
         height, width = frame.image.shape[:2]
         shown: dict[str, Any] = {"frame": frame.number, "captured_s": frame.captured_s, "size": [width, height]}
-        if frame.jpeg:
-            return shown, frame.jpeg
-        every = int(np.ceil(np.sqrt(frame.image.size / RAW_BYTES)))
-        image = frame.image[::every, ::every]
-        return shown | {"shape": image.shape}, image.tobytes()
+        return shown, frame.jpeg or b""
 
     def _put(self, line: bytes, picture: bytes) -> bool:
         """Give the view a message unless it has not read the previous one. Never waits."""

@@ -2,7 +2,7 @@
 
     with FlightLog(path, header={"hz": 30, "fade_s": 0.5, "stop_s": 1.0}, max_bytes=10_000_000, keep=3) as log:
         log.tick(Tick(t_s=time.monotonic() - log.start_s, ...))
-        log.event("camera unplugged", level=logging.WARNING, frame=812)
+        log.event("camera unplugged", level=logging.WARNING)
     flight = read_log(path)
 
 Each file begins with a header, which names the columns of the ticks. A tick is an array of values, null if unknown;
@@ -32,7 +32,6 @@ from filelock import BaseFileLock, Timeout
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import THROTTLED_VALUE, Host, throttled_means
-from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.params import params
@@ -75,14 +74,13 @@ _TEXTS = ("state", "reason")
 
 
 class Event(NamedTuple):
-    """Something that happened. t_s: seconds since the log's start. fields: details."""
+    """Something that happened. t_s: seconds since the log's start."""
 
     t_s: float
     text: str
-    fields: dict[str, Any]
 
     def __str__(self) -> str:
-        return "; ".join([self.text, *(f"{name} {value}" for name, value in self.fields.items())])
+        return self.text
 
 
 def log_limits() -> tuple[int, int]:
@@ -140,12 +138,12 @@ class FlightLog:
         """Log a tick. Waits for nothing, raises nothing."""
         self._rows.append(row)
 
-    def event(self, text: str, *, level: int = logging.INFO, **fields: Any) -> None:
-        """Log an event with its details, in the file and through `logging`. Waits for nothing, raises nothing."""
-        event = Event(self._clock() - self.start_s, text, fields)
+    def event(self, text: str, *, level: int = logging.INFO) -> None:
+        """Log an event, in the file and through `logging`. Waits for nothing, raises nothing."""
+        event = Event(self._clock() - self.start_s, text)
         self._rows.append(event)
         self.recent.append(event)
-        _log.log(level, "%s", event)
+        _log.log(level, "%s", text)
 
     def close(self) -> None:
         """Write what is left. Waits 2 s at most, and then gives up on a disk that is stuck."""
@@ -230,10 +228,8 @@ def _line(row: Any) -> bytes:
     if isinstance(row, Tick):
         row = [round(value, 4) if isinstance(value, float) else value for value in plain(row)]
     elif isinstance(row, Event):
-        fields = row.fields
-        if len(whole := repr(fields)) > EVENT_CHARACTERS:  # a log file is bounded, a traceback is not
-            fields = {"cut": whole[:EVENT_CHARACTERS]}
-        row = {"kind": "event", "t_s": row.t_s, "event": row.text[:EVENT_CHARACTERS], "fields": fields}
+        # cut, because a log file is bounded and an error's text is not
+        row = {"kind": "event", "t_s": row.t_s, "event": row.text[:EVENT_CHARACTERS]}
     return json.dumps(plain(row), separators=(",", ":"), default=str).encode() + b"\n"
 
 
@@ -291,21 +287,14 @@ class Flight:
             "plans": len(latency_ms),
             "plan_age_p95_ms": _percentile(ticks["plan_age_ms"], 95),
             **{f"latency_p{q}_ms": _percentile(latency_ms, q) for q in (50, 95)},
-            "seconds_in": self._seconds_in(),
             "temperature_max_c": _percentile(self.machine["temperature_c"], 100),
             "throttled": throttled,
             "throttled_means": throttled_means(throttled),
-            "events": [{"t_s": e.t_s, "event": e.text, **e.fields} for e in self.events],
+            "events": [{"t_s": e.t_s, "event": e.text} for e in self.events],
             "drive": self.drive,
             "drives": self.drives,
             "damaged_lines": self.damaged,
         }
-
-    def _seconds_in(self) -> dict[str, float]:
-        t_s, states = self.ticks["t_s"], self.ticks["state"]
-        durations_s = np.diff(t_s, append=t_s[-1:] + (self.period_ms or 0) / 1000)
-        names = {s.value: s.name.lower() for s in State} | {"": "not known"}
-        return {names.get(str(s), str(s)): float(durations_s[states == s].sum()) for s in np.unique(states)}
 
 
 def _percentile(values: np.ndarray, q: float) -> float | None:
@@ -317,7 +306,7 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     """Read a flight log, with the older files path.1, path.2, ... that belong to it.
 
     drive: index of the drive in these files: 0 is the first, -1 the last. A service's log has a drive for each arming.
-    Raises RoverError if the file cannot be read, holds no such drive, or is of another version of the format.
+    Raises RoverError if the file cannot be read, or holds no such drive.
     """
     path = Path(path)
     rows = [_row(line) for line in _lines_of(path)]
@@ -325,8 +314,6 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     if not -len(drives) <= drive < len(drives):
         raise RoverError(f"{path}: no drive {drive} in it", found=f"{len(drives)} drives", remedy=NAME_A_LOG)
     header, *chosen = drives[drive]
-    if (schema := header.get("schema", SCHEMA)) != SCHEMA:
-        raise RoverError(f"{path}: of version {schema}, this program reads {SCHEMA}", remedy="use the other version's")
     ticks = [row for row in chosen if isinstance(row, list)]
     machine = [row for row in chosen if type(row) is tuple]
     columns = zip(*ticks, strict=True) if ticks else [()] * len(Tick._fields)
@@ -382,12 +369,12 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
         match json.loads(line):
             case list(values):
                 return [_value(name, value) for name, value in zip(Tick._fields, values, strict=True)]
-            case {"kind": "event", "t_s": t_s, "event": str(text), "fields": dict(fields)} if is_number(t_s):
-                return Event(float(t_s), text, fields)
+            case {"kind": "event", "t_s": t_s, "event": str(text)} if is_number(t_s):
+                return Event(float(t_s), text)
             case {"kind": "machine", "t_s": t_s, "temperature_c": heat, "throttled": bits} if is_number(t_s):
                 known = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
                 return (float(t_s), heat, bits) if known else None
-            case {"kind": "header"} as header if isinstance(header.get("drive", {}), dict):
+            case {"kind": "header", "schema": schema, "drive": dict()} as header if schema == SCHEMA:
                 return header
     except (ValueError, TypeError, RecursionError):
         pass

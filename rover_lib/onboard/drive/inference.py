@@ -155,8 +155,6 @@ class PolicyProcess:
     must have the size that the manifest gives, which is read in this process.
     """
 
-    loaded: Callable[[Any], None] | None = None  # called with the loaded policy; the laboratory makes it misbehave
-
     def __init__(self, artifact: Path | str | Artifact, *, threads: int | None = None):
         self._source, self.artifact = artifact, artifact.path if isinstance(artifact, Artifact) else Path(artifact)
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
@@ -175,7 +173,7 @@ class PolicyProcess:
         self.rate_hz, self.chunk = float(self.manifest["rate_hz"]), int(self.manifest["chunk"])
         spawn = multiprocessing.get_context("spawn")
         self._pipe, theirs = spawn.Pipe()
-        arguments = theirs, str(self.artifact), self.threads, type(self).loaded
+        arguments = theirs, str(self.artifact), self.threads
         self._process = spawn.Process(target=serve, args=arguments, name="policy", daemon=True)
         try:
             self._process.start()
@@ -240,7 +238,7 @@ class PolicyProcess:
         return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
 
 
-def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any], None] | None) -> None:
+def serve(pipe: Connection, artifact: str, threads: int) -> None:
     """Run the policy's process: answer each request until the other side closes the pipe.
 
     An answer is "=" and bytes, or "!" and an error's sentence. The first says why the process is not confined.
@@ -252,8 +250,6 @@ def serve(pipe: Connection, artifact: str, threads: int, loaded: Callable[[Any],
     with contextlib.suppress(EOFError, OSError):
         try:
             policy, unconfined = _load_confined(artifact, threads)
-            if loaded:
-                loaded(policy)
             forbid_opening()
         except Exception as error:
             return pipe.send_bytes(_refusal(f"{artifact}: cannot be loaded", error))

@@ -14,13 +14,13 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
-from rover_lib.onboard.drive.flight_log import ARMED, Tick
+from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick
 from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
 
@@ -106,20 +106,10 @@ class Report:
         }
 
 
-class Log(Protocol):
-    """Where a drive is told: a FlightLog, or what a simulation has for one."""
-
-    start_s: float
-
-    def tick(self, row: Tick) -> None: ...
-
-    def event(self, text: str, *, level: int = logging.INFO) -> None: ...
-
-
 def drive(
     pilot: Pilot,
     link: ServoLink | None,
-    log: Log,
+    log: FlightLog,
     *,
     rate_hz: float,
     until: Until | None = None,
@@ -166,7 +156,7 @@ def drive(
 class _Loop:
     pilot: Pilot
     link: ServoLink | None
-    log: Log
+    log: FlightLog
     period_s: float
     until: Until
     hooks: Hooks

@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import car_of
-from rover_lib.onboard.car.camera import path_of
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.errors import CameraError
 from rover_lib.onboard.status_line import StatusLine
 
 
@@ -26,9 +24,9 @@ class DriveOptions:
     hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
     much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
     throttle_limit: replaces that of params.yml. threads: of the policy; None: all cores but one. log_file: None: the
-    user's. service: run as a systemd service, disarmed until a human arms it. film: the camera may be recorded pictures
-    (a folder or a FIFO). latency_ms: make each plan take at least this long, for comparisons. view: the socket of a
-    view; None: the user's. asked_s: when the car was asked for, by boottime().
+    user's. service: run as a systemd service, disarmed until a human arms it. latency_ms: make each plan take at least
+    this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car was asked for, by
+    boottime().
     """
 
     artifact: Path
@@ -44,17 +42,9 @@ class DriveOptions:
     threads: int | None = None
     log_file: Path | None = None
     service: bool = False
-    film: bool = False
     latency_ms: float = 0.0
     view: Path | None = None
     asked_s: float = field(default_factory=boottime)
-
-
-def check_no_film(camera: str) -> None:
-    """Raise CameraError for pictures that do not come from a camera's device."""
-    path = path_of(camera)
-    if path.exists() and not path.is_char_device():
-        raise CameraError(f"{camera}: recorded pictures", remedy="give the camera's /dev/videoN, or --film")
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:

@@ -118,7 +118,7 @@ class PolicyPilot:
         self._camera, self._planner, self._commanded, self._settings = camera, planner, commanded, settings
         self._calibration = calibration or PwmCalibration()
         self._follower = Follower(settings, rate_hz)
-        self._sight = Sight(camera, settings)
+        self.sight = Sight(camera, settings)
         self._frame_age_s = self._asking_s = 0.0  # the longest since the last warnings()
         self._cut = 0.0  # the most throttle that the limit has taken away, not said yet
         self._said_cut = False
@@ -139,7 +139,7 @@ class PolicyPilot:
         frame = self._camera.latest()
         if frame:
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
-            self._sight.watch(frame, now_s)
+            self.sight.watch(frame, now_s)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
         plan = self._planner.newest()
         if plan is not None and plan is not self._follower.plan:
@@ -164,11 +164,7 @@ class PolicyPilot:
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
-        self._sight.sent(at_s, order.throttle)
-
-    def check_sight(self) -> None:
-        """Raise CameraError if nobody may drive by the newest frame."""
-        self._sight.check()
+        self.sight.sent(at_s, order.throttle)
 
     def warnings(self) -> Iterator[str]:
         """Yield sentences about how late camera and policy were since the last call."""
@@ -186,15 +182,13 @@ class PolicyPilot:
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:
     """Return an error if the pictures have stopped changing. It matters only while the car moves."""
     seen = frame.repeats + 1
-    if not settings.frozen_frames or seen < settings.frozen_frames:
+    if seen < settings.frozen_frames:
         return None
     return CameraError(f"the camera is frozen: {seen} frames showed nothing new", remedy="plug it in again")
 
 
 def blank(frame: Frame, settings: Settings) -> CameraError | None:
     """Return an error if this frame is black or without contrast."""
-    if not settings.black_frames:
-        return None
     if frame.mean < settings.black_level:
         return CameraError(f"the camera's picture is black (mean {frame.mean:.1f} of 255)", remedy=CAP)
     if frame.contrast < settings.flat_level:

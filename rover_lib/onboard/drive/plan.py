@@ -7,7 +7,6 @@
 Nothing here uses a clock or a device: times are arguments, in seconds of one monotonic clock.
 """
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -15,27 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.checked import Rule, broken_rule, is_whole, number, of_type, optional, whole
+from rover_lib.onboard.checked import broken_rule, number, of_type, whole
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
 STEERING, THROTTLE = 0, 1
-ROUNDING = 1e-6  # error of a time, in steps
 LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, throttle]
 IN_FORCE_S = 0.15  # how long a command holds: after that, the Arduino stops a car that gets no other
 BLIND_M = 1.0  # how far the car may go by one picture, at RECORDED_MPS
 RECORDED_MPS = 1.1  # throttle 0.09, the most of the recordings, of 12 m/s
-ENSEMBLE_MOST = 10.0  # times 64 plans, whose weights must not overflow: exp(709) is the largest that a float holds
 OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
-FRAMES = Rule(lambda count: is_whole(count, 0) and count != 1, "0 (off) or a whole number from 2")
 RULES = {
     "fade_s": number(1e-3, 3600),
     "stop_s": number(1e-3, 3600),
     "blend_ticks": whole(0, 1000),
     "compensate": of_type(bool),
-    "ensemble": optional(number(-ENSEMBLE_MOST, ENSEMBLE_MOST)),
     "throttle_limit": number(0, 1),
-    "frozen_frames": FRAMES,
-    "black_frames": FRAMES,
+    "frozen_frames": whole(2, 1000),
+    "black_frames": whole(2, 1000),
     "black_level": number(-255, 255),
     "flat_level": number(-255, 255),
 }
@@ -49,7 +44,6 @@ class Settings:
     stop_s: float = 1.0
     blend_ticks: int = 3
     compensate: bool = True
-    ensemble: float | None = None
     throttle_limit: float = 0.2
     frozen_frames: int = 3
     black_frames: int = 3
@@ -142,14 +136,9 @@ class Follower:
     def __init__(self, settings: Settings, rate_hz: float):
         self.settings = settings
         self.rate_hz = rate_hz
-        self._plans: deque[Plan] = deque(maxlen=64)  # more than one is kept for ensembling only
+        self.plan: Plan | None = None  # the newest; None before the first
         self._offset = np.zeros(2)  # old command minus new plan, when the newest plan took over
         self._blended = 0  # ticks since then
-
-    @property
-    def plan(self) -> Plan | None:
-        """The newest plan; None before the first."""
-        return self._plans[-1] if self._plans else None
 
     def add(self, plan: Plan, now_s: float) -> None:
         """Let a fresh plan take over at this tick. It is ignored unless its frame is newer than the last plan's."""
@@ -157,16 +146,13 @@ class Follower:
         if before and plan.captured_s <= before.captured_s:
             return
         if before and self.settings.blend_ticks:
-            old = self._wanted(now_s) * [1.0, self._fade(now_s - before.captured_s)]
-        if self.settings.ensemble is None:
-            self._plans.clear()
-        self._plans.append(plan)
-        if before and self.settings.blend_ticks:
-            self._offset, self._blended = old - self._meant(now_s), 0
+            old = self._wanted(before, now_s) * [1.0, self._fade(now_s - before.captured_s)]
+            self._offset, self._blended = old - self._meant(plan, now_s), 0
+        self.plan = plan
 
     def stop_s(self) -> float:
         """Return the age in seconds at which the newest plan stops the car: the settings', or the chunk's end."""
-        return min(self.settings.stop_s, len(self._plans[-1].actions) / self.rate_hz) if self._plans else 0.0
+        return min(self.settings.stop_s, len(self.plan.actions) / self.rate_hz) if self.plan else 0.0
 
     def command(self, now_s: float) -> Command | None:
         """Return what the newest plan meant for now; None without a plan, or if it is too old to drive by."""
@@ -174,7 +160,7 @@ class Follower:
         if plan is None or not (age_s := now_s - plan.captured_s) < self.stop_s():
             return None
         fade = self._fade(age_s)
-        steering, throttle = np.clip(self._wanted(now_s) * [1.0, fade], *plan.limits)
+        steering, throttle = np.clip(self._wanted(plan, now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
         limit = self.settings.throttle_limit  # forwards and backwards
         kept = max(min(float(throttle), limit), -limit)
@@ -189,22 +175,13 @@ class Follower:
             return 0.0
         return max(0.0, (stop_s - age_s) / (stop_s - fade_s))
 
-    def _wanted(self, now_s: float) -> np.ndarray:
+    def _wanted(self, plan: Plan, now_s: float) -> np.ndarray:
         left = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
-        return self._meant(now_s) + self._offset * max(0.0, left)
+        return self._meant(plan, now_s) + self._offset * max(0.0, left)
 
-    def _meant(self, now_s: float) -> np.ndarray:
-        newest = self._plans[-1]
-        if self.settings.ensemble is None:
-            return newest.at(self._step(newest, now_s))
-        # As LeRobot's ACTTemporalEnsembler: exp(-coefficient * i), i = 0 is the oldest plan that reaches until now.
-        steps = [(p, self._step(p, now_s)) for p in self._plans]
-        reach = [p.at(step) for p, step in steps if step < len(p.actions) - 1 + ROUNDING] or [newest.at(math.inf)]
-        weights = np.exp(-self.settings.ensemble * np.arange(len(reach)))
-        return np.average(reach, axis=0, weights=weights)
-
-    def _step(self, plan: Plan, now_s: float) -> float:
-        return (now_s - (plan.captured_s if self.settings.compensate else plan.ready_s)) * self.rate_hz
+    def _meant(self, plan: Plan, now_s: float) -> np.ndarray:
+        began_s = plan.captured_s if self.settings.compensate else plan.ready_s
+        return plan.at((now_s - began_s) * self.rate_hz)
 
 
 class Commanded:

@@ -94,7 +94,7 @@ class Service:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         self._systemd = WatchDog(sock=self._socket)
         self._rounds = 0  # rounds of checks that passed
-        self._state = self._text = self._missing = ""
+        self._state = self._text = ""
         self._done = threading.Event()
         self._threads = [
             threading.Thread(target=self._feed, name="watchdog", daemon=True),
@@ -151,8 +151,7 @@ class Service:
             for check in checks:
                 check()
             self._rounds += 1
-            self._missing = missing()
-            self._tell(f"{DISARMED}: {said + '; ' if said else ''}{self._missing or WAITING}")
+            self._tell(f"{DISARMED}: {said + '; ' if said else ''}{missing() or WAITING}")
             if first:
                 first = False
                 with contextlib.suppress(OSError):
@@ -240,7 +239,7 @@ class Service:
         if ask == "heartbeat":
             self._heard_s = self._clock()
         if ask != "arm":
-            return {"text": self._text, "missing": self._missing, "model": self._model, "ticket": self._ticket}
+            return {"text": self._text, "model": self._model, "ticket": self._ticket}
         if model != self._model:
             return {"armed": False, "text": "the request names another model: ask anew"}
         request = Request(**{name: None if value is None else float(value) for name, value in limits.items()})
@@ -290,14 +289,13 @@ def _is_closed(connection: socket.socket) -> bool:
         return True
 
 
-def state_of(unit: str = UNIT) -> dict[str, Any]:
+def state_of() -> dict[str, Any]:
     """Return what systemd knows about the service: its state is one of STATES, or "". Raises RoverError without one."""
-    names = "LoadState,ActiveState,StatusText,ActiveEnterTimestamp,NRestarts,Result,UnitFileState"
-    command = ["systemctl", "show", f"--property={names}", unit]
+    command = ["systemctl", "show", "--property=LoadState,ActiveState,StatusText", UNIT]
     try:
         result = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
     except (OSError, subprocess.SubprocessError) as error:
-        raise RoverError(f"systemctl cannot be asked about {unit} ({error})", remedy="is this a rover?") from None
+        raise RoverError(f"systemctl cannot be asked about {UNIT} ({error})", remedy="is this a rover?") from None
     properties = dict(line.partition("=")[::2] for line in result.stdout.splitlines())
     text = properties.get("StatusText", "")
     return {
@@ -305,14 +303,10 @@ def state_of(unit: str = UNIT) -> dict[str, Any]:
         "active": properties.get("ActiveState", "unknown"),
         "state": next((s for s in STATES if text.startswith(s)), ""),
         "text": text,
-        "since": properties.get("ActiveEnterTimestamp", ""),
-        "restarts": int(properties.get("NRestarts") or 0),
-        "result": properties.get("Result", ""),
-        "at_boot": properties.get("UnitFileState") == "enabled",
     }
 
 
-def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
+def ask_service(**question: Any) -> dict[str, Any]:
     """Send a question to the service and return its answer. Raises RoverError if it is not reached or is silent."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(ARMED_S)
@@ -321,42 +315,30 @@ def ask_service(unit: str = UNIT, **question: Any) -> dict[str, Any]:
             connection.send(json.dumps(question).encode())
             return json.loads(connection.recv(QUESTION_BYTES))
         except (FileNotFoundError, ConnectionRefusedError):
-            state = state_of(unit)
-            what = f"{unit} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
-            raise RoverError(what, remedy=f"sudo systemctl start {unit}") from None
+            state = state_of()
+            what = f"{UNIT} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
+            raise RoverError(what, remedy=f"sudo systemctl start {UNIT}") from None
         except (OSError, ValueError) as error:
-            raise RoverError(f"{unit} gave no answer ({error})", remedy="use sudo") from None
+            raise RoverError(f"{UNIT} gave no answer ({error})", remedy="use sudo") from None
 
 
 def arm_car(
-    request: Request,
-    unit: str = UNIT,
-    *,
-    model: str = "",
-    confirm: Callable[[dict[str, Any]], None] = lambda state: None,
-    notify: Callable[[str], None] = lambda text: None,
-    wait_s: float = 0.0,
+    request: Request, *, model: str = "", confirm: Callable[[dict[str, Any]], None] = lambda state: None
 ) -> str:
     """Arm the car whose service waits for it; return what the service then says. Raises RoverError if it refuses.
 
     model: content hash of the model that is meant; "": whichever is loaded. confirm: called with the service's state
-    before arming; may raise. wait_s: how long to wait for what is missing, of which `notify` is told.
+    before arming; may raise.
     """
-    state = ask_service(unit, ask="state")
+    state = ask_service(ask="state")
     if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
-        what = f"{unit} has loaded another model than {model[:12]}"
+        what = f"{UNIT} has loaded another model than {model[:12]}"
         raise RoverError(what, found=state["model"][:12], remedy="did somebody else deploy meanwhile?")
     confirm(state)
-    now, told, end_s = state, "", time.monotonic() + wait_s
-    while now.get("missing") and time.monotonic() < end_s:
-        if now["missing"] != told:
-            notify(told := now["missing"])
-        time.sleep(CHECK_S)
-        now = ask_service(unit, ask="state")
     asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": boottime()}
-    answer = ask_service(unit, ask="arm", **asked, **vars(request))
+    answer = ask_service(ask="arm", **asked, **vars(request))
     if not answer["armed"]:
-        raise RoverError(f"{unit} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
+        raise RoverError(f"{UNIT} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
     return answer["text"]
 
 

@@ -21,7 +21,7 @@ from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, wanted_si
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner
-from rover_lib.onboard.drive.loop import Hooks, Report, Until, Warnings, drive
+from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
@@ -67,12 +67,13 @@ class Session:
         Raises as loop.drive() does, but for a service no DriveFault.
         """
         options, pilot = self.options, self.make_pilot()
-        warnings = self.make_warnings(pilot)
+        health = HealthWatch(self.report, self.link)
         with Arming(self, pilot) as arming:
             self.report.clear()
             arm = partial(self._arm, arming, stop, said)
             show = partial(self.feed.tick, self.report, self.camera, pilot)
-            hooks = Hooks(arm, warnings, arming.record if options.record else None, show)
+            record = arming.record if options.record else None
+            hooks = Hooks(arm, lambda: [*pilot.warnings(), *health()], record, show)
             until = Until(options.ticks, options.max_seconds, stop, self.over)
             try:
                 drive(pilot, self.link, self.log, rate_hz=options.hz, until=until, hooks=hooks, report=self.report,
@@ -93,10 +94,6 @@ class Session:
         pwm = self.car.pwm
         return PolicyPilot(self.camera, self.planner, self.commanded, self.settings, self.rate_hz, calibration=pwm)
 
-    def make_warnings(self, pilot: PolicyPilot) -> Warnings:
-        health = HealthWatch(self.report, self.link)
-        return lambda: [*pilot.warnings(), *health()]
-
     def make_recorder(self, folder: Path, room: int | None) -> AbstractContextManager[Recorder]:
         port = self.link.port if self.link else ""
         about = About(f"driven by {self.mode}", arduino_port=port, source="rover drive", car=self.car)
@@ -116,18 +113,13 @@ class Session:
     def _arm(self, arming: "Arming", stop: threading.Event, said: str) -> Telemetry | None:
         """Arm the car for whoever asks for it: a service's operator, or the command itself."""
         attempt = partial(self.attempt, arming)
-        if self.link and (self.service or self.terminal):
-            show = partial(self._show_waiting, said)
-            checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]
-            if self.service:
-                missing = partial(what_is_missing, self.link)
-                telemetry = self.service.wait_for_human(attempt, checks, missing, said=said)
-            else:
-                telemetry = arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
-        else:
-            telemetry = attempt()
-        self.camera.begin()  # a film must start with the loop, not while arming waits
-        return telemetry
+        if not (self.link and (self.service or self.terminal)):
+            return attempt()
+        show = partial(self._show_waiting, said)
+        checks: list[Callable[[], object]] = [self.camera.latest, self.planner.newest, self.link.latest, show]
+        if self.service:
+            return self.service.wait_for_human(attempt, checks, partial(what_is_missing, self.link), said=said)
+        return arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
 
     def _show_waiting(self, said: str) -> None:
         asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
@@ -183,7 +175,7 @@ class Arming:
             driving.enter_context(session.planner.without_rest())
             driving.enter_context(session.boost(session.log))
             session.planner.renew(session.settings.fade_s)
-            self._pilot.check_sight()
+            self._pilot.sight.check()
             if session.link:
                 limit = session.settings.throttle_limit
                 self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)
@@ -197,7 +189,7 @@ class Arming:
     def record_human(self, stop: threading.Event, over: Callable[[], str | None]) -> None:
         """After a takeover in a recorded drive, record the human. Raises nothing."""
         session = self._session
-        if not self._recorder or not session.link:
+        if not (self._recorder and session.link and self._armed):
             return
         self._driving.close()  # the host no longer drives: ordinary priority, and one plan per second
         recorder, log = self._recorder.recorder, session.log

@@ -75,7 +75,7 @@ class TakeoverRecorder:
     def human(
         self,
         link: ServoLink,
-        armed: Telemetry | None,
+        armed: Telemetry,
         *,
         rate_hz: float,
         stop: threading.Event,
@@ -84,16 +84,15 @@ class TakeoverRecorder:
     ) -> Takeover:
         """Record the Arduino's newest status at each tick of rate_hz until the human lets go.
 
-        armed: the status with which the car was armed, when both sticks were at rest; None takes neutral as rest. stop:
-        ends the recording. over: called at each tick; may return another reason to end it. clock: of the link and the
-        recorder. Sends nothing, and raises nothing if the link fails.
+        armed: the status with which the car was armed, when both sticks were at rest. stop: ends the recording. over:
+        called at each tick; may return another reason to end it. clock: of the link and the recorder. Sends nothing,
+        and raises nothing if the link fails.
         """
         start_s = heard_s = signal_s = clock()
         rest_s: float | None = None  # since when both sticks have been at rest
         counts, boot, tick = dict.fromkeys((HUMAN, NOBODY), 0), None, 0
         neutral = link.calibration.neutral()
-        held_us = armed.receiver_steering_us if armed else None
-        rest_us = neutral.steering_us if held_us is None else held_us, neutral.throttle_us
+        rest_us = armed.receiver_steering_us or neutral.steering_us, neutral.throttle_us
         first = link.turned  # the status that ended the policy's turn
         if self._waiting and first and (first.result == IGNORED or first.host_s <= self._waiting[0][0]):
             self._waiting = None  # the Arduino did not take the newest command

@@ -51,19 +51,18 @@ def load_confined(
     paths: Mapping[str, Path | str],
     *,
     threads: int,
-    spare_mb: float = 0,
     notify: Callable[[str], object] = lambda reason: _log.warning("not confined: %s", reason),
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 
-    spare_mb: memory that the process needs besides. notify: told why, if the process is not confined.
+    notify: told why, if the process is not confined.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
     with ExitStack() as unless_all_are_loaded:
         for artifact in artifacts.values():
             unless_all_are_loaded.enter_context(artifact)
         reasons = [UNCONFINED[engine] for engine in map(import_engine, artifacts.values()) if engine in UNCONFINED]
-        limit_mb = spare_mb + sum(memory_mb(path, threads) for path in paths.values())
+        limit_mb = sum(memory_mb(path, threads) for path in paths.values())
         if reason := reasons[0] if reasons else confine(limit_mb):
             notify(reason)
         policies = {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}

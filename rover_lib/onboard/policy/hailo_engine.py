@@ -11,40 +11,38 @@ import hailo_platform
 import numpy as np
 
 from rover_lib.onboard.artifact.archive import HEF, ONNX
-from rover_lib.onboard.artifact.engines import SessionEngine
+from rover_lib.onboard.artifact.engines import Engine
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.policy.onnx_engine import session_of
 
 TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take
 
 
-class HailoEngine(SessionEngine):
-    """A network on the chip, and the rest of the policy on the processor. Make it with `load`.
-
-    _how: the manifest's "hailo": network, outputs (name: shape) and original_names.
-    """
+class HailoEngine(Engine):
+    """A network on the chip, and the rest of the policy on the processor. Make it with `load`."""
 
     def __init__(self, artifact: Artifact, threads: int | None):
-        self._path, self._how = artifact.path, artifact.manifest["hailo"]
-        cameras = artifact.manifest["cameras"]
+        self._path, cameras = artifact.path, artifact.manifest["cameras"]
+        answers = artifact.manifest["hailo"]["outputs"]  # name: shape
         shapes = {f"frame_{c['name']}": [c["height"], c["width"], 3] for c in cameras}
-        self._rest_model = artifact.record(ONNX)
         formats = hailo_platform.FormatType
         self._device = hailo_platform.VDevice()
         self._model = self._device.create_infer_model(artifact.record(HEF))
         self._inputs = self._match(self._model.inputs, shapes)
-        outputs = self._match(self._model.outputs, self._how["outputs"])
+        outputs = self._match(self._model.outputs, answers)
         for stream in self._inputs.values():
             self._model.input(stream).set_format_type(formats.UINT8)
         for stream in outputs.values():
             self._model.output(stream).set_format_type(formats.FLOAT32)
         self._network = self._model.configure()
         self._bindings = self._network.create_bindings()
-        self._answers = {name: np.empty(shape, np.float32) for name, shape in self._how["outputs"].items()}
+        self._answers = {name: np.empty(shape, np.float32) for name, shape in answers.items()}
         for name, buffer in self._answers.items():
             self._bindings.output(outputs[name]).set_buffer(buffer)
-        self.set_threads(threads or usable_cores())
+        self.threads = threads or usable_cores()
+        self._rest = session_of(artifact.record(ONNX), self.threads, self._path)
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
         """As Engine.run()."""
@@ -56,20 +54,10 @@ class HailoEngine(SessionEngine):
         except Exception as e:  # HailoRT raises a dozen types, and so does ONNX Runtime
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
 
-    def _make_session(self, threads: int) -> None:
-        from rover_lib.onboard.policy.onnx_engine import session_of
-
-        self._rest = session_of(self._rest_model, threads, self._path)
-
     def _match(self, streams: list[Any], shapes: dict[str, list[int]]) -> dict[str, str]:
-        """Return HailoRT's name of the stream for each of our names: by its size and, if several have it, by name."""
-        matched = {}
-        for name, shape in shapes.items():
-            alike = [s.name for s in streams if math.prod(s.shape) == math.prod(shape)]
-            if len(alike) > 1:
-                wanted = {name, self._how["original_names"].get(name, name)}
-                alike = [s for s in alike if wanted & set(self._model.hef.get_original_names_from_vstream_name(s))]
-            matched[name] = alike[0] if len(alike) == 1 else ""
+        """Return HailoRT's name of the stream for each of our names, by size. ArtifactError if two have the same."""
+        names = {math.prod(s.shape): s.name for s in streams}
+        matched = {name: names.get(math.prod(shape), "") for name, shape in shapes.items()}
         if sorted(matched.values()) != sorted(s.name for s in streams):
             found = ", ".join(f"{s.name} {list(s.shape)}" for s in streams)
             raise ArtifactError(f"{self._path}: its HEF has other streams than {shapes}", found=found)

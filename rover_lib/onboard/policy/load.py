@@ -80,10 +80,6 @@ class Policy:
         """The number of threads that compute an inference."""
         return self._engine.threads
 
-    def set_threads(self, threads: int) -> None:
-        """Compute with this number of threads from now on. Some engines have to load the artifact again."""
-        self._engine.set_threads(threads)
-
 
 def import_engine(artifact: Artifact) -> str:
     """Import the engine that an artifact needs, and return its name. Raises ArtifactError if it is not installed."""

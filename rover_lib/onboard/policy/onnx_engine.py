@@ -7,7 +7,7 @@ import numpy as np
 import onnxruntime
 
 from rover_lib.onboard.artifact.archive import ONNX, refused
-from rover_lib.onboard.artifact.engines import SessionEngine
+from rover_lib.onboard.artifact.engines import Engine
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
 
@@ -34,30 +34,20 @@ def session_of(model: bytes, threads: int, path: Path | str = "the model") -> on
     return session
 
 
-class OnnxEngine(SessionEngine):
+class OnnxEngine(Engine):
     """The model of an ONNX artifact. Make it with `load`."""
 
     def __init__(self, path: Path, model: bytes, threads: int):
-        self._path = path
-        self._start(model, threads)
-        self.threads = threads
+        self._session, self.threads = session_of(model, threads, path), threads
+        self.names = [i.name for i in self._session.get_inputs()]
 
     def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        inputs = dict(zip(self._names, (state[None], *frames_rgb), strict=True))
+        inputs = dict(zip(self.names, (state[None], *frames_rgb), strict=True))
         try:
             (y,) = self._session.run(None, inputs)
         except Exception as e:  # ONNX Runtime raises a dozen types, none of them a RuntimeError
             raise RuntimeError(str(e)) from None
         return y
-
-    def _make_session(self, threads: int) -> None:
-        with Artifact(self._path) as artifact:  # again, because keeping the model would cost its size in memory
-            artifact.prove()
-            self._start(artifact.record(ONNX), threads)
-
-    def _start(self, model: bytes, threads: int) -> None:
-        self._session = session_of(model, threads, self._path)
-        self._names = [i.name for i in self._session.get_inputs()]
 
 
 def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
@@ -65,6 +55,6 @@ def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
     path, manifest = artifact.path, artifact.manifest
     engine = OnnxEngine(path, artifact.record(ONNX), threads or usable_cores())
     wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
-    if engine._names != wanted:
-        raise refused(path, f"its model takes {engine._names}, its manifest says {wanted}"[:300])
+    if engine.names != wanted:
+        raise refused(path, f"its model takes {engine.names}, its manifest says {wanted}"[:300])
     return engine

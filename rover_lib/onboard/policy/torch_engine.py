@@ -30,9 +30,6 @@ class TorchEngine:
     def threads(self) -> int:
         return torch.get_num_threads()
 
-    def set_threads(self, threads: int) -> None:
-        torch.set_num_threads(threads)
-
 
 def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     """Load an artifact. Raises ArtifactError if it was made with another torch, or cannot be loaded."""

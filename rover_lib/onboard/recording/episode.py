@@ -1,4 +1,4 @@
-"""Write one drive as an episode folder, in the format of the user's recorder, and read its controls again.
+"""Write one drive as an episode folder, in the format of the user's recorder.
 
 episode_YYYYMMDD_HHMMSS/
   episode_data.json   control_data.csv   frame_data.csv   frames/frame_%06d.jpg
@@ -483,11 +483,3 @@ def _data_of(path: Path) -> bytes:
         return read_plain(path, DATA_BYTES)
     except OSError:
         return b""
-
-
-def json_controls(path: Path) -> list[dict[str, Any]]:
-    """Return the controls in an episode_data.json; none if it cannot be read."""
-    try:
-        return [row for row in json.loads(_data_of(path))["control_samples"] if isinstance(row, dict)]
-    except (ValueError, RecursionError, TypeError, KeyError):
-        return []

@@ -84,7 +84,8 @@ class View:
 
     address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. car: whose drives are shown;
-    None means this machine's. ask: takes what a simulation's page asks for; None for a car. Raises RoverError for an
+    None means this machine's. ask: takes what a simulation's page asks for; None for a car. script: of such a page,
+    after that of every page. Raises RoverError for an
     unknown user, and CarError and ParamsError like this_car() and CarShape.of().
     """
 
@@ -96,6 +97,7 @@ class View:
         drive_user: str | None = None,
         car: Car | None = None,
         ask: Callable[[str], object] | None = None,
+        script: bytes = b"",
     ):
         self._address, self._token, self._place, self._ask = address, token, place, ask
         self._users = {0, os.geteuid()}
@@ -112,7 +114,7 @@ class View:
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet"}
         self._picture = b""
         self._news = asyncio.Event()
-        self._html = PAGE.read_bytes()
+        self._html = PAGE.read_bytes().replace(b"</script>", script + b"</script>")
 
     async def run(
         self, opened: Callable[[str], object], beside: Callable[["View"], Awaitable[object]] | None = None
@@ -230,8 +232,6 @@ class View:
                     line, _, picture = data.partition(b"\n")
                     head = json.loads(line)
                     phase = head["phase"]
-                    if shape := head.pop("shape", None):
-                        picture = _jpeg_of(picture, shape)
                     if drive is self._drives[-1]:
                         self.show(head, picture)
         finally:
@@ -317,14 +317,6 @@ def _digest_of(tag: bytes, html: bytes) -> str:
     part = re.search(rb"<%s>(.*?)</%s>" % (tag, tag), html, re.S)
     assert part, "view.html has one of each"
     return f"sha256-{base64.b64encode(hashlib.sha256(part[1]).digest()).decode()}"
-
-
-def _jpeg_of(picture: bytes, shape: list[int]) -> bytes:
-    """Compress the raw BGR picture of a camera that delivers no JPEGs. Raises ValueError if it has another size."""
-    import numpy as np  # imported here because few cameras need it
-    import simplejpeg
-
-    return simplejpeg.encode_jpeg(np.frombuffer(picture, np.uint8).reshape(shape), 80, "BGR")
 
 
 async def _received(loop: asyncio.AbstractEventLoop, drive: socket.socket) -> bytes:

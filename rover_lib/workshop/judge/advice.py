@@ -183,19 +183,17 @@ def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names
 
 
 def _to_drive(judged: Mapping[str, Any], stages: Stages, names: Names, artifact: str) -> list[tuple[str, str]]:
+    if stages["compare"]["fp32"]["trials"]:  # it learned in the balloon world, or would not drive there
+        watch = "make watch" if names.name == "demo" else shlex.join(["rover", "view", artifact])
+        record = "rover record --max-seconds 30 episodes"
+        return [(watch, "watch it drive, in your browser"), (record, "record your own drives, on the car")]
     play = "ansible-playbook -i inventory.ini ansible/"
     allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
     deploying = f"{play}deploy.yml -e {shlex.quote(f'rover_artifact={artifact}')}" + (f" -e '{allow}'" if allow else "")
-    commands = []
-    if stages["compare"]["fp32"]["trials"]:
-        commands.append((shlex.join(["rover", "view", artifact]), "watch it drive, in your browser"))
     if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
         return [
-            *commands,
             (deploying, "put it on the rover"),
             (f"{play}benchmark.yml", "measure its time there"),
             (f"{play}drive.yml --limit rover1", "drive, transmitter in hand"),
         ]
-    if judged["deploy"] == "mixed":
-        commands.append((deploying, "put it on the rover"))
-    return commands
+    return [(deploying, "put it on the rover")] if judged["deploy"] == "mixed" else []

@@ -20,7 +20,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.onboard.car.host import THROTTLED_BITS
 from rover_lib.workshop.judge.recorded_range import worst
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
@@ -34,7 +33,6 @@ SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
 MIST = "#AAB7C4"  # what is compared with a slate figure: before, without, the rest
 GREY = "#B0B0B0"
 OTHERS = (SLATE, "#8C6D31", "#AA4499", "#117733", "#6699CC", "#994455", "#997700")  # hosts, students, more actions
-NOW_BITS = sum(1 << bit for bit in THROTTLED_BITS)  # get_throttled's bits for now; others are since the last boot
 COLOURS = {
     "fp32": BLACK,
     "dynamic": ORANGE,

@@ -9,14 +9,14 @@ import random
 import needs
 import pytest
 from recorded import real_episode
-from uno import CUT, EDGE_US, LINE_IN, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
+from uno import CUT, EDGE_US, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 
 pytestmark = [pytest.mark.emulated, needs.simavr]
 NEUTRAL_US = 1456, 120
-TIMEOUT_MS, WATCHDOG_MS, TAKEOVER_MS = 150, 60, 50
+WATCHDOG_MS = 60
 REST = (1460, 124)  # sticks that were let go, a little off, as transmitters are
 RUBBISH = b"<>ADNQ 0123456789*ABCDEF\n\xff"
 
@@ -34,11 +34,6 @@ def armed(board):
     board.run_ms(120)
     arm(board)
     return board
-
-
-def last_throttle_us(events):
-    """When the last throttle pulse that moves the car ended."""
-    return max(e.at_us + e.pulse_us for e in pulses(events, "throttle") if e.pulse_us > 124)
 
 
 def test_neutral_before_anything_else(board):
@@ -77,34 +72,6 @@ def test_recorded_pulses_come_out_as_they_went_in(board):
         events = board.drive(sent.steering_us, sent.throttle_us, 25)
         on_pins(events, steering_us, throttle_us, within_us=2 * ARDUINO_STEP_US)
     assert len(moving) >= 5
-
-
-def test_no_command_for_150_ms_stops(armed):
-    rng = random.Random(1)
-    for _ in range(5):
-        armed.drive(1800, 232, 60 + rng.uniform(0, 25), every_ms=20)
-        armed.command("D", 1800, 232)
-        events = armed.run_ms(350)
-        command_us = max(e.at_us for e in events if e.kind == LINE_IN)
-        late_ms = (last_throttle_us(events) - command_us) / 1000
-        print(f"throttle off {late_ms:.1f} ms after the last command")
-        assert TIMEOUT_MS - 2 <= late_ms <= TIMEOUT_MS + 3
-        on_pins(events, *NEUTRAL_US, after_us=command_us + (TIMEOUT_MS + 24) * 1000)
-        arm(armed)
-
-
-def test_the_human_takes_over_within_50_ms(armed):
-    rng = random.Random(2)
-    for _ in range(5):
-        armed.drive(1800, 232, 60 + rng.uniform(0, 25), every_ms=20)
-        start_us = armed.now_us
-        armed.transmitter(1560, 124)
-        events = armed.drive(1800, 232, 90, every_ms=20)
-        on_pins(events, 1560, 124, after_us=start_us + TAKEOVER_MS * 1000, within_us=STEP_US)
-        print(f"the host's last throttle {(last_throttle_us(events) - start_us) / 1000:.1f} ms after the stick")
-        armed.transmitter(*REST)
-        armed.run_ms(50)
-        arm(armed)
 
 
 def test_a_line_full_of_rubbish_keeps_no_command_out(armed):
@@ -172,18 +139,15 @@ def test_no_other_interrupt_disturbs_the_steering_by_more_than_a_step(board):
         assert abs(board.status.receiver_steering_us - steering_us) <= STEP_US + 0.5  # half of one is rounding
 
 
-@pytest.mark.parametrize(("let_go", "most_ms"), [(False, 155), (True, 30)])
-def test_a_held_throttle_of_a_gamepad_stops(let_go, most_ms):
+def test_a_held_throttle_of_a_gamepad_stops():
     board = Uno(human="gamepad")
     board.run_ms(120)
-    held = [(1456, 120)] * 20 + [(1600, 200)] * 15
-    for steering_us, throttle_us in held + [(0, 0)] * let_go:
+    for steering_us, throttle_us in [(1456, 120)] * 20 + [(1600, 200)] * 15:
         at_us = board.now_us
         board.send(line(f">S {board.boot} {board.status.uptime_ms} {steering_us} {throttle_us}"))
         board.run_ms(20)
     assert any(abs(us - 200) <= 1 for us in widths(board.events, "throttle"))
     board.run_ms(400)
-    off_ms = (last_throttle_us(board.events) - at_us) / 1000  # after the last line began
-    print(f"throttle off after {off_ms:.1f} ms")
-    assert off_ms <= most_ms
+    last_us = max(e.at_us + e.pulse_us for e in pulses(board.events, "throttle") if e.pulse_us > 124)
+    assert last_us - at_us <= 155_000  # after the last line began
     board.close()

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import needs
 import pytest
-from uno import ANSWER_MS, EDGE_US, EEPROM_BYTES, REPOSITORY, RESET, STEP_US, Uno, arm, on_pins, pulses, widths
+from uno import ANSWER_MS, EDGE_US, EEPROM_BYTES, REPOSITORY, STEP_US, Uno, arm, on_pins, pulses, widths
 
 from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -73,18 +73,6 @@ def test_a_pulse_is_whole_whenever_it_changes(crawler):
         assert min(widths(events, pin)) >= 1500 - 2 - EDGE_US
         assert max(widths(events, pin)) <= most_us + 2 + EDGE_US
     has_periods(events, CRAWLER)
-
-
-def test_after_a_reset_the_pins_have_its_neutral(crawler):
-    """A watchdog's reset in a drive gave the default's neutral, 120 us at 984 Hz, to a speed controller of 50 Hz."""
-    crawler.drive(2000, 1500 + CRAWLER.cap_us, 297)
-    crawler.transmitter(0, 0)
-    crawler.hang()
-    crawler.run_ms(400)
-    reset_us = max(e.at_us for e in crawler.events if e.kind == RESET)
-    later = [e for e in crawler.events if e.at_us > reset_us]
-    on_pins(later, 1500, 1500, within_us=HALF_STEP_US)
-    has_periods(later, CRAWLER)
 
 
 def test_told_of_another_car_no_pulse_is_cut():

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from balloon_world.simulated_arduino import PinEvent
-from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Gates, Observation, judge, periods_of
+from lab.driving.pins import CONTINUES, HUMAN, STOPPED, Command, Observation, judge, periods_of
 from rover_lib.onboard.car.car import Car
 
-GATES = Gates(stopped_ms=250, throttle_max_us=124, takeover_ms=50)
 AT, START, END = 100.0, 99.5, 102.0
 DRIVEN = (1567, 209)
 
@@ -48,5 +47,5 @@ def seen(what):
     ],
 )
 def test_a_judgement(expected, what, sentence):
-    wrong = judge(expected, seen(what), GATES, human_us=(1600, 140)).wrong
+    _, wrong = judge(expected, seen(what), human_us=(1600, 140))
     assert any(sentence in w for w in wrong) if sentence else wrong == []

@@ -75,11 +75,8 @@ def test_a_bomb_is_known_by_its_header(artifacts, tmp_path, name):
 CAMERA = {"name": "cam_front", "height": 72, "width": 128}
 MANIFESTS = [
     ({"schema": 2}, "schema"),
-    ({"mode": "harm"}, "mode"),
     ({"gmac": ...}, "gmac"),
-    ({"chunk": 10**30}, "chunk"),
     ({"rate_hz": True}, "rate_hz"),
-    ({"cameras": []}, "cameras"),
     ({"cameras": [CAMERA | {"height": 72_000}]}, "cameras"),
     ({"cameras": [CAMERA] * 2}, "cameras"),
     ({"cameras": [CAMERA | {"width": 256}]}, "another shape"),

@@ -129,17 +129,3 @@ def test_the_command_writes_what_it_measured_and_replaces_nothing_without_force(
         assert result.exit_code == 1 and word in result.output and not desk.asked
     assert read_car(path) == Car()
     assert run(Desk(CRAWLER), "--force")[0].exit_code == 0 and not read_car(path).is_default
-
-
-def test_ctrl_c_leaves_everything_as_it_was(run):
-    desk = Desk(CRAWLER)
-
-    def interrupt(text, ask=desk.ask):
-        if len(desk.asked) == 5:
-            raise KeyboardInterrupt
-        ask(text)
-
-    desk.ask = interrupt
-    result, path = run(desk)
-    assert result.exit_code == 1 and len(desk.asked) == 5
-    assert not path.parent.exists() or not list(path.parent.iterdir())

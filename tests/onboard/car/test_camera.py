@@ -1,7 +1,6 @@
-"""The newest frame: from folders, streams and devices, also when these stop, change or repeat themselves."""
+"""The newest frame: from streams and devices, also when these stop, change or repeat themselves."""
 
 import os
-import threading
 
 import cv2
 import hostile
@@ -44,29 +43,17 @@ def test_of_a_stream_only_the_newest_is_kept_until_it_ends(tmp_path):
 
 def test_what_cannot_be_read_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(c, "FIRST_FRAME_S", 0.3)
-    (tmp_path / "drive.mp4").touch()
-    cut = tmp_path / "cut"
-    cut.mkdir()
-    (cut / "0.jpg").write_bytes(hostile.cut(hostile.WHOLE))
+    os.mkfifo(tmp_path / "cut")
+    fd = os.open(tmp_path / "cut", os.O_RDWR)
+    os.write(fd, hostile.cut(jpeg(100)))
     for source, message in (
         ("63", "no such camera"),
-        (tmp_path, "no JPEGs"),
-        (tmp_path / "drive.mp4", "ffmpeg"),
-        (cut, r"no frame within 0\.3 s: a JPEG is damaged or cut short"),
+        (tmp_path, "neither a camera nor"),
+        (tmp_path / "cut", r"no frame within 0\.3 s: a JPEG is damaged or cut short"),
     ):
         with pytest.raises(CameraError, match=message):
-            Camera(source, held=True).open()
-
-
-def test_a_folder_is_shown_again_and_again_until_it_begins(tmp_path):
-    """So that arming may take its time; then each picture comes once, from the first on."""
-    for i in range(3):
-        (tmp_path / f"frame_{i:06d}.jpg").write_bytes(b"abc"[i : i + 1])
-    begun = threading.Event()
-    reader = c._folder(tmp_path, 1000, threading.Event(), begun)
-    assert b"".join(next(reader)[0] for _ in range(7)) == b"abcabca"
-    begun.set()
-    assert b"".join(picture for picture, _ in reader) == b"abc"
+            Camera(source).open()
+    os.close(fd)
 
 
 def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen():
@@ -87,17 +74,6 @@ def test_no_picture_of_a_real_drive_counts_as_frozen():
         for jpeg in sorted((episode / "frames").glob("*.jpg")):
             camera.add(decode_jpeg(jpeg.read_bytes()), 0.0, None)
             assert camera.latest().repeats == 0
-
-
-def test_a_film_that_begins_again_is_no_frozen_camera():
-    rng, camera, shown = np.random.default_rng(0), Camera("film", held=True), []
-    pictures = [rng.integers(0, 255, (36, 64, 3), np.uint8) for _ in range(6)]
-    for picture in pictures * 3:
-        if len(shown) == 12:  # until here they do no harm: nobody drives with it yet
-            camera.begin()
-        camera.add(picture, 0.0, None)
-        shown.append(camera.latest().repeats)
-    assert shown == [0] * 6 + [1, 2, 3, 4, 5, 6] + [0] * 6
 
 
 # ---- what is no frame, on a virtual clock

@@ -5,8 +5,6 @@ import copy
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rover_lib.onboard.car import car as module
 from rover_lib.onboard.car.car import Car, this_car, yaml_of
@@ -69,20 +67,6 @@ def test_each_side_of_neutral_has_its_own_span():
     assert [Car().pwm.throttle.moves(us) for us in (0, 104, 120, 124, 125)] == [False] * 4 + [True]
 
 
-@given(st.floats(-1, 1), st.floats(-1, 1), st.booleans())
-def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
-    content = copy.deepcopy(CRAWLER)
-    if inverted:
-        content["steering"] |= {"left_us": 1100, "right_us": 2000}
-    pwm = Car.of(content).pwm
-    pulses = pwm.pulses(steering, throttle)
-    # A receiver's period may be a little longer or shorter; only the pulse counts for a servo.
-    actions = pwm.actions_from_pulses(pulses.steering_us, pulses.throttle_us, 19000, 22000)
-    assert pwm.pulses(-1, 0).steering_us == (2000 if inverted else 1100)
-    assert actions.steering == pytest.approx(steering, abs=0.6 / 400)
-    assert actions.throttle == pytest.approx(throttle, abs=0.6 / 500)
-
-
 @pytest.mark.parametrize(
     ("where", "value", "sentence"),
     [
@@ -92,7 +76,7 @@ def test_an_action_comes_back_from_its_pulse(steering, throttle, inverted):
         ("steering.neutral_us", 1250, "neutral_us must be from 1300 to 1700"),
         ("steering.right_us", 1300, "must be from 250"),
         ("steering.left_us", 2400, "must be from 800 to 2200"),
-        ("steering.period_us", 1900, "longer than its pulses"),
+        ("steering.period_us", 1900, "steering's period_us must be from 3000"),
         ("throttle.period_us", 2500, "throttle's period_us must be from 1000"),
         ("throttle.reverse_us", 700, "an end of throttle"),
         ("throttle.forward_us", 1550, "must be from 100"),

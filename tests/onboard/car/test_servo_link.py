@@ -14,7 +14,6 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 from pty_board import Board, board_of, obedient
-from uno import line
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
@@ -25,26 +24,25 @@ until = functools.partial(needs.until, seconds=2.0)
 STATUS = "<S 7 1234 5 k M r w 1456 120 238 1460 21316 - - 1 2 3 4"
 
 
-def test_frame_and_parse():
-    assert frame(">D 7 1 1456 120") == line(">D 7 1 1456 120")
-    said = parse(line(STATUS)[:-1], 2.5)
+def test_what_the_arduino_says():
+    said = parse(frame(STATUS)[:-1], 2.5)
     pulses = (1456, 120, 238, 1460, 21316, None, None)
     assert said == Telemetry(2.5, 7, 1234, 5, "k", State.MANUAL, "r", "w", *pulses, 1, 2, 3, 4)
     assert said.why == "manual: after a reset"
     assert (said.pulses.steering_us, said.pulses.throttle_us) == (1456, 120)
-    assert parse(line(f"<H 4 4.2.0 7 0 w {DEFAULT}")[:-1], 0) == Hello(4, "4.2.0", 7, 0, "watchdog", DEFAULT)
-    assert parse(line("<H 5 5.1 whatever comes then")[:-1], 0).protocol == 5
+    assert parse(frame(f"<H 4 4.2.0 7 0 w {DEFAULT}")[:-1], 0) == Hello(4, "4.2.0", 7, 0, "watchdog", DEFAULT)
+    assert parse(frame("<H 5 5.1 whatever comes then")[:-1], 0).protocol == 5
 
 
 @given(st.data())
 def test_a_garbled_status_says_nothing(data):
-    good = line(STATUS)[:-1]
+    good = frame(STATUS)[:-1]
     at = data.draw(st.integers(0, len(good) - 1))
     flip = data.draw(st.integers(1, 255))
     assert parse(good[:at] + bytes([good[at] ^ flip]) + good[at + 1 :], 0) is None
     changes = {" M ": " X ", "1460 21316": "1460 -", "1456": "01456", "<S": ">S", "- - 1": "- - 5 1"}
     wrong = data.draw(st.sampled_from(list(changes)))
-    assert parse(line(STATUS.replace(wrong, changes[wrong]))[:-1], 0) is None
+    assert parse(frame(STATUS.replace(wrong, changes[wrong]))[:-1], 0) is None
 
 
 def test_a_drive_ends_in_neutral():
@@ -102,13 +100,6 @@ def test_an_arduino_that_is_not_reset_is_asked():
         threading.Thread(target=needs.keep_sending, args=(lambda: board.say(STATUS), 1.2), daemon=True).start()
         with ServoLink(board.port) as link:
             assert link.hello.sequence == 40 and board.heard[0] == ">Q"
-
-
-def test_arming_refused():
-    with board_of(answer=lambda board, body: board.status("M", "r", "t")) as board, ServoLink(board.port) as link:
-        with pytest.raises(LinkError, match="let go of the throttle"):
-            link.arm()
-        assert sum(b.startswith(">A") for b in board.heard) == 1
 
 
 def test_the_arduino_is_told_when_somebody_asked():
@@ -175,7 +166,7 @@ def test_a_stuck_port_does_not_stop_the_loop():
 def test_silence_is_an_error_and_garbled_lines_are_dropped():
     now = [0.0]
     with board_of(answer=obedient) as board, ServoLink(board.port, clock=lambda: time.monotonic() + now[0]) as link:
-        os.write(board.master, b"<S 1 2 3*00000000\n" + b"x" * 1000 + b"\n\n" + line(STATUS))
+        os.write(board.master, b"<S 1 2 3*00000000\n" + b"x" * 1000 + b"\n\n" + frame(STATUS))
         until(lambda: link.latest().sequence == 5)
         assert link.garbled == 2
         now[0] = 0.6

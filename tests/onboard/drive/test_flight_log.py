@@ -71,12 +71,11 @@ def test_events_have_their_time_and_go_to_logging_too(path, caplog):
     now = [100.0]
     with caplog.at_level("INFO", "rover"), FlightLog(path, header=HEADER, **LIMITS, clock=lambda: now[0]) as log:
         now[0] = 102.5
-        fields = {"frame": np.int64(812), "age": float("nan"), "what": ValueError("x")}
-        log.event("camera unplugged", level=logging.WARNING, **fields)
-        log.event("x" * 3000, details="y" * 3000)
+        log.event("camera unplugged", level=logging.WARNING)
+        log.event("x" * 3000)
     first, second = read_log(path).events
-    assert first == (2.5, "camera unplugged", {"frame": 812, "age": None, "what": "x"})
-    assert len(str(second)) < 2000  # a file is bounded, a traceback is not
+    assert first == (2.5, "camera unplugged")
+    assert len(second.text) < 1000  # a file is bounded, an error's text is not
     assert [r.levelname for r in caplog.records] == ["WARNING", "INFO"]
 
 
@@ -152,7 +151,7 @@ def good(tmp_path_factory):
     with FlightLog(path, header=HEADER, **LIMITS) as log:
         for k in range(40):
             log.tick(tick(k))
-        log.event("armed", who="host")
+        log.event("armed")
     return path.read_bytes()
 
 
@@ -177,8 +176,9 @@ TICK = [0.1, 0.2, "A", "a", 0, 0, 1456, 120, None, None, 0, None, None, 1, 0]
 NO_ROWS = [
     7,
     {"kind": "machine", "t_s": 1, "temperature_c": "hot", "throttled": None},
-    {"kind": "event", "t_s": 10**400, "event": "a", "fields": {}},
-    {"kind": "header", "drive": [1]},
+    {"kind": "event", "t_s": 10**400, "event": "a"},
+    {"kind": "header", "schema": 2, "drive": [1]},
+    {"kind": "header", "schema": 1, "drive": {}},
     TICK[:-1],
     [None, *TICK[1:]],
     ["a"] * 15,
@@ -192,14 +192,10 @@ def test_lines_of_another_form_are_skipped(tmp_path, good):
 
 
 def test_what_cannot_be_read(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    for name in ("nothing.log", "fifo", "."):
-        with pytest.raises(RoverError, match="cannot be read"):
+    (tmp_path / "empty.log").touch()
+    for name in ("nothing.log", ".", "empty.log"):
+        with pytest.raises(RoverError):
             read_log(tmp_path / name)
-    other = tmp_path / "old.log"
-    other.write_text('{"schema":1,"kind":"header","start":"x"}\n')
-    with pytest.raises(RoverError, match="version 1"):
-        read_log(other)
 
 
 # ---- bad disks
@@ -260,21 +256,15 @@ def test_a_stuck_disk_holds_up_neither_the_loop_nor_the_end(path, monkeypatch, q
 
 # ---- the summary
 
+PLAN = ("latency_ms", "plan_age_ms")
+
 
 def test_summary(path, pi_host):
-    late_ms = [0.1] * 97 + [30.0, 4.5, 1.0]
-    rows = [
-        tick(
-            k,
-            t_s=(k + 3 * (k > 50)) / 30 + late / 1000,  # three were missed
-            late_ms=late,
-            state="" if k < 10 else "A" if k < 70 else "M",
-            plan=k // 10,
-            latency_ms=None if k < 10 else 100.0 + k // 10,
-            plan_age_ms=None if k < 10 else float(k),
-        )
-        for k, late in enumerate(late_ms)
-    ]
+    rows = []
+    for k, late_ms in enumerate([0.1] * 97 + [30.0, 4.5, 1.0]):
+        times = {"t_s": (k + 3 * (k > 50)) / 30 + late_ms / 1000, "late_ms": late_ms}  # three were missed
+        plan = {"latency_ms": 100.0 + k // 10, "plan_age_ms": float(k)} if k >= 10 else dict.fromkeys(PLAN)
+        rows.append(tick(k, plan=k // 10, **times, **plan))
     write(path, rows, host=pi_host)
     found = read_log(path).summary()
     json.dumps(found, allow_nan=False)
@@ -283,6 +273,5 @@ def test_summary(path, pi_host):
     assert found["plan_age_p95_ms"] == pytest.approx(np.percentile(np.arange(10, 100), 95))
     assert (found["latency_p50_ms"], found["latency_p95_ms"]) == (105.0, pytest.approx(108.6))
     assert found["seconds"] == pytest.approx(3.4009)
-    assert found["seconds_in"] == pytest.approx({"not known": 1 / 3, "autonomous": 2.1, "manual": 1.0}, abs=2e-3)
     assert found["temperature_max_c"] == 61.35
     assert found["throttled_means"] == ["under-voltage since the start", "throttled since the start"]

@@ -84,47 +84,27 @@ def test_what_must_not_drive_is_raised():
         until_raises(planner, CameraError, "unplugged")
 
 
-def test_a_plan_to_begin_by_is_fresh():
-    """It rests after each plan, unless the car is to drive."""
-    with Planner(Frames(), lambda frame, state: CHUNK, Commanded(), 30.0, rest_s=10.0) as planner:
-        old = planner.wait(2.0)
-        planner.renew(5.0)
-        assert planner.newest() is old
-        time.sleep(0.1)
-        with planner.without_rest():
-            planner.renew(0.05)
-        assert planner.newest().number > old.number
-
-
-def test_a_policy_that_has_no_fresh_plan(monkeypatch):
-    monkeypatch.setattr("rover_lib.onboard.drive.inference.FRESH_S", 0.1)
-    answers = iter([CHUNK])
+def test_a_plan_to_begin_by_is_fresh(monkeypatch):
+    """It rests after each plan, unless the car is to drive; then an old plan is not enough."""
+    monkeypatch.setattr("rover_lib.onboard.drive.inference.FRESH_S", 0.2)
+    answers = iter([CHUNK, CHUNK])
 
     def predict(frame, state):
         if (answer := next(answers, None)) is None:
-            time.sleep(0.4)
+            time.sleep(0.5)
             raise PolicyError("too late")
         return answer
 
     with Planner(Frames(), predict, Commanded(), 30.0, rest_s=10.0) as planner:
-        planner.wait(2.0)
+        old = planner.wait(2.0)
+        planner.renew(5.0)
+        assert planner.newest() is old
         with planner.without_rest():
+            planner.renew(0.0)
+            assert planner.newest().number == 2
             with pytest.raises(PolicyError, match="no fresh plan"):
                 planner.renew(0.0)
-            time.sleep(0.5)
-            with pytest.raises(PolicyError, match="too late"):
-                planner.renew(0.0)
-
-
-def test_how_long_it_takes_is_known():
-    def predict(frame, state):
-        time.sleep(0.3)
-        return CHUNK
-
-    with Planner(Frames(), predict, Commanded(), 30.0, latency_s=0.4) as planner:
-        time.sleep(0.1)
-        assert 0.05 < planner.asking_s < 0.3
-        assert planner.wait(5.0).latency_s >= 0.4
+            until_raises(planner, PolicyError, "too late")
 
 
 @pytest.fixture(scope="module")
@@ -163,22 +143,9 @@ def test_a_bad_state_is_a_sentence_and_the_process_goes_on(process):
     assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
 
 
-def test_an_artifact_that_cannot_be_used(tmp_path, artifacts):
-    with pytest.raises(PolicyError, match="not found"), PolicyProcess(tmp_path / "policy.pt"):
+def test_an_artifact_that_is_not_there(tmp_path):
+    with pytest.raises(PolicyError), PolicyProcess(tmp_path / "policy.pt"):
         pass
-    (tmp_path / "policy.pt").write_bytes(artifacts["static"].read_bytes()[:-5000])
-    with pytest.raises(PolicyError, match="cut short"), PolicyProcess(tmp_path / "policy.pt"):
-        pass
-
-
-def bad_loader(policy):
-    raise OSError("no such library")
-
-
-def test_what_fails_while_it_is_loaded_is_a_sentence(artifacts, monkeypatch):
-    monkeypatch.setattr(PolicyProcess, "loaded", staticmethod(bad_loader))
-    with pytest.raises(PolicyError, match="OSError: no such library"):
-        PolicyProcess(artifacts["static"], threads=1).__enter__()
 
 
 def test_a_process_that_is_killed(artifacts):

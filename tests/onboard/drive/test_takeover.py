@@ -2,13 +2,12 @@
 
 import threading
 from dataclasses import replace
-from itertools import pairwise
 
 import pytest
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
-from rover_lib.onboard.drive.takeover import LET_GO_S, TakeoverRecorder, driver_by
+from rover_lib.onboard.drive.takeover import TakeoverRecorder, driver_by
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 
 ARMED = Telemetry(99.0, 7, 0, 0, "k", State.AUTONOMOUS, "a", "-", 1456, 120, 238, 1460, 21316, 120, 1016, 0, 0, 0, 0)
@@ -27,12 +26,23 @@ LOST = {"steering_us": 1456, "throttle_us": 120, "receiver_steering_us": 1600, "
         "receiver_throttle_period_us": None}  # fmt: skip
 
 
-class Time(threading.Event):
-    """Virtual time, which waiting moves on."""
+class Human(threading.Event):
+    """A human in virtual time, which waiting moves on, in the places of clock, link, recorder and stop.
 
-    def __init__(self):
+    The link says `manual()` for a second from 100 s on, and then what comes `later`, anew every STEP_S. It can be told
+    nothing: no method is there. commands: what the policy had sent.
+    """
+
+    calibration = Car().pwm
+
+    def __init__(self, later, turned=None, commands=()):
         super().__init__()
-        self.now_s = 100.0
+        self.later, self.now_s = later, 100.0
+        self.turned = turned or self.latest()
+        self.rows, self.failure = [], None
+        self.recorder = TakeoverRecorder(self, "static")
+        for row in commands:
+            self.recorder.command(*row, plan_age_ms=80.0)
 
     def wait(self, timeout=None):
         self.now_s += timeout
@@ -41,56 +51,20 @@ class Time(threading.Event):
     def clock(self):
         return self.now_s
 
-
-class Link:
-    """Says what `said` gives for a time since 100 s, anew every STEP_S. It can be told nothing: no method is there."""
-
-    calibration = Car().pwm
-
-    def __init__(self, time, said):
-        self._time, self._said = time, said
-        self.turned = self.at(0)
-
-    def at(self, number):
-        status = self._said(number * STEP_S)
+    def latest(self):
+        number = int((self.now_s - 100 + 1e-9) / STEP_S)
+        status = manual() if number * STEP_S < 1 else self.later
         if isinstance(status, Exception):
             raise status
         return replace(status, host_s=100 + number * STEP_S, uptime_ms=number * 20)
 
-    def latest(self):
-        return self.at(int((self._time.now_s - 100 + 1e-9) / STEP_S))
-
-
-class Written:
-    """In the place of a Recorder."""
-
-    def __init__(self):
-        self.rows, self.failure = [], None
-
     def control(self, *row, **columns):
         self.rows.append((row, columns))
 
-    @property
-    def drivers(self):
-        return [columns["driver"] for _, columns in self.rows]
-
-
-def human(said, *, written=None, armed=ARMED, over=lambda time: None, commands=()):
-    """What is written of a human whose statuses are `said`, and how it ended."""
-    time, written = Time(), written or Written()
-    recorder = TakeoverRecorder(written, "static")
-    for row in commands:
-        recorder.command(*row)
-    link = Link(time, said)
-    takeover = recorder.human(link, armed, rate_hz=30, stop=time, over=lambda: over(time), clock=time.clock)
-    return takeover, written
-
-
-def let_go_at(end_s):
-    return lambda t_s: manual() if t_s < end_s else manual(1470, 124)
-
-
-# ---- who drives
+    def drive(self, over=lambda human: None):
+        return self.recorder.human(
+            self, ARMED, rate_hz=30, stop=self, over=lambda: over(self) if self.now_s > 101 else None, clock=self.clock
+        )
 
 
 @pytest.mark.parametrize(
@@ -108,78 +82,38 @@ def test_who_drives(status, driver):
     assert driver_by(status) == driver
 
 
-def test_each_status_is_written_once_with_its_own_time_and_pulses():
-    takeover, written = human(let_go_at(1.0))
-    times_s = [row[0] for row, _ in written.rows]
-    assert times_s[0] == 100 and all(0 < b - a < 0.041 for a, b in pairwise(times_s))
-    assert takeover.controls == {HUMAN: len(written.rows), NOBODY: 0}
-    row, columns = written.rows[10]
-    assert row == (times_s[10], round((times_s[10] - 100) * 1000), 1600, 180, 21316, 1016) and columns == {
-        "driver": HUMAN
-    }
-
-
-def test_no_pulse_is_no_number():
-    _, written = human(lambda t_s: manual(**LOST) if 0.5 < t_s < 1 else let_go_at(1.5)(t_s))
-    lost = [row for row, columns in written.rows if columns["driver"] == NOBODY]
-    assert len(lost) > 10 and {row[3] for row in lost} == {row[5] for row in lost} == {None}
-    assert {row[2] for row in lost} == {1600}  # what the receiver still says
-
-
-# ---- what ends it
-
-
-def test_it_ends_when_the_human_lets_go_and_not_at_a_short_rest():
-    takeover, _ = human(lambda t_s: let_go_at(0.5)(t_s) if t_s < 2.0 else let_go_at(3.0)(t_s))
-    assert takeover.ended == f"the sticks have been at rest for {LET_GO_S:g} s" and not takeover.fault
-    assert takeover.seconds == pytest.approx(3.0 + LET_GO_S, abs=0.06)
+def test_a_status_is_written_with_its_own_time_and_pulses_and_no_pulse_is_no_number():
+    human = Human(manual(**LOST))
+    human.drive()
+    assert human.rows[0] == ((100.0, 0, 1600, 180, 21316, 1016), {"driver": HUMAN})
+    lost = [row for row, columns in human.rows if columns["driver"] == NOBODY]
+    assert len(lost) > 10 and {row[2:] for row in lost} == {(1600, None, 21316, None)}
 
 
 @pytest.mark.parametrize(("steering_us", "rests"), [(1508, True), (1509, False), (1411, False)])
 def test_rest_is_where_the_sticks_were_when_the_car_was_armed(steering_us, rests):
-    takeover, _ = human(lambda t_s: manual(steering_us, 120))
-    assert (takeover.seconds < 3) == rests
-
-
-def test_rest_is_neutral_where_nothing_is_known_of_arming():
-    assert human(lambda t_s: manual(1456 + 48, 120), armed=None)[0].seconds == pytest.approx(LET_GO_S, abs=0.1)
-
-
-def test_it_ends_when_the_transmitter_is_off():
-    takeover, written = human(lambda t_s: manual() if t_s < 1 else manual(**LOST))
-    assert "no signal for 2 s" in takeover.ended and takeover.seconds == pytest.approx(3.0, abs=0.1)
-    assert written.drivers[-1] == NOBODY
-
-
-def full(written, time):
-    written.failure = "the disk is full" if time.now_s > 101 else None
+    takeover = Human(manual(steering_us, 120)).drive()
+    assert (takeover.seconds < 4) == rests and ("at rest for 2 s" in takeover.ended) == rests
 
 
 @pytest.mark.parametrize(
-    ("later", "over", "ended", "fault"),
+    ("later", "over", "ended", "after_s", "fault"),
     [
-        (LinkError("fake port: silent"), None, "silent", True),
-        (manual(boot=8), None, "reset", True),  # its clock begins anew, and its pins were loose for a while
-        (ARMED, None, "another program", False),
-        (None, lambda written, time: time.set() if time.now_s > 101 else None, "told to stop", False),
-        (None, lambda written, time: "enough" if time.now_s > 101 else None, "enough", False),
-        (None, full, "nothing more can be recorded", False),
+        (LinkError("fake port: silent"), None, "silent", 1.0, True),
+        (manual(boot=8), None, "reset", 1.0, True),  # its clock begins anew, and its pins were loose for a while
+        (ARMED, None, "another program", 1.0, False),
+        (manual(**LOST), None, "no signal for 2 s", 3.0, False),
+        (manual(), threading.Event.set, "told to stop", 1.0, False),
+        (manual(), lambda human: "enough", "enough", 1.0, False),
+        (manual(), lambda human: setattr(human, "failure", "full"), "nothing more can be recorded", 1.0, False),
     ],
-    ids=["link", "reset", "armed", "signal", "asked", "disk"],
 )
-def test_what_else_ends_it(later, over, ended, fault):
-    written = Written()
-    takeover, _ = human(
-        lambda t_s: manual() if later is None or t_s < 1 else later,
-        written=written,
-        over=lambda time: over(written, time) if over else None,
-    )
-    assert ended in takeover.ended and takeover.fault is fault and takeover.seconds < 1.2
-    assert len(written.rows) > 25 and written.rows[-1][0][0] < 101.2 and POLICY not in written.drivers
+def test_what_else_ends_it(later, over, ended, after_s, fault):
+    human = Human(later)
+    takeover = human.drive(over or (lambda human: None))
+    assert ended in takeover.ended and takeover.fault is fault and takeover.seconds == pytest.approx(after_s, abs=0.1)
+    assert len(human.rows) > 25 and all(columns["driver"] != POLICY for _, columns in human.rows)
     assert f"{takeover.controls[HUMAN]} of human" in str(takeover)
-
-
-# ---- the policy's last command
 
 
 COMMANDS = [(s, 0, 1567, 209, 21316, 1016) for s in (99.90, 99.933, 99.966)]
@@ -194,14 +128,8 @@ COMMANDS = [(s, 0, 1567, 209, 21316, 1016) for s in (99.90, 99.933, 99.966)]
     ],
 )
 def test_a_command_that_was_not_taken_is_not_written(result, at_s, kept):
-    time, written = Time(), Written()
-    recorder = TakeoverRecorder(written, "static")
-    for row in COMMANDS:
-        recorder.command(*row, plan_age_ms=80.0)
-    link = Link(time, let_go_at(0.5))
-    link.turned = replace(manual(), host_s=at_s, result=result)
-    recorder.human(link, ARMED, rate_hz=30, stop=time, clock=time.clock)
-    policy = [(row, columns) for row, columns in written.rows if columns["driver"] == POLICY]
-    assert [row for row, _ in policy] == COMMANDS[:kept]
-    assert {(columns["mode"], columns["plan_age_ms"]) for _, columns in policy} == {("static", 80.0)}
-    assert written.drivers[kept] == HUMAN and written.rows[kept][0][0] == at_s
+    human = Human(manual(1470, 124), replace(manual(), host_s=at_s, result=result), COMMANDS)
+    human.drive()
+    policy = [(row, columns) for row, columns in human.rows if columns["driver"] == POLICY]
+    assert policy == [(row, {"mode": "static", "driver": POLICY, "plan_age_ms": 80.0}) for row in COMMANDS[:kept]]
+    assert human.rows[kept][0][0] == at_s and human.rows[kept][1] == {"driver": HUMAN}

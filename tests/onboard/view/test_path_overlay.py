@@ -1,12 +1,10 @@
 """Where a plan leads, compared with the physics and camera of the balloon world, whose car is the default."""
 
-import math
 from dataclasses import replace
 
 import pytest
 
 from balloon_world import world as w
-from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.view.path_overlay import CarShape, from_now
 
@@ -45,13 +43,6 @@ def test_from_now_leaves_out_what_is_over():
     assert [a[0] for a in from_now(plan, 10.1)] == list(range(3, 32))
     assert [a[0] for a in from_now(plan, 10.0)] == list(range(30))
     assert from_now(plan, 9.9)[0] == [0, 0] and from_now(plan, 12.0) == []
-
-
-def test_another_car_is_drawn_as_it_is():
-    shape = CarShape.of(Car(field_of_view_deg=120.0, wheelbase_m=0.5))
-    turn = [s.track([(0.3, 0.05)] * 30, STEP_S)[-1][2] for s in (SHAPE, shape)]
-    assert turn[0] / turn[1] == pytest.approx(0.5 / 0.26)
-    assert shape.focal == pytest.approx(0.5 / math.tan(math.radians(60)), abs=1e-4)
 
 
 def test_a_car_needs_numbers_above_0():
