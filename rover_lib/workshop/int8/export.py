@@ -21,7 +21,7 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.wheel_version import release
+from rover_lib.onboard.wheel_version import VERSION
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.observe import Calibration
@@ -200,7 +200,7 @@ class Exporter:
             "normalisation": "inside the graph: uint8 RGB frames and raw states in, raw actions out",
             "checkpoint": {"sha256": self.checkpoint.sha256, "format": self.checkpoint.format},
             "calibration": calibrated,
-            "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
+            "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": VERSION, **form.versions},
             **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(policy.module if isinstance(policy, QuantizedPolicy) else policy),
             "gmac": self.gmac,
