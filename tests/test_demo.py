@@ -14,28 +14,15 @@ import pytest
 from executed import shown
 
 from balloon_world import latency, students
-from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge.compare import gates
-from rover_lib.workshop.run.run import NAMES
 
 ROOT = Path(__file__).parents[1]
-STAGES = ("load", "calibrate", "quantize", "compare")
 
 
 def stage_of(folder, name):
     return read_stage(folder / f"{name}.json", name)
-
-
-def test_left_everything_that_a_run_leaves(demo_run):
-    for stage in STAGES:
-        assert stage_of(demo_run, stage)["inputs"]
-    for mode in ("fp32", "dynamic", "static"):
-        assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
-    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES}
-    assert len(list((demo_run / "figures").glob("*.png"))) >= 5
-    assert list(demo_run.glob("benchmark-*.json"))
 
 
 def test_the_policy_drives_and_int8_is_like_it(demo_run):

@@ -40,14 +40,12 @@ COLOURS = {
     "static": BLUE,
     "mixed": GREEN,
     "static_affine": SKY,
-    "lerobot": "#777777",
     "steering": "#332288",
     "throttle": "#CC79A7",
 }
 NAMES = {
     "fp32": "FP32",
     "static_affine": "static, affine",
-    "lerobot": "LeRobot, eager FP32",
     "torch_affine": "torch, affine",
     "onnxruntime": "ONNX Runtime INT8",
     "fp32.onnx": "FP32, for ONNX Runtime",
