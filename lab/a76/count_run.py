@@ -48,6 +48,8 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     if REFERENCE not in artifacts:
         raise RoverError(f"{run_dir}: no {REFERENCE}.pt in it", found=[*artifacts], remedy="'rover run' makes a run")
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
+    if len(cameras := manifests[REFERENCE]["cameras"]) != 1:
+        raise RoverError(f"{run_dir}: only policies of one camera are counted", found=f"{len(cameras)} cameras")
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
