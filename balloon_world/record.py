@@ -19,12 +19,13 @@ from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.recording import episode as recording
-from rover_lib.onboard.recording.episode import SIMULATED, About, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.cache import key_of
 from rover_lib.workshop.progress import Progress, silent
 
 LABEL = "hit red balloon"
 JPEG_QUALITY = 85
+PORT = "playground"  # of its Arduino
 SHOVES = 2  # without shoves the expert never shows how to come back on course, and the policy never learns it
 MARKER = ".recorded.json"
 # An invented time, so that a seed's recording has the same bytes every time.
@@ -91,7 +92,7 @@ class WorldEpisode:
         car = this_car()
         self._world, self._pwm, self._start_s = world, car.pwm, start.timestamp()
         self._periods = [_round_us(c.period_us) for c in (self._pwm.steering, self._pwm.throttle)]
-        about = About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=SIMULATED, car=car)
+        about = About(LABEL, fps=RATE_HZ, start_time_s=self._start_s, arduino_port=PORT, car=car)
         size = FRAME_WIDTH, FRAME_HEIGHT
         self.writer = EpisodeWriter(folder / episode_name(start), about, resolution=size, jpeg_quality=JPEG_QUALITY)
         self.writer.metadata["steering_positive"] = car.positive

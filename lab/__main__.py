@@ -128,8 +128,8 @@ def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...]
 def drive_randomly(ctx: click.Context, output: Path | None, drives: int, first: int, jobs: int | None) -> None:
     """Drive with random faults in virtual time, and check each drive against invariants: what must never happen.
 
-    Prints, and writes to OUTPUT as JSON, how many states they visited and, for each drive that breaks an invariant, its
-    seed and story. The exit code is 1 if one does. Needs gcc.
+    Prints, and writes to OUTPUT as JSON, for each drive that breaks an invariant, its seed and story. The exit code is
+    1 if one does. Needs gcc.
     """
     from lab.driving.random_drives import random_drives
     from rover_lib.onboard.stage import write_stage

@@ -4,12 +4,11 @@
 order and still print what they must. So they run in a folder of their own, on a few frames and worlds.
 """
 
-import ast
 import os
 from typing import Any
 
 # The notebooks' kernels inherit these, as in `rover run`.
-from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT
+from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT, LINE
 
 FEW: dict[str, Any] = {
     "run_dir": "../runs/nbval",
@@ -43,11 +42,7 @@ def pytest_collection_modifyitems(items):
 
 def with_few(parameters: str) -> str:
     """A parameters cell whose literals are those of FEW."""
-    tree = ast.parse(parameters)
-    for statement in tree.body:
-        assert isinstance(statement, ast.Assign)
-        (name,) = statement.targets
-        assert isinstance(name, ast.Name)
-        if name.id in FEW:
-            statement.value = ast.Constant(FEW[name.id])
-    return ast.unparse(tree)
+    lines = []
+    for name, literal, _ in LINE.findall(parameters):
+        lines.append(f"{name} = {FEW[name]!r}" if name in FEW else f"{name} = {literal}")
+    return "\n".join(lines)

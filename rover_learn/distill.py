@@ -218,7 +218,7 @@ class Distillation(Work):
         scheme, _ = chooser.observer(how.scheme, how.observers, self.progress)
         checked = pick_evenly(self.opened.parts.choosing, pipeline.CHOOSING_FRAMES)
         policy = quantize(student, scheme, calibration)
-        export(policy, student, new / "policy_static.pt", checked, calibration, how.parity)
+        export(policy, student, new / "policy_static.pt", checked, calibration)
 
 
 def errors_of(

@@ -7,15 +7,10 @@ import nbformat
 from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
 
 
-def text_of(cell: nbformat.NotebookNode) -> str:
-    """Return what a cell printed and showed. A table is included as text; a figure adds nothing."""
-    texts = (o.get("text") or o.get("data", {}).get("text/plain", "") for o in cell.get("outputs", ()))
-    return "\n".join(text.rstrip("\n") for text in texts)
-
-
 def shown(path: Path) -> str:
-    """Return `text_of` all cells."""
-    return "\n".join(text_of(c) for c in nbformat.read(path, as_version=4).cells)
+    """Return what a notebook's cells printed and showed. A table is included as text; a figure adds nothing."""
+    outputs = [o for cell in nbformat.read(path, as_version=4).cells for o in cell.get("outputs", ())]
+    return "\n".join((o.get("text") or o.get("data", {}).get("text/plain", "")).rstrip("\n") for o in outputs)
 
 
 def run_cells(name, run_dir, **given):

@@ -27,11 +27,6 @@ def real_recordings() -> Path:
     return _shared("recordings/episode_*/frames", "several real recordings").parents[1]
 
 
-def odd_policy() -> Path:
-    """Return a folder with a policy that answers some frames far more strongly than others, and its recordings."""
-    return _shared("outliers/best_model.pth", "a policy with odd frames").parent
-
-
 def _shared(pattern: str, what: str) -> Path:
     for base in BESIDE:
         if found := sorted((base / "shared").glob(pattern)):

@@ -9,34 +9,20 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-import nbformat
 import numpy as np
 import pytest
-from executed import shown, text_of
+from executed import shown
 
 from balloon_world import latency, students
-from rover_lib.onboard import load_policy
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge.compare import gates
-from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
 ROOT = Path(__file__).parents[1]
-STAGES = ("load", "calibrate", "quantize", "compare")
 
 
 def stage_of(folder, name):
     return read_stage(folder / f"{name}.json", name)
-
-
-def test_left_everything_that_a_run_leaves(demo_run):
-    for stage in STAGES:
-        assert stage_of(demo_run, stage)["inputs"]
-    for mode in ("fp32", "dynamic", "static"):
-        assert load_policy(demo_run / f"policy_{mode}.pt").manifest["mode"] == mode
-    assert {p.stem for p in demo_run.glob("*.ipynb")} >= {*NAMES}
-    assert len(list((demo_run / "figures").glob("*.png"))) >= 5
-    assert list(demo_run.glob("benchmark-*.json"))
 
 
 def test_the_policy_drives_and_int8_is_like_it(demo_run):
@@ -75,16 +61,6 @@ def test_a_student_of_its_own_is_judged_beside_it(demo_run):
     assert metrics["recommendation"]["gates"] == gates
     assert metrics["recommendation"]["name"] == ("demo-small" if all(g["passed"] for g in gates) else "teacher")
     assert str(students.table(metrics)) in shown(demo_run / "08_distill.ipynb")
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_outputs_that_never_change_are_those_committed(demo_run, name):
-    """These are the cells that nbval would compare if it executed again what the demo has just executed."""
-    ran, committed = (nbformat.read(f / f"{name}.ipynb", as_version=4) for f in (demo_run, NOTEBOOKS))
-    found = {c.id: text_of(c) for c in ran.cells if "NBVAL_CHECK_OUTPUT" in c.source}
-    for cell in committed.cells:
-        if "NBVAL_CHECK_OUTPUT" in cell.source:
-            assert found[cell.id] == text_of(cell), cell.id
 
 
 @pytest.mark.slow

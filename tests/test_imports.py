@@ -33,15 +33,13 @@ def modules() -> dict[str, Path]:
 @functools.cache
 def imported(path: Path) -> set[str]:
     """Return every name that a file imports, also inside functions and only for type checkers."""
-    names, waiting = set(), [ast.parse(path.read_text())]
-    while waiting:
-        node = waiting.pop()
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             names |= {f"{node.module}.{a.name}" for a in node.names}
-        waiting += ast.iter_child_nodes(node)
     return names
 
 

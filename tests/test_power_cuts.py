@@ -166,17 +166,14 @@ def cut_a_recording(disk, count, logged):
         durations.unlink()
 
 
-@pytest.mark.slow
-@real_time
-def test_a_power_cut_costs_a_recording_its_last_second(disk):
-    cut_a_recording(disk, 10, logged=False)
+TEN = pytest.param(10, False, marks=pytest.mark.slow)
+THIRTY = [pytest.param(30, logged, marks=pytest.mark.release) for logged in (False, True)]
 
 
-@pytest.mark.release
-@pytest.mark.parametrize("logged", [False, True])
+@pytest.mark.parametrize(("count", "logged"), [TEN, *THIRTY])
 @real_time
-def test_thirty_power_cuts_of_a_recording(disk, logged):
-    cut_a_recording(disk, 30, logged)
+def test_a_power_cut_costs_a_recording_its_last_second(disk, count, logged):
+    cut_a_recording(disk, count, logged)
 
 
 # ---- all else that is written

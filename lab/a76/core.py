@@ -221,24 +221,24 @@ def emulate(
     return Emulation(sections, more, dict(watched.peak_mb))
 
 
-class _Watched:
+class _Watched(Thread):
     """The memory of a running emulator, sampled while inside. Each printed line begins a step with its own peak."""
 
     def __init__(self, pid: int):
+        super().__init__(daemon=True)
         self.pid, self.step = pid, ""
         self.peak_mb: dict[str, float] = defaultdict(float)
         self._lock, self._over = Lock(), Event()
-        self._thread = Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "_Watched":
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
         self._over.set()
-        self._thread.join()
+        self.join()
 
-    def _run(self) -> None:
+    def run(self) -> None:
         while not self._over.wait(SAMPLE_S):
             self.begin(None)
 

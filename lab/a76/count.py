@@ -58,12 +58,8 @@ class Counted(NamedTuple):
 
 
 def write_observations(path: Path, samples: Sequence[Any]) -> Path:
-    """Write what a policy shall see, as guest/inferences.predict_all reads it."""
-    frames: dict[str, Any] = {}
-    for i, sample in enumerate(samples):
-        seen = sample.frame_bgr()
-        by_name = {f".{camera}": frame for camera, frame in seen.items()} if isinstance(seen, Mapping) else {"": seen}
-        frames |= {f"frame_{i:04d}{name}": frame for name, frame in by_name.items()}
+    """Write what a policy of one camera shall see, as guest/inferences.predict_all reads it."""
+    frames: dict[str, Any] = {f"frame_{i:04d}": sample.frame_bgr() for i, sample in enumerate(samples)}
     np.savez(path, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
     return path
 

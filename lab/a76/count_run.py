@@ -48,6 +48,8 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     if REFERENCE not in artifacts:
         raise RoverError(f"{run_dir}: no {REFERENCE}.pt in it", found=[*artifacts], remedy="'rover run' makes a run")
     manifests = {stem: read_manifest(path) for stem, path in artifacts.items()}
+    if len(cameras := manifests[REFERENCE]["cameras"]) != 1:
+        raise RoverError(f"{run_dir}: only policies of one camera are counted", found=f"{len(cameras)} cameras")
     again = open_run(run_dir)
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
@@ -55,8 +57,9 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     core, plans = prepare(), plans_of(manifests, len(samples))
     jobs = {}
     for stem, plan in plans.items():
-        chosen, how = [samples[i] for i in plan.frames], {"guest": guest_of(artifacts[stem]), "counted": plan.counted}
-        jobs[stem] = partial(count_artifact, core, artifacts[stem], manifests[stem], chosen, **how)
+        path, chosen = artifacts[stem], [samples[i] for i in plan.frames]
+        guest = guest_of(path)
+        jobs[stem] = partial(count_artifact, core, path, manifests[stem], chosen, guest=guest, counted=plan.counted)
     counts = side_by_side(jobs, "artifacts, emulated", progress)
     judged = _judge(artifacts, plans, counts, samples, again, progress)
     rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}

@@ -31,10 +31,7 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     first = next(iter(metrics["artifacts"].values()))
     keys = style.judged_keys(right, {k: v for k, v in first.items() if "workstation" not in k})
     height = 0.8 / max(len(keys), 1)
-    judged = {}
-    for at, (name, m) in enumerate(rows.items()):
-        if keys and m.get(keys[0]) is not None and m.get("reference") != f"policy_{name}":
-            judged[at] = m
+    judged = {at: m for at, (name, m) in enumerate(rows.items()) if m["reference"] != f"policy_{name}"}
     frames = sorted({m["frames_on_the_core"] for m in judged.values()})
     over = " to ".join(str(n) for n in frames[:: len(frames) - 1 or 1])
     for i, key in enumerate(keys):

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rover_lib.onboard.care.pi5 import DRIVING
-from rover_lib.onboard.columns import align
+from rover_lib.onboard.columns import align, number
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst
 
@@ -105,16 +105,12 @@ def table(content: dict[str, Any]) -> str:
     ordered = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
     for name, found in ordered:
-        cells = [_written(found[key], how) for key, how in COLUMNS.values()]
+        cells = [number(found[key], how) for key, how in COLUMNS.values()]
         errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
         span = "{low:.3g} to {high:.3g}".format_map(found["computed_pi5_ms"])
-        rows.append([name, *cells, _written(worst(errors), ".3f"), str(found["frames_on_the_core"]), span])
+        rows.append([name, *cells, number(worst(errors), ".3f"), str(found["frames_on_the_core"]), span])
     lines = [f"{LABEL}, 10^9 instructions of an inference; times are computed from them (docs/clock.md)", *align(rows)]
     for row in metrics["gates"]:
         verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
-        lines.append(f"{verdict}: {row['gate']}, {_written(row['found'], '.4g')} {row['relation']} {row['limit']:g}")
+        lines.append(f"{verdict}: {row['gate']}, {number(row['found'], '.4g')} {row['relation']} {row['limit']:g}")
     return "\n".join(lines)
-
-
-def _written(value: float | None, how: str) -> str:
-    return "-" if value is None else format(value, how)

@@ -7,18 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from elftools.elf.elffile import ELFFile
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
 KERNELS = 30  # how many are named in the report; the rest are summed up
 NAME_LENGTH = 140
-# Symbols are read with numpy: it reads the 778,000 of libtorch_cpu.so in 0.3 s, pyelftools in 40 s, one by one.
-SYMBOL = np.dtype(
-    [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
-)
-FUNCTIONS = (0, 2, 10)  # symbol types none (assembly), function, indirect function
+SYMBOL = re.compile(r"^(\w{16})(?: (\w{16}))? [tTwWi] ([^$@\n]+)", re.M)  # of nm; $x and $d only mark code and data
 
 
 class Functions:
@@ -26,29 +21,25 @@ class Functions:
 
     def __init__(self, path: Path):
         self.path = path
-        with path.open("rb") as file:
-            elf = ELFFile(file)
-            # The address of the first loaded segment. A mapping of the file starts there, which shows where it was put.
-            self.base = min((s["p_vaddr"] & ~0xFFF for s in elf.iter_segments("PT_LOAD")), default=0)
-            whole = elf.get_section_by_name(".symtab")
-            self.complete = whole is not None  # a stripped file names only the functions that it exports
-            table = whole or elf.get_section_by_name(".dynsym")
-            symbols: Any = np.frombuffer(table.data() if table else b"", SYMBOL)
-            self._names = elf.get_section(table["sh_link"]).data() if table else b"\0"
-        symbols = symbols[np.isin(symbols["info"] & 15, FUNCTIONS) & (symbols["section"] > 0) & (symbols["at"] > 0)]
-        first = np.frombuffer(self._names, "u1")[symbols["name"]]
-        symbols = symbols[(first != ord("$")) & (first != 0)]  # $x, $d only mark code and data
-        self._symbols = symbols[np.lexsort((symbols["size"], symbols["at"]))]
-        self._at = self._symbols["at"].tolist()
+        segments = run("readelf", "--segments", "--wide", path, error=RoverError)
+        # The address of the first loaded segment. A mapping of the file starts there, which shows where it was put.
+        loaded = re.findall(r"^ +LOAD +\w+ 0x(\w+)", segments, re.M)
+        self.base = min((int(address, 16) & ~0xFFF for address in loaded), default=0)
+        nm = ["nm", "--no-sort", "--defined-only", "--print-size"]
+        listing = run(*nm, path, error=RoverError)
+        self.complete = bool(listing)  # a stripped file names only the functions that it exports
+        found = SYMBOL.findall(listing or run(*nm, "--dynamic", path, error=RoverError))
+        symbols = [(int(at, 16), int(size or "0", 16), name) for at, size, name in found]
+        self._symbols = sorted(symbols, key=lambda symbol: symbol[:2])
+        self._at = [at for at, _, _ in self._symbols]
 
     def function_at(self, address: int) -> str:
         """Return the mangled name of the function at an address of the file, or the file's name if it has no name."""
         i = bisect_right(self._at, address) - 1
         if i >= 0:
-            symbol = self._symbols[i]
-            if self.complete or address < int(symbol["at"]) + int(symbol["size"]):
-                start = int(symbol["name"])
-                return self._names[start : self._names.index(b"\0", start)].decode(errors="replace")
+            at, size, name = self._symbols[i]
+            if self.complete or address < at + size:
+                return name
         return f"[{self.path.name}]"
 
 

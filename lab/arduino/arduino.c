@@ -2,7 +2,7 @@
  *
  * As a library (cc -shared -fPIC): stepped from a test, no clock of this world in it.
  * As a program (cc -DPROGRAM): in real time, its serial line on a pty.
- *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--slow N] [--periods S T]
+ *     arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] [--periods S T]
  *             [--eeprom HEX]
  *         --link           a symbolic link to the pty, for pyserial to open
  *         --log            on standard output, a line each: monotonic_s,event,pin,pulse_us,period_us
@@ -13,8 +13,6 @@
  *         --reset-on-open  what DTR's edge does to an Uno when its port is opened; there is none if who closed it last had
  *                          HUPCL off
  *         --boot-ms        the boot loader's time: nothing runs for so long
- *         --slow           its clock runs N times slower than this world's, for an emulated Pi that needs so long too;
- *                          pulses and periods are by its own clock
  *         --periods        of the transmitter's pulses, microseconds, where they are not those of the recordings' car
  *         --eeprom         its first bytes; all others are erased
  *     Where this machine stalls for more than 20 ms, so does the Arduino; the log then has "stall" with microseconds.
@@ -438,8 +436,6 @@ static struct {
 } human;
 static const double WIGGLE_EVERY_US = 2.5e6;
 
-static double slow = 1; /* seconds of this world in a second of the Arduino's */
-
 /* The Arduino does not wait for who reads its log. */
 static void put_log(double at_s, const char *what, const char *pin, double pulse_us, double period_us) {
     if (!pin_log.what) return;
@@ -458,7 +454,7 @@ static void log_event(const struct uno_event *event, double start_s) {
             fabs(event->period_us - last.period_us) < CHANGE_US)
             return;
     }
-    put_log(start_s + event->at_us * 1e-6 * slow, EVENTS[event->kind], PINS[event->channel + 1], event->pulse_us,
+    put_log(start_s + event->at_us * 1e-6, EVENTS[event->kind], PINS[event->channel + 1], event->pulse_us,
             event->period_us);
 }
 
@@ -560,7 +556,6 @@ int main(int argc, char **argv) {
         if (!strcmp(argv[i], "--link") && more) link_path = argv[++i];
         else if (!strcmp(argv[i], "--log") && more) log = argv[++i];
         else if (!strcmp(argv[i], "--boot-ms") && more) boot_s = atof(argv[++i]) * 1e-3;
-        else if (!strcmp(argv[i], "--slow") && more) slow = atof(argv[++i]);
         else if (!strcmp(argv[i], "--eeprom") && more) eeprom = argv[++i];
         else if (!strcmp(argv[i], "--reset-on-open")) reset_on_open = true;
         else if (!strcmp(argv[i], "--periods") && i + 2 < argc) {
@@ -569,9 +564,9 @@ int main(int argc, char **argv) {
         } else elf = argv[i];
     }
     if (log) pin_log.what = !strcmp(log, "all") ? PINS_ALL : !strcmp(log, "changes") ? PINS_CHANGES : PINS_NONE;
-    if (!elf || !link_path || (log && !pin_log.what) || !(slow >= 1)) {
+    if (!elf || !link_path || (log && !pin_log.what)) {
         fprintf(stderr, "usage: arduino ROVER.elf --link PATH [--log all|changes] [--reset-on-open] [--boot-ms N] "
-                        "[--slow N] [--periods S T] [--eeprom HEX]\n");
+                        "[--periods S T] [--eeprom HEX]\n");
         return 2;
     }
     pid_t parent = getppid();
@@ -598,7 +593,7 @@ int main(int argc, char **argv) {
     while (running && !state && getppid() == parent) {
         state = uno_run_us(uno, 500);
         struct pollfd files[2] = {{master, POLLIN, 0}, {0, POLLIN, 0}};
-        double ahead = start + uno_now_us(uno) * 1e-6 * slow - monotonic();
+        double ahead = start + uno_now_us(uno) * 1e-6 - monotonic();
         poll(files, 2, 0);
         if (ahead < -0.02) { /* this machine had no time for us: the Arduino stood still too, rather than hurry now */
             put_log(monotonic(), "stall", "", -ahead * 1e6, 0);
@@ -612,8 +607,8 @@ int main(int argc, char **argv) {
             if (reset_on_open && !dtr) {
                 uno_reset(uno);
                 log_events(uno, start);
-                start += boot_s * slow; /* stands still for so long */
-                ahead += boot_s * slow;
+                start += boot_s; /* stands still for so long */
+                ahead += boot_s;
             }
         }
         if (open && !open_now) dtr = stays_up();

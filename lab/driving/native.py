@@ -7,7 +7,7 @@ import ctypes
 from typing import Any
 
 from lab.driving.virtual import STEERING, THROTTLE, Board
-from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.car import DEFAULT_NUMBERS, Car
 from rover_lib.onboard.car.servo_link import Hello, Telemetry, frame, parse
 
 BOOT = 7
@@ -37,7 +37,7 @@ class NativeArduino:
         self._ms = now_ms
         self.start(Car())
         self._board.c.board_sequence(ctypes.c_uint32(sequence))
-        if not self.car.is_default:
+        if self.car.numbers != DEFAULT_NUMBERS:
             assert self.command("C", *self.car.numbers) == "k"
 
     def start(self, kept: Car | None) -> None:

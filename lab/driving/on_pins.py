@@ -36,7 +36,6 @@ START_S = 90.0  # a drive imports torch twice, which takes a third of a minute w
 END_S = 6.0
 KNOWN_S = 0.05  # how long it takes until a pulse has ended and been read
 ATTEMPTS = 5  # how often a row is tried if this machine was too busy
-KILLED = -signal.SIGKILL
 LINE_S = 1.5  # within which a line must come
 LATE_COMMAND_S = 0.1  # three ticks of a drive
 PRIORITY = 3  # of real-time scheduling, above that of rover drive: hardware does not wait for this machine
@@ -219,8 +218,6 @@ def run_pin_row(bench: PinBench, fault: FaultRow) -> dict[str, Any]:
     judged = judge(fault.expected, seen, human_us=human_us)
     with contextlib.suppress(RoverError):  # then it is not recovered
         bench.at_speed()
-    if code == KILLED:  # the next drive tells of it
-        line = bench.drive.line_of(fault.message)
     more = {"attempts": attempts, "stalled_ms": round(seen.stalled_ms(), 1)}
     line = line and line.replace(f"{bench.folder}/", "")
     return row_of(fault, judged, code, line, bench.driving(), "on pins", **more)
@@ -239,7 +236,7 @@ def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, 
     lines = [e for e in bench.events if e.kind == "line" and e.pulse_us and e.monotonic_s <= end_s]
     commands = [Command(e.monotonic_s, round(e.pulse_us), round(e.period_us)) for e in lines]
     code = drive.process.poll() if fault.wanted_code is None else drive.wait(END_S)
-    line = None if code == KILLED else drive.line_of(fault.message)
+    line = drive.line_of(fault.message) if fault.message else None
     bench.clear_faults()
     return Observation(bench.events, commands, at_s, end_s), code, line
 

@@ -185,17 +185,14 @@ def _not_continued(seen: Observation, figures: Figures, until_limit: bool, car: 
     stopped_s = seen.at_s + figures["stopped_after_ms"] / 1e3 + 1e-4 if until_limit else seen.end_s
     if not until_limit:
         figures["stopped_after_ms"] = None
-    neutral_us = {"steering": car.numbers[2], "throttle": car.numbers[6]}
     for index, (pin, period_us) in enumerate(periods_of(car).items(), 1):
-        for e in seen.pulses(pin):
+        for e in (e for e in seen.pulses(pin) if e.end_s <= stopped_s):
             recent = [c[index] for c in seen.commands if e.monotonic_s - STILL_VALID_S < c.at_s <= e.monotonic_s]
             if e.kind == "cut" or abs(e.period_us - period_us) > EDGE_US:
                 yield f"a {pin} pulse out of time: {e.period_us:g} us after the one before, {period_us} is its period"
                 return
-            neutral = until_limit and e.end_s > stopped_s and abs(e.pulse_us - neutral_us[pin]) <= COMMAND_US[pin]
             # The firmware moves a pin slowly, so a pulse may lie between those of two recent commands.
-            within = recent and min(recent) - COMMAND_US[pin] <= e.pulse_us <= max(recent) + COMMAND_US[pin]
-            if not neutral and not within:
+            if not recent or not min(recent) - COMMAND_US[pin] <= e.pulse_us <= max(recent) + COMMAND_US[pin]:
                 yield f"{pin} at {e.pulse_us:g} us {(e.monotonic_s - seen.at_s) * 1e3:.0f} ms after the fault, which "\
                       f"was not commanded ({sorted(set(recent))})"  # fmt: skip
                 return

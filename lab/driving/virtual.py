@@ -76,9 +76,6 @@ class Board:
         """Set the receiver's pulses from now on, where 0 stands for none. board.c explains the other arguments."""
         self.c.board_transmit(channel, pulse_us, one_in, misread_in, misread_us, period_us)
 
-    def give(self, data: bytes) -> None:
-        self.c.board_give(data, len(data))
-
     def run(self, ms: int) -> tuple[int, bytes]:
         """Let up to `ms` milliseconds pass. Returns how many did, and what the sketch sent in the last of them."""
         passed = self.c.board_run(ms)
@@ -238,7 +235,6 @@ class World:
         self.unplugged = self.stuck = False
         self.content_ms = 0  # content_ms (see Asked) of the newest order
         self.written: list[bytes] = []
-        self._unread: list[bytes] = []
         self._boot = 0
         self._due: list[tuple[int, int, Callable[[], object]]] = []
         self._count = 0
@@ -359,32 +355,17 @@ class World:
 
     def _arrive_down(self, line: bytes) -> None:
         if self.board and not self._hung_ms:
-            self.board.give(line)
+            self.board.c.board_give(line, len(line))
 
     def _arrive_up(self, line: bytes) -> None:
         if self.unplugged or not self.port:
             return
-        if self.paused_until_ms > self.now_ms:
-            if not self._unread:  # the thread that reads wakes up a little later than the host's loop
-                self.at(self.paused_until_ms + 1, self._read_all)
-            self._unread.append(line)
-        else:
-            self._hear(line)
-
-    def _hear(self, lines: bytes) -> None:
-        for line in lines.splitlines():
-            if self.port and isinstance(status := parse(line, 0.0), Telemetry):
+        if self.paused_until_ms > self.now_ms:  # the thread that reads wakes up a little later than the host's loop
+            return self.at(self.paused_until_ms + 1, functools.partial(self._arrive_up, line))
+        for part in line.splitlines():
+            if isinstance(status := parse(part, 0.0), Telemetry):
                 self.seen.heard.append((self.now_ms, status.sequence))
-        if self.port:
-            self.port.hear(lines)
-
-    def _read_all(self) -> None:
-        lines, self._unread = self._unread, []
-        if self.paused_until_ms > self.now_ms:  # stopped again
-            self._unread = lines
-            self.at(self.paused_until_ms + 1, self._read_all)
-        elif self.port:
-            self._hear(b"".join(lines))
+        self.port.hear(line)
 
     def write(self, line: bytes) -> None:
         """Write a line from the host. Raises what a port raises: OSError if unplugged, BlockingIOError if stuck."""

@@ -202,29 +202,27 @@ class Eyes:
     def _pictures(self) -> Iterator[tuple[np.ndarray, float | None]]:
         try:
             self._idle.put(None)
-            while isinstance(given := self._given.get(), tuple):
+            while given := self._given.get():
                 yield given
                 self._idle.put(None)
-            if given:
-                raise given
         finally:
             self._over = True
             self._idle.put(None)
 
-    def _give(self, picture: tuple[np.ndarray, float] | Exception | None) -> None:
+    def _give(self, picture: tuple[np.ndarray, float] | None) -> None:
         if not self._over:
             self._given.put(picture)
             self._idle.get()
         if self._over:
             self._thread.join()
 
-    def unplug(self, failure: Exception | None = None) -> None:
-        """Let the camera's reader come to the end of its pictures, or raise."""
-        self._give(failure)
+    def unplug(self) -> None:
+        """Let the camera's reader come to the end of its pictures."""
+        self._give(None)
 
     def close(self) -> None:
         self.camera._closing.set()
-        self._give(None)
+        self.unplug()
         self.on_frame = lambda: None
 
     def _tick(self) -> None:
@@ -260,12 +258,10 @@ class VirtualPlanner(Planner):
         self._looked_at = 0
         self._number = 0
         self.content: dict[int, int] = {}  # by a plan's number, when (ms) its picture's scene was really to be seen
-        super().__init__(eyes.camera, self._never, commanded, RATE_HZ, limits=world.car.limits, clock=world.clock)
+        never = cast(Any, None)  # the thread that asks for predictions is never started here
+        super().__init__(eyes.camera, never, commanded, RATE_HZ, limits=world.car.limits, clock=world.clock)
         self._news = cast(Any, _Waiting(world))
         eyes.on_frame = self._look
-
-    def _never(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        raise AssertionError("the thread that asks for predictions is never started here")
 
     def _look(self) -> None:
         """Begin a plan from the newest frame, as the thread does as soon as it is free."""

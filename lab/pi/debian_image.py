@@ -20,7 +20,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.run_program import run
 
-USER, HOST_NAME = "pi", "raspberrypi"
+USER = "pi"
 PACKAGES = (
     *("?essential", "?priority(^required$)", "debian-archive-keyring", "ca-certificates"),
     *("systemd", "systemd-sysv", "dbus", "udev", "libpam-systemd", "kmod", "procps"),
@@ -108,9 +108,7 @@ def _unpack(root: Path, packages: list[Path]) -> None:
 
 
 def _personalize(root: Path, public_key: str) -> None:
-    """Write what Raspberry Pi Imager writes: a host name, a user with a key, and sudo without a password."""
-    (root / "etc" / "hostname").write_text(f"{HOST_NAME}\n")
-    (root / "etc" / "hosts").write_text(f"127.0.0.1\tlocalhost\n127.0.1.1\t{HOST_NAME}\n")
+    """Write what Raspberry Pi Imager writes, but the host's name: a user with a key, and sudo without a password."""
     (root / "etc" / "machine-id").write_text("")  # each boot of a copy makes its own
     sudoers = root / "etc" / "sudoers.d" / "010_pi-nopasswd"
     sudoers.write_text(f"{USER} ALL=(ALL) NOPASSWD: ALL\n")

@@ -1,7 +1,6 @@
 """Commands that make artifacts from a checkpoint and inspect them."""
 
 import functools
-import json
 import re
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -97,19 +96,15 @@ def _values_of(turned: Turned) -> dict[str, Any]:
 
 @click.command(short_help="Judge an existing run again.")
 @click.argument("run_dir", type=PathTo("run"))
-@AS_JSON
-def report(run_dir: Path, as_json: bool) -> None:
+def report(run_dir: Path) -> None:
     """Judge the run in RUN_DIR again, after `make count` or `rover world students`, or when params.yml has changed."""
-    _judge(run_dir, as_json)
+    _judge(run_dir)
 
 
-def _judge(run_dir: Path, as_json: bool = False) -> None:
+def _judge(run_dir: Path) -> None:
     from rover_lib.workshop.run.run_report import PAGE, text, write
 
-    content = write(run_dir)
-    if as_json:
-        return click.echo(json.dumps(content, indent=2))
-    click.echo(f"{text(content['metrics'])}\n\ndone: {run_dir / PAGE}")
+    click.echo(f"{text(write(run_dir)['metrics'])}\n\ndone: {run_dir / PAGE}")
 
 
 @click.command(short_help="Say what a file or folder is; list the runs.")

@@ -15,7 +15,3 @@ def __getattr__(name: str) -> Any:
 
         return getattr(policy, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -5,7 +5,6 @@ It is thin: it parses arguments, calls the library and prints.
 
 import contextlib
 import json
-import os
 import sys
 import traceback
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.columns import align, benchmark_rows, number
+from rover_lib.onboard.columns import align, benchmark_rows
 from rover_lib.onboard.command import (
     ARTIFACT,
     AS_JSON,
@@ -162,9 +161,8 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
 @PORT
 @click.option("--hz", type=Number(1, 120), default=30.0, show_default=True, help="Required frames per second.")
 @click.option("--receiver", is_flag=True, help="Only test the receiver, with a human at the transmitter.")
-@AS_JSON
 @click.pass_context
-def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bool, **asked: Any) -> None:
+def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: Any) -> None:
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
     Nothing is armed. Exit code 1 if anything that driving needs fails; warnings do not count. With --receiver it asks
@@ -177,15 +175,11 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, as_json: bo
         found = checking.receiver(port, ask)
     else:
         found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
-    checks = []
+    failed = []
     for check in found:
-        checks.append(check)
-        if not as_json:
-            click.echo(str(check))
-    failed = [c.name for c in checks if c.verdict == "fail"]
-    if as_json:
-        show({"drives": not failed, "checks": [vars(c) for c in checks]}, as_json)
-    elif failed:
+        click.echo(str(check))
+        failed += [check.name] if check.verdict == "fail" else []
+    if failed:
         notify(f"rover: this car would not drive: {', '.join(failed)}")
     ctx.exit(1 if failed else 0)
 
@@ -250,37 +244,26 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--warmup", type=FROM_0, default=10, show_default=True)
 @click.option("--iterations", type=FROM_1, default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(0, MOST_THREADS), default=0, show_default=True, help="0: all cores.")
-@click.option("--duration", "duration_s", type=POSITIVE, help="Soak for this many seconds instead, with a time series.")
 @click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
-@click.option("--gates", is_flag=True, help="Check the first artifact against the original limits in params.yml.")
 @AS_JSON
-def benchmark(
-    artifacts: tuple[Path, ...], threads: int, output: Path | None, gates: bool, as_json: bool, **options: Any
-) -> None:
+def benchmark(artifacts: tuple[Path, ...], threads: int, output: Path | None, as_json: bool, **options: Any) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
-    from rover_lib.onboard.artifact.manifest import content_hash, distinct_names
+    from rover_lib.onboard.artifact.manifest import content_hash
     from rover_lib.onboard.car.host import usable_cores
     from rover_lib.onboard.care.benchmark import benchmark_artifacts
-    from rover_lib.onboard.care.limits import check_gates
-    from rover_lib.onboard.params import params
     from rover_lib.onboard.stage import write_stage
 
-    files = distinct_names(artifacts)
+    stems = [path.stem for path in artifacts]
+    files = {path.stem if stems.count(path.stem) == 1 else str(path): path for path in artifacts}
     contents = {name.removesuffix(path.suffix) + path.suffix: content_hash(path) for name, path in files.items()}
     metrics = benchmark_artifacts(files, threads or usable_cores(), options)
     if output:
         write_stage(output, "benchmark", params={"threads": threads, **options}, metrics=metrics, inputs=contents)
-    if gates:
-        metrics["gates"] = check_gates(metrics, params()["gates"]["original"])
     if as_json:
         return show(metrics, as_json)
     click.echo("\n".join(align(benchmark_rows(metrics))))
     machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
     show({k: v for k, v in machine.items() if v is not None}, False)
-    for row in metrics.get("gates", []):
-        passed = {True: "kept", False: "MISSED", None: "not measured"}[row["passed"]]
-        found = row["found"] if isinstance(row["found"], str) else number(row["found"], ".4g")
-        click.echo(f"{row['gate']:<20} {found:>8}  promised {row['limit']}: {passed}")
 
 
 @main.command("arm-car", short_help="Arm the car; its service then drives at once.")
@@ -342,16 +325,10 @@ def stage(releases: Any, source: Path, **options: Any) -> None:
 @click.pass_obj
 def verify(releases: Any, name: str, confined: bool) -> None:
     """Verify that a release is complete and computes here what it should, by checksums and parity vectors."""
-    if confined and (path := releases.path_of(name)).exists():
-        from rover_lib.onboard.artifact.manifest import Artifact
-        from rover_lib.onboard.policy.confine import confine, memory_mb
-        from rover_lib.onboard.policy.load import import_engine
-
-        with Artifact(path) as artifact:
-            import_engine(artifact)
-        if unconfined := confine(memory_mb(path, os.cpu_count() or 1)):
-            notify(f"rover: not confined: {unconfined}")
-    releases.check(name)
+    if confined:
+        releases.verify(name, confined=True)
+    else:
+        releases.check(name)
     click.echo(f"{name}: verified")
 
 

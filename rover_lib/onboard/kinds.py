@@ -28,7 +28,6 @@ CALLED = {
     "tub": "a donkeycar tub",
     "run": "a run's folder",
     "flight log": "a flight log",
-    "calibration": "the calibration of a run",
     "stage": "the report of a run's stage",
 }
 WANTED = {  # what a command takes: the kinds, and how to get one
@@ -168,7 +167,5 @@ def _of_archive(file: Path) -> tuple[str, ...]:
             return ("artifact",)
         with zipfile.ZipFile(file) as z, z.open(next(n for n in z.namelist() if n.endswith("/data.pkl"))) as content:
             keys = content.read(HEAD)
-        if b"model_state_dict" in keys:
-            return ("checkpoint",)
-        return ("calibration",) if b"image_sizes" in keys and b"smooth" in keys else ()
+        return ("checkpoint",) if b"model_state_dict" in keys else ()
     return ()

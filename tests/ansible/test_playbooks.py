@@ -122,6 +122,14 @@ def test_wrong_arguments_and_machines_are_refused_before_anything_is_done(tmp_pa
 # What must not be stopped or lost
 
 
+def programs(folder: Path, bodies: dict[str, str]) -> None:
+    """Write shell scripts."""
+    for name, body in bodies.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"#!/bin/sh\n{body}\n")
+        (folder / name).chmod(0o755)
+
+
 def test_a_car_that_drives_is_not_stopped_unless_that_is_asked_for(tmp_path):
     """Only systemd is asked, and a car may also be armed while the model before is proven."""
     driving, disarmed = "driving: steering +0.10", "disarmed: waiting for a human to arm it"
@@ -131,24 +139,20 @@ def test_a_car_that_drives_is_not_stopped_unless_that_is_asked_for(tmp_path):
         ("not_driving", disarmed, "refuse", ""),
         ("rollback", disarmed, "refuse", "is driving"),
         ("rollback", disarmed, "stop", ""),
+        ("rollback", disarmed, "stop", '"msg": "no model: deploy one"'),  # what the program says, as the reason
     ]
     cases = []
     for i, (file, text, asked, words) in enumerate(rows):
         folder = tmp_path / str(i)
         says = f"printf 'LoadState=loaded\\nActiveState=active\\nStatusText='; cat {folder}/text"
-        for name, body in {
-            "bin/systemctl": f'echo "$@" >> {folder}/calls\n{says}',
-            "venv/bin/rover": f"printf driving > {folder}/text",
-        }.items():
-            (folder / name).parent.mkdir(parents=True)
-            (folder / name).write_text(f"#!/bin/sh\n{body}\n")
-            (folder / name).chmod(0o755)
+        rover = f"printf driving > {folder}/text" if i < 5 else "echo 'no model: deploy one' >&2; exit 1"
+        programs(folder, {"bin/systemctl": f'echo "$@" >> {folder}/calls\n{says}', "venv/bin/rover": rover})
         (folder / "text").write_text(text)
         given = {"bin": str(folder / "bin"), "rover_home": str(folder), "rover_models": str(folder / "no models")}
         cases.append((file, given | {"rover_while_driving": asked, "rover_ready_s": 2}, words))
     play_each(tmp_path, cases)
-    restarted = ["restart rover-drive.service" in (tmp_path / str(i) / "calls").read_text() for i in range(5)]
-    assert restarted == [False, False, False, False, True]
+    restarted = ["restart rover-drive.service" in (tmp_path / str(i) / "calls").read_text() for i in range(6)]
+    assert restarted == [False, False, False, False, True, False]
 
 
 def test_an_episode_comes_home_and_leaves_the_rover_unless_another_would_be_lost(tmp_path):
@@ -267,3 +271,25 @@ def test_a_board_is_not_flashed_again_for_want_of_a_gamepad(tmp_path, firmware, 
         env = {**os.environ, "ROVER_CAR": str(tmp_path / "car.yml")}
         done = subprocess.run([sys.executable, *asks[1:-1], board.port], env=env, capture_output=True, text=True)
     assert bool(done.returncode) == flashes, done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: the playbook gives files to root")
+def test_an_old_boot_loader_is_flashed_at_its_own_speed(tmp_path):
+    avrdude = f'echo "$@" >> {tmp_path}/asked\ncase "$*" in *115200*) exit 1 ;; esac'
+    systemctl = "[ $1 != is-active ] && printf 'LoadState=loaded\\nActiveState=inactive'"
+    programs(tmp_path, {"bin/avrdude": avrdude, "bin/systemctl": systemctl})
+    (tmp_path / "rover.hex").touch()
+    env = {**os.environ, "PATH": f"{tmp_path}/bin:{os.environ['PATH']}"}
+    words = [
+        "-C",
+        ROOT / "firmware",
+        f"--old-file={tmp_path}/rover.hex",
+        f"BUILD={tmp_path}",
+        "PORT=/dev/none",
+        "flash",
+    ]
+    subprocess.run(["make", *words], env=env, check=True, capture_output=True)
+    given = {"bin": f"{tmp_path}/bin", "rover_home": str(tmp_path), "rover_port": "/dev/none"}
+    play_each(tmp_path, [("firmware", given | {"rover_firmware": f"{tmp_path}/rover.hex"}, "")])
+    speeds = re.findall(r"-b (\d+)", (tmp_path / "asked").read_text())
+    assert speeds == ["115200", "57600"] * 2

@@ -68,7 +68,8 @@ def arm(link):
 
 
 def drive(link, action, condition):
-    needs.keep_sending(lambda: link.send_action(*action), condition=condition)
+    pulses = link.calibration.pulses(*action)
+    needs.keep_sending(lambda: link.send(pulses.steering_us, pulses.throttle_us), condition=condition)
 
 
 @pytest.mark.slow

@@ -40,8 +40,8 @@ def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     result = rover("run", "best_model.pth", "recordings")
     assert result.exit_code == 0 and "Verdict: deploy policy_static.pt" in result.output
     assert "Next:" in result.output and (folder / "report.html").is_file()
-    content = json.loads(rover("report", folder, "--json").output)
-    assert content == json.loads((folder / "run.json").read_text())
+    content = json.loads((folder / "run.json").read_text())
+    assert content["metrics"]["headline"] in rover("report", folder).output
     for listed in (rover("inspect", folder.parent, "--json"), rover("inspect", "--json")):
         assert json.loads(listed.output)["runs"] == {"mine": content["metrics"]["headline"]}
 
@@ -101,8 +101,7 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
         assert (metrics["main"], metrics["threads"]) == (str(files[0]), 1)
         assert all(v["n"] == 2 for v in timed.values())
     assert set(read_stage(out, "benchmark")["inputs"]) == {*map(str, files)}
-    result = rover("benchmark", *files, "--iterations", 1, *few, "--gates")
-    assert str(files[0]) in result.stdout and "model_size_mb" in result.stdout
+    assert str(files[0]) in rover("benchmark", *files, "--iterations", 1, *few).stdout
     assert rover("benchmark", files[0], files[0]).exit_code == 1  # given twice
 
 

@@ -44,36 +44,28 @@ def in_world(demo_run, folder, *options):
 
 
 @real_time
-def test_a_drive_leaves_its_report_its_log_and_an_episode(demo_run, tmp_path):
+def test_a_signal_ends_a_drive_which_leaves_its_report_its_log_and_an_episode(demo_run, tmp_path):
     folder = fresh(tmp_path)
-    command = in_world(demo_run, folder, "--ticks", 60, "--latency-ms", 50, "--record", folder / "episodes")
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    report = json.loads((folder / "drive.json").read_text())
-    assert (report["ticks"], report["ended"]) == (60, "60 ticks")
-    assert {"missed", "jitter_p99_ms", "plan_age_p95_ms", "hits", "trials"} <= set(report)
-    assert 50 <= report["latency_p50_ms"] < 150
-    flight = read_log(folder / "flight.log")
-    assert len(flight.ticks["t_s"]) == 60 and set(flight.ticks["state"]) == {"A"}
-    assert any("neutral: stopped" in event.text for event in flight.events) and "armed" in done.stderr
-    (episode,) = load_recordings(folder / "episodes").episodes
-    assert len(episode.samples) > 30 and {s.driver for s in episode.samples} == {"policy"}
-    data = json.loads(next((folder / "episodes").glob("*/episode_data.json")).read_text())
-    assert len(data["control_samples"]) == 60 and {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
-
-
-@real_time
-def test_a_signal_stops_the_car_and_is_no_fault(demo_run, tmp_path):
-    folder = fresh(tmp_path)
-    process = subprocess.Popen(in_world(demo_run, folder), stderr=subprocess.PIPE, text=True)
+    command = in_world(demo_run, folder, "--latency-ms", 50, "--record", folder / "episodes")
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     for line in process.stderr:
         if line.strip() == "rover: armed":
             break
-    time.sleep(0.5)
+    time.sleep(2)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=20)
     assert process.returncode == 0 and "SIGINT: stopping" in stderr, stderr
-    assert json.loads((folder / "drive.json").read_text())["ended"] == "told to stop"
+    report = json.loads((folder / "drive.json").read_text())
+    assert report["ended"] == "told to stop" and 50 <= report["latency_p50_ms"] < 150
+    assert {"missed", "jitter_p99_ms", "plan_age_p95_ms", "hits", "trials"} <= set(report)
+    flight = read_log(folder / "flight.log")
+    assert len(flight.ticks["t_s"]) == report["ticks"] > 40 and set(flight.ticks["state"]) == {"A"}
+    assert any("neutral: stopped" in event.text for event in flight.events)
+    (episode,) = load_recordings(folder / "episodes").episodes
+    assert len(episode.samples) > 30 and {s.driver for s in episode.samples} == {"policy"}
+    data = json.loads(next((folder / "episodes").glob("*/episode_data.json")).read_text())
+    assert len(data["control_samples"]) == report["ticks"]
+    assert {"mode", "plan_age_ms"} <= set(data["control_samples"][0])
 
 
 async def watch_and_stop(url: str) -> list[dict]:
@@ -94,7 +86,7 @@ async def watch_and_stop(url: str) -> list[dict]:
 
 
 @real_time
-def test_a_page_shows_the_drive_and_its_button_ends_it(demo_run, tmp_path):
+def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp_path):
     pytest.importorskip("aiohttp", reason="needs the extra look")
     folder = fresh(tmp_path)
     served = [*ROVER[:1], "view", "--web-port", "0", "--feed", str(folder / "view")]

@@ -1,8 +1,7 @@
 """Two processes that make the same thing at once do not disturb each other, and a kill or a power cut costs nothing."""
 
 import os
-import subprocess
-import sys
+import signal
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -50,27 +49,37 @@ def test_while_one_is_in_it_another_is_refused_or_waits(tmp_path):
     assert names_in(tmp_path / "mine") == ["first", "second"] and names_in(tmp_path) == ["mine", "usual"]
 
 
-def end_by_a_kill(lines, *args):
-    code = ["import os, sys, pathlib", *lines, "    os.kill(os.getpid(), 9)"]
-    assert subprocess.run([sys.executable, "-c", "\n".join(code), *args]).returncode == -9
+def in_fork(work):
+    """Do it in a process of its own, in which it kills itself."""
+    if not (child := os.fork()):
+        try:
+            work()
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
 
 @pytest.mark.parametrize(("then", "kept"), [("other", []), ("this", ["link", "sub"]), ("", [])])
 def test_what_a_killed_process_left_goes_first_unless_the_same_is_asked(tmp_path, then, kept):
-    lines = (
-        "from rover_lib.onboard.durable import build_folder",
-        "with build_folder(pathlib.Path(sys.argv[1]), asked='this') as folder:",
-        "    (folder / 'sub').mkdir(), (folder / '.half').touch(), (folder / 'link').symlink_to('/nowhere')",
-    )  # fmt: skip
-    end_by_a_kill(lines, tmp_path / "mine")
+    def fill():
+        with build_folder(tmp_path / "mine", asked="this") as folder:
+            (folder / "sub").mkdir()
+            (folder / ".half").touch()
+            (folder / "link").symlink_to("/nowhere")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    in_fork(fill)
     with build_folder(tmp_path / "mine", asked=then) as folder:
         assert [name for name in names_in(folder) if name != ASKED] == kept
     assert names_in(tmp_path) == ["mine"] and names_in(tmp_path / "mine") == kept
 
 
 def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
-    lines = ("from rover_lib.onboard.stage import atomic_path", "with atomic_path(sys.argv[1]) as path:")
-    end_by_a_kill(lines, tmp_path / "a.json")
+    def write_half():
+        with atomic_path(tmp_path / "a.json"):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    in_fork(write_half)
     (tmp_path / ".a.json.mine.json").touch()
     with atomic_path(tmp_path / "a.json") as first, atomic_path(tmp_path / "a.json") as second:
         first.write_text("first")

@@ -135,7 +135,8 @@ def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
         config = inspect.unwrap(getattr(module, program.partition("-")[2])).__annotations__["cfg"]
         config = eval(config, vars(module)) if isinstance(config, str) else config
         monkeypatch.setattr(sys, "argv", [program, *words])  # where LeRobot looks for a policy's path
-        assert draccus.parse(config, args=words)
+        # Else LeRobot speaks by a program of Debian's that few have, and ends in FileNotFoundError.
+        assert getattr(draccus.parse(config, args=words), "play_sounds", False) is False, line
         parsed.append(program)
     assert len(parsed) == 4, parsed
 

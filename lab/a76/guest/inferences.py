@@ -16,7 +16,7 @@ import numpy as np
 GETPPID, MARK = 173, 0xC0FFEE  # as in count.c; without the plugin this system call has no effect
 libc = ctypes.CDLL(None)
 
-# frame, state -> (chunk, A) float32. frame: (h, w, 3) uint8 BGR, or a dict of these by camera name. state: (S,).
+# frame, state -> (chunk, A) float32. frame: (h, w, 3) uint8 BGR. state: (S,).
 Predict = Callable[[Any, np.ndarray], np.ndarray]
 
 
@@ -37,15 +37,14 @@ def loaded(load: Callable[[], Any]) -> Any:
 def predict_all(predict: Predict, observations: str, folder: str, counted: int) -> None:
     """Predict each observation, and leave `chunks.npy` (n, chunk, A) float32 in the folder.
 
-    observations: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR, or `frame_0000.<camera>`...
-    for several cameras. They are predicted in that order, and again from the first if there are fewer than `counted`.
-    Reading a frame is not counted.
+    observations: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR. They are predicted in that
+    order, and again from the first if there are fewer than `counted`. Reading a frame is not counted.
     """
     chunks = []
     with np.load(observations) as seen:
         states = seen["state"]
         for i in range(max(len(states), counted)):
-            state, frame = states[i % len(states)], frame_of(seen, i % len(states))
+            state, frame = states[i % len(states)], seen[f"frame_{i % len(states):04d}"]
             print("predict", flush=True)
             if i < counted:
                 mark(True, i + 1)
@@ -55,14 +54,6 @@ def predict_all(predict: Predict, observations: str, folder: str, counted: int) 
                 chunk = predict(frame, state)
             chunks.append(chunk)
     np.save(Path(folder) / "chunks.npy", np.stack(chunks[: len(states)]))
-
-
-def frame_of(seen: Any, number: int) -> Any:
-    """Return a frame of an npz, or for several cameras a dict of frames by their names."""
-    name = f"frame_{number:04d}"
-    if name in seen:
-        return seen[name]
-    return {key.removeprefix(f"{name}."): seen[key] for key in seen if key.startswith(f"{name}.")}
 
 
 def leave(folder: str, threads: int, **versions: str) -> None:

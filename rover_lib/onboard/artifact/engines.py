@@ -1,12 +1,11 @@
 """The engines that run artifacts, by the name in an artifact's manifest. Only `load` imports one.
 
 An engine's module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact
-here. threads: None lets the engine choose.
+here. threads: None lets the engine choose. UNCONFINED, if it has it: why its process cannot be confined (confine.py).
 """
 
-import importlib
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -17,8 +16,6 @@ MODULES = {
     ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
     HAILO: "rover_lib.onboard.policy.hailo_engine",
 }
-# Engines whose process cannot be confined (see confine.py), and why
-UNCONFINED = {HAILO: "HailoRT talks to the chip through its driver"}
 
 
 class Engine(Protocol):
@@ -32,8 +29,3 @@ class Engine(Protocol):
     def give_back(self) -> bool:
         """Free the memory that only loading needed, after a first run; return whether to check predictions again."""
         return False
-
-
-def module_of(name: str) -> Any:
-    """Import an engine's module, which takes seconds. Raises KeyError or ImportError."""
-    return importlib.import_module(MODULES[name])

@@ -11,7 +11,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -271,14 +271,3 @@ def _texts(value: Any) -> Iterator[str]:
     elif isinstance(value, dict | list):
         for each in [*value, *value.values()] if isinstance(value, dict) else value:
             yield from _texts(each)
-
-
-def distinct_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Name each artifact by its stem, or its path if another has the same stem. Raises ArtifactError for one twice."""
-    stems = [path.stem for path in paths]
-    names: dict[str, Path] = {}
-    for path in paths:
-        if any(path.resolve() == other.resolve() for other in names.values()):
-            raise ArtifactError(f"{path}: given twice", remedy="name each file once")
-        names[path.stem if stems.count(path.stem) == 1 else str(path)] = path
-    return names

@@ -1,7 +1,7 @@
 """The car: its servo pulses, the host's throttle limit, its camera and its wheelbase, all read from one file, car.yml.
 
     with ServoLink("/dev/ttyUSB0", this_car()) as link:
-        link.send_action(steering=0.2, throttle=0.1)
+        link.tell(read_car("other.yml"))
 
 Without a car.yml, it is the car of the original recordings. The Arduino is told the same numbers, and refuses any
 beyond the limits that its firmware was compiled with (firmware/rover/vehicle.h), which this module repeats.
@@ -112,11 +112,6 @@ class Car:
     def id(self) -> int:
         """CRC-32 of the numbers, by which host and Arduino know that they mean the same car."""
         return zlib.crc32(struct.pack("<9H", *self.numbers))
-
-    @property
-    def is_default(self) -> bool:
-        """Whether it is the car that the firmware assumes until it is told of another."""
-        return self.numbers == DEFAULT_NUMBERS
 
     @property
     def cap(self) -> float:
@@ -237,7 +232,7 @@ def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) 
 
 _DEFAULT_CAR = Car()
 DEFAULT = _DEFAULT_CAR.description()
-DEFAULT_NUMBERS = _DEFAULT_CAR.numbers
+DEFAULT_NUMBERS = _DEFAULT_CAR.numbers  # which the firmware assumes until it is told of others
 
 
 def read_car(path: Path | str) -> Car:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from rover_lib.onboard.car.pwm import Pulses
-
 PROTOCOL_VERSION = 4
 LINE_MAX = 128  # bytes of a line from the Arduino
 SEQUENCES = 1 << 32
@@ -98,11 +96,6 @@ class Telemetry:
     old_commands: int
     out_of_range: int
     lost_bytes: int
-
-    @property
-    def pulses(self) -> Pulses:
-        """What goes to the servos."""
-        return Pulses(self.steering_us, self.throttle_us)
 
     @property
     def why(self) -> str:

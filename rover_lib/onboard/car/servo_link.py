@@ -20,7 +20,7 @@ from typing import Any
 
 import serial
 
-from rover_lib.onboard.car.car import PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
+from rover_lib.onboard.car.car import DEFAULT_NUMBERS, PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
 from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
 from rover_lib.onboard.car.ports import find_port
 from rover_lib.onboard.car.protocol import (
@@ -46,7 +46,6 @@ SILENT_S = 0.3  # nothing may be sent before: while an Arduino resets, its boot 
 HELLO_EVERY_S = 0.5
 REPEAT_S = 0.05
 ANSWER_S = 0.5
-SIGNALS_MS = 250  # after its start; until then the Arduino may not have seen enough pulses for a signal
 STALE_S = 0.5  # a status that is older means silence: the Arduino sends one every 20 ms
 LATE_S = 0.150  # the Arduino rejects older commands, and a link as slow as this is unfit for driving
 DATED = (">A", ">D")  # commands that carry the time of the newest status that the host had read
@@ -84,7 +83,7 @@ class ServoLink:
         with ServoLink("/dev/ttyUSB0") as link:
             link.arm()
             while ...:
-                link.send_action(steering, throttle)  # at least every 150 ms
+                link.send(steering_us, throttle_us)  # at least every 150 ms
 
     Any thread may call any method. When the port fails, each call raises LinkError, and the Arduino stops by itself.
     With a car whose human has a gamepad, the thread that reads the statuses answers them with its sticks. If the
@@ -138,11 +137,6 @@ class ServoLink:
             self._release()
             remedy = "is it plugged in, is the user in group dialout, and does no other program have the port?"
             raise LinkError(f"{self.port}: cannot be opened ({error})", remedy=remedy) from error
-        self._closing.clear()
-        self._gamepad = None
-        with self._heard:
-            self.hello = self._telemetry = self.turned = self._requested = self._failure = None
-            self._unanswered.clear()
         self._reader = threading.Thread(target=self._read, args=(self._serial,), name="servo link", daemon=True)
         self._reader.start()
         try:
@@ -194,7 +188,7 @@ class ServoLink:
 
     def _tell_car(self, hello: Hello) -> None:
         """Tell the Arduino this car's neutral, pulses and cap; until it knows them, it refuses to arm."""
-        if self.car.is_default and hello.car == self.car.id:
+        if self.car.numbers == DEFAULT_NUMBERS and hello.car == self.car.id:
             self._told_boot = hello.boot
             return
         for telemetry in self._ask(">C", *self.car.numbers):
@@ -256,8 +250,6 @@ class ServoLink:
         for telemetry in self._ask(">A", asked.uptime_ms if asked else 0, self.car.id):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
-            if telemetry.result == "s" and telemetry.uptime_ms < SIGNALS_MS:
-                continue  # it has just started, and cannot have seen the signals yet
             if telemetry.result in "cestw":
                 remedy = self.remedy(telemetry.result) if telemetry.result in MISSING else "ask again"
                 raise LinkError(f"{self.port}: arming was {RESULTS[telemetry.result]}", remedy=remedy)
@@ -333,14 +325,6 @@ class ServoLink:
             what = f"{channel.name} pulse must be whole microseconds from {low} to {high}"
             raise LinkError(what, found=repr(pulse_us), remedy="it was not sent")
         return whole_us
-
-    def send_action(self, steering: float, throttle: float) -> int:
-        """Send steering in [-1, 1] and throttle in [0, 1] (from -1 with reverse) as pulses, like send().
-
-        Raises CarError for other values, and LinkError like send().
-        """
-        pulses = self.calibration.pulses(steering, throttle)
-        return self.send(pulses.steering_us, pulses.throttle_us)
 
     def latest(self) -> Telemetry | None:
         """Return the newest status, None before the first. Raises LinkError if it is older than 0.5 s."""

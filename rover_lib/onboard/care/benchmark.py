@@ -1,34 +1,30 @@
 """Measure the latency of policies on this machine: its distribution, the host's state, and a Pi 5's lower bound.
 
-    metrics = benchmark({"static": static, "fp32": fp32}, frames, state, BenchmarkOptions(iterations=1000))
+    metrics = benchmark({"static": static, "fp32": fp32}, frames, state, iterations=1000)
 
 All policies are timed in one run. Each round has one inference of every policy, and starts with a different one. So a
 machine that heats up or is shared slows all of them alike. A value that the host does not report (no thermal zone, no
 vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.car.host import Host, throttled_means, usable_cores
-from rover_lib.onboard.care.lower_bound import floor_ms
-from rover_lib.onboard.checked import broken_rule, number, optional, whole
+from rover_lib.onboard.car.host import Host, usable_cores
+from rover_lib.onboard.care.pi5 import floor_ms
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.policy.confined import load_confined, run_confined
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
-MOST = 10**9  # rounds or seconds: a limit that nobody meets
-NOTED = ("latency_p50_ms", "latency_p95_ms", "latency_max_ms", "n")  # of a point in the time series
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
+READ_S = 1.0  # between two readings of the host
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
@@ -51,11 +47,10 @@ def _predict_alone(path: str, threads: int) -> float | None:
 def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mapping[str, Any]) -> dict[str, Any]:
     """Time artifacts from anywhere, by name, in a confined process, on the frames of the first one's parity vectors.
 
-    options: of BenchmarkOptions. Each artifact's memory is measured too. Raises PolicyError for one that does not load.
+    options: of benchmark(). Each artifact's memory is measured too. Raises PolicyError for one that does not load.
     """
     metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
     metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
-    metrics["throttled_means"] = throttled_means(metrics["throttled"])
     _add_memory(metrics, paths, threads)
     return metrics
 
@@ -66,7 +61,7 @@ def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]
     frames = []
     for i in range(len(vectors["state"])):  # stored as RGB; a camera gives BGR
         frames.append({camera: vectors[f"frame_{camera}"][i][:, :, ::-1] for camera in cameras})
-    return benchmark(policies, frames, vectors["state"][0], BenchmarkOptions(**options))
+    return benchmark(policies, frames, vectors["state"][0], **options)
 
 
 def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
@@ -97,159 +92,116 @@ def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
     }
 
 
-def _silent(items: Iterable, **_: object) -> Iterable:
-    return items
-
-
-@dataclass(frozen=True)
-class BenchmarkOptions:
-    """How to time policies. Raises ParamsError for impossible values.
-
-    warmup: inferences of each policy that are not counted. iterations: number of rounds. duration_s: instead, a soak
-    test with a time series. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures are at
-    the top level (None: the first's). reference: what the others' speed is compared with. memory_alone: measure each
-    artifact's memory in a process of its own.
-    """
-
-    warmup: int = 10
-    iterations: int = 100
-    duration_s: float | None = None
-    at_most_s: float | None = None
-    main: str | None = None
-    reference: str | None = None
-    memory_alone: bool = False
-
-    def __post_init__(self) -> None:
-        rules = {"warmup": whole(0, MOST), "iterations": whole(1, MOST)}
-        rules |= dict.fromkeys(("duration_s", "at_most_s"), optional(number(0.001, MOST)))
-        if broken := broken_rule(vars(self), rules):
-            raise ParamsError(f"{broken[0]} of a benchmark must be {broken[1]}", found=broken[2])
-
-
-@dataclass(frozen=True)
-class Clocks:
-    """The clocks of a benchmark, both in seconds: elapsed time, and processor time."""
-
-    wall: Callable[[], float] = time.perf_counter
-    cpu: Callable[[], float] = time.process_time
-
-
-DEFAULTS = BenchmarkOptions()
-REAL_TIME = Clocks()
-
-
 def benchmark(
     policies: Mapping[str, Any],
     frames: Sequence[Any],
     state: np.ndarray,
-    options: BenchmarkOptions = DEFAULTS,
     *,
+    warmup: int = 10,
+    iterations: int = 100,
+    at_most_s: float = math.inf,
+    main: str | None = None,
+    reference: str | None = None,
+    memory_alone: bool = False,
     host: Host | None = None,
-    clocks: Clocks = REAL_TIME,
-    progress: Progress = _silent,
+    wall: Callable[[], float] = time.perf_counter,
+    cpu: Callable[[], float] = time.process_time,
+    progress: Progress = lambda items, **_: items,
 ) -> dict[str, Any]:
     """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
 
     policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path` and `.threads` are used if
-    it has them. frames: used in turn.
+    it has them. frames: used in turn. warmup: inferences of each policy that are not counted. iterations: number of
+    rounds. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures are at the top level
+    (None: the first's). reference: what the others' speed is compared with. memory_alone: measure each artifact's
+    memory in a process of its own. wall, cpu: clocks of elapsed and of processor time, in seconds.
 
     cpu_pct is processor time as a share of all cores that this process may use. temperature_c is the highest and
     clock_mhz the lowest reading. peak_memory_mb is the artifact's alone if it was measured, else None, and this
-    process's at the top level. Raises ParamsError without policies or frames, or if main or reference is not among the
-    policies.
+    process's at the top level. Raises ParamsError without policies, frames or iterations, or if main or reference is
+    not among the policies.
     """
     names = list(policies)
-    main, reference = options.main or next(iter(names), None), options.reference
-    if not len(frames) or main not in names or reference not in (None, *names):
-        what = f"a benchmark needs frames and policies, {main} and {reference} among them"
-        raise ParamsError(what, found=f"{len(frames)} frames and {names}")
+    main = main or next(iter(names), None)
+    if not len(frames) or not iterations > 0 or main not in names or reference not in (None, *names):
+        what = f"a benchmark needs frames, iterations, and policies with {main} and {reference} among them"
+        raise ParamsError(what, found=f"{len(frames)}, {iterations} and {names}")
     host = host or Host()
     cores = usable_cores()
     for name in names:
-        for i in range(options.warmup):
+        for i in range(warmup):
             policies[name].predict_chunk(frames[i % len(frames)], state)
-    run = _Run(policies, frames, state, host, clocks)
-    run.measure(options, progress)
+    run = _Run(policies, frames, state, host, wall, cpu)
+    run.measure(progress(range(iterations), desc="timing", total=iterations), at_most_s)
     threads = getattr(policies[main], "threads", None)
 
-    artifacts = {name: run.metrics_of(name, cores) for name in names}
+    artifacts = {name: run.metrics_of(name) for name in names}
     top = dict(artifacts[main])
     if reference is not None:
         for name, metrics in artifacts.items():
             metrics |= run.speedup(name, reference)
-    process_mb = host.process_peak_memory_mb()
     metrics = {
         **top,
-        "peak_memory_mb": process_mb,
-        "process_peak_memory_mb": process_mb,
-        "cpu_pct": _share_pct(run.process_s, run.wall_s, cores),
+        "peak_memory_mb": host.process_peak_memory_mb(),
+        "cpu_pct": 100 * run.process_s / run.wall_s / cores if run.wall_s > 0 else None,
         **run.host_metrics(),
         "main": main,
         "reference": reference,
         "threads": threads,
         "cores": cores,
-        "warmup": options.warmup,
+        "warmup": warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
         "artifacts": artifacts,
-        "series": run.series if options.duration_s is not None else None,
     }
-    if options.memory_alone:
+    if memory_alone:
         paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
         _add_memory(metrics, paths, threads)
     return metrics
-
-
-def _share_pct(cpu_s: float, wall_s: float, cores: int) -> float | None:
-    return 100 * cpu_s / wall_s / cores if wall_s > 0 else None
 
 
 class _Run:
     """The timed part of one benchmark."""
 
     def __init__(
-        self, policies: Mapping[str, Any], frames: Sequence[Any], state: np.ndarray, host: Host, clocks: Clocks
+        self,
+        policies: Mapping[str, Any],
+        frames: Sequence[Any],
+        state: np.ndarray,
+        host: Host,
+        wall: Callable[[], float],
+        cpu: Callable[[], float],
     ):
         self.policies, self.frames, self.state = policies, frames, state
-        self.host, self.clocks = host, clocks
+        self.host, self.wall, self.cpu = host, wall, cpu
         self.latencies_ms: dict[str, list[float]] = {name: [] for name in policies}
-        self.cpu_s = dict.fromkeys(policies, 0.0)
         self.readings: list[dict[str, Any]] = []
-        self.series: list[dict[str, Any]] = []
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
-    def measure(self, options: BenchmarkOptions, progress: Progress) -> None:
-        """Time `iterations` rounds, or as many as begin within duration_s, and fill the lists."""
-        duration_s, names = options.duration_s, list(self.policies)
-        if duration_s is None:
-            rounds = progress(range(options.iterations), desc="timing", total=options.iterations)
-        else:
-            rounds = progress(itertools.count(), desc=f"soaking for {duration_s:g} s", total=None)
-        # at most 300 points: enough to see a machine throttle, few enough to plot and to keep
-        every_s = max(1.0, (duration_s or 0) / 300)
-        self.readings.append(self.host.reading())
+    def measure(self, rounds: Iterable[int], at_most_s: float) -> None:
+        """Time the rounds, or as many as begin within at_most_s, and fill the lists."""
+        names = list(self.policies)
         before = self.host.core_ticks()
-        cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
-        ends = (duration_s or math.inf, 1), (options.at_most_s or math.inf, LEAST_ROUNDS)
-        tick_s, seen = every_s, dict.fromkeys(names, 0)
+        cpu_start_s, start_s = self.cpu(), self.wall()
+        read_s = -math.inf
         for i in rounds:
-            passed_s = self.clocks.wall() - start_s
-            if any(i >= least and passed_s >= end_s for end_s, least in ends):
+            passed_s = self.wall() - start_s
+            if i >= LEAST_ROUNDS and passed_s >= at_most_s:
                 break
-            if duration_s and passed_s >= tick_s:
-                self._note(passed_s, seen)
-                tick_s = passed_s + every_s
+            if passed_s >= read_s + READ_S:
+                self.readings.append(self.host.reading())
+                read_s = passed_s
             for k in range(len(names)):
                 self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
-        self.wall_s, self.process_s = self.clocks.wall() - start_s, self.clocks.cpu() - cpu_start_s
+        self.wall_s, self.process_s = self.wall() - start_s, self.cpu() - cpu_start_s
+        self.readings.append(self.host.reading())
         after = self.host.core_ticks()
-        self._note(self.wall_s, seen)
         if before and after and len(before) == len(after):
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
-    def metrics_of(self, name: str, cores: int) -> dict[str, Any]:
+    def metrics_of(self, name: str) -> dict[str, Any]:
         """Return the figures of one policy: those measured, and those known from its manifest and file."""
         policy, times_ms = self.policies[name], self.latencies_ms[name]
         manifest = getattr(policy, "manifest", None) or {}
@@ -258,7 +210,6 @@ class _Run:
         return {
             **latency_metrics(times_ms),
             "peak_memory_mb": None,
-            "cpu_pct": _share_pct(self.cpu_s[name], sum(times_ms) / 1000, cores),
             "floor_ms": floor_ms(gmac, mode) if mode else None,
             "gmac": gmac,
             "mode": mode,
@@ -277,32 +228,15 @@ class _Run:
         """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
         temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
         clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
-        throttled = self.readings[-1]["throttled"]
         return {
             "cpu_per_core_pct": self.per_core_pct,
             "temperature_c": max(temperatures_c, default=None),
             "clock_mhz": min(clocks_mhz, default=None),
-            "throttled": throttled,
-            "throttled_means": throttled_means(throttled),
+            "throttled": self.readings[-1]["throttled"],
         }
 
     def _time(self, name: str, frame: Any) -> None:
         predict = self.policies[name].predict_chunk
-        cpu_start_s, start_s = self.clocks.cpu(), self.clocks.wall()
+        start_s = self.wall()
         predict(frame, self.state)
-        end_s, cpu_end_s = self.clocks.wall(), self.clocks.cpu()
-        self.latencies_ms[name].append((end_s - start_s) * 1000)
-        self.cpu_s[name] += cpu_end_s - cpu_start_s
-
-    def _note(self, t_s: float, seen: dict[str, int]) -> None:
-        """Add one point to the time series: the latencies since the last point, and the host's state."""
-        reading = self.host.reading()
-        self.readings.append(reading)
-        artifacts = {}
-        for name, times_ms in self.latencies_ms.items():
-            recent, seen[name] = times_ms[seen[name] :], len(times_ms)
-            if recent:
-                all_of = latency_metrics(recent)
-                artifacts[name] = {key: all_of[key] for key in NOTED}
-        memory_mb = self.host.process_peak_memory_mb()
-        self.series.append({"t_s": t_s, **reading, "memory_mb": memory_mb, "artifacts": artifacts})
+        self.latencies_ms[name].append((self.wall() - start_s) * 1000)

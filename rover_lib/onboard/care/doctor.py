@@ -41,7 +41,6 @@ SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB
 SIGNAL_S = 1.0
 RITUAL_S = 30.0  # time for a human to do what is asked
 REST_US = 32  # the firmware arms only with the throttle stick this near to neutral
-HOT_C = 75.0  # a Pi 5 slows down from 80 C
 MEMORY_MB = 700  # the real policy needs 358 MB while predicting and 424 while loading, the loop's process 100
 RECORDINGS_MB = 1000  # a quarter of an hour at 30 Hz
 
@@ -87,7 +86,6 @@ def examine(
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(dev):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device)
-        checks["cameras"] = lambda: cameras(dev)
     checks |= {
         "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
         "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev / "none"))),
@@ -95,7 +93,6 @@ def examine(
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "artifact": lambda: policy(artifact),
-        "temperature": lambda: temperature(host),
         "power": lambda: power(host),
         "governor": lambda: governor(host.sys_root),
         "disk": lambda: disk(log_folder or Path.cwd(), Path.cwd()),
@@ -121,14 +118,6 @@ def access(name: str, device: Path) -> Iterator[Check]:
         yield Check(name, "ok", f"{user} may use {device}")
     else:
         yield Check(name, "fail", f"{user} may not use {device}, of group {group}", remedy)
-
-
-def cameras(dev: Path = Path("/dev")) -> Iterator[Check]:
-    """Name each USB camera and the node that gives its pictures, as udev does."""
-    links = sorted((dev / "v4l" / "by-id").glob("*-video-index0"))
-    found = "; ".join(f"{link.resolve()}: {link.name.removesuffix('-video-index0')}" for link in links)
-    remedy = "plug it in; dmesg | tail says whether the kernel saw it"
-    yield warn_unless(bool(links), "cameras", found or "no USB camera", remedy)
 
 
 def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
@@ -310,14 +299,6 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
     found = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
     remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
     yield warn_unless(median_s < fade_s / 2, "inference", found, remedy)
-
-
-def temperature(host: Host) -> Iterator[Check]:
-    """Check the processor's temperature."""
-    celsius = host.temperature_c()
-    found = "not reported" if celsius is None else f"{celsius:.0f} C"
-    fine = celsius is None or celsius < HOT_C
-    yield warn_unless(fine, "temperature", found, "a fan, or air: a Raspberry Pi slows down from 80 C")
 
 
 def power(host: Host) -> Iterator[Check]:

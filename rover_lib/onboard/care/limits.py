@@ -3,7 +3,6 @@
 rows = check_gates(metrics, params()["gates"]["original"])
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,8 +23,6 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
     rows = []
     for gate, limit in gates.items():
         value = metrics.get(gate, metrics.get(GATE_KEYS.get(gate, gate)))
-        if isinstance(value, float) and math.isnan(value):
-            value = None
         rows.append({"gate": gate, "limit": limit, "found": value, "passed": _passes(gate, value, limit)})
     return rows
 
@@ -33,13 +30,12 @@ def check_gates(metrics: Mapping[str, Any], gates: Mapping[str, Any]) -> list[di
 def _passes(gate: str, value: Any, limit: Any) -> bool | None:
     if isinstance(limit, str):
         return None if value is None else bool(value == limit)
-    is_range = isinstance(limit, (list, tuple)) and len(limit) == 2
-    ends = list(limit) if is_range else [limit]
-    if not all(map(is_number, ends)) or ends != sorted(ends):
+    ends = limit if isinstance(limit, list) else [limit]
+    if not all(map(is_number, ends)) or len(ends) not in (1, 2) or ends != sorted(ends):
         what = f"gate {gate} must be a number, [low, high] or a text"
         raise ParamsError(what, found=repr(limit), remedy="see params.yml")
     if value is None:
         return None
     if gate in HIGHER_IS_BETTER:
         return bool(value >= ends[0])
-    return bool(value <= ends[1] if is_range else value < ends[0])
+    return bool(value <= ends[-1] if len(ends) == 2 else value < ends[0])

@@ -1,6 +1,6 @@
 """What a Raspberry Pi 5 takes for counted work, by a fit to published times: computed, never measured.
 
-    predict_ms(Work(cycles_g=0.69, near_lines_g=0.03, far_lines_g=0.005), threads=3)
+    predict_ms(Work(cycles_g=0.69, near_lines_g=0.03, far_lines_g=0.005))
 
 The fit has three terms: the cycles of the busiest thread, the lines of 64 bytes that it fetches into its first cache,
 and the lines between all cores and the memory, which overlap with the others. The low and the high end are as far off
@@ -15,11 +15,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rover_lib.onboard.errors import ParamsError
-
 FITTED = Path(__file__).with_name("pi5.json")  # its program: lab/a76/clock.py at commit 545214c
-CORES = 4
 DRIVING = 3  # threads of a policy that drives: all cores but one, which is left for the loop, the camera and the view
+# Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
+# per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
+PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
 
 
 class Span(NamedTuple):
@@ -48,16 +48,6 @@ class Work:
         """Return the work that a row of arm.json or clock.json tells of."""
         return cls(row["cycles_g"], row["near_lines_g"], row["far_lines_g"], row["alone"])
 
-    def terms(self, threads: int) -> tuple[float, float, float]:
-        """Return the busiest thread's cycles and near lines, and the far lines of all, in 10**9.
-
-        Raises ParamsError for threads that a Pi 5 does not have.
-        """
-        if not 1 <= threads <= CORES:
-            raise ParamsError(f"a Raspberry Pi 5 has {CORES} cores", found=threads, remedy="give 1 to 4 threads")
-        part = self.alone + (1 - self.alone) / threads
-        return self.cycles_g * part, self.near_lines_g * part, self.far_lines_g
-
 
 @cache
 def fitted() -> dict[str, Any]:
@@ -67,18 +57,24 @@ def fitted() -> dict[str, Any]:
     return json.loads(FITTED.read_text())
 
 
-def predict_ms(work: Work, threads: int = DRIVING, fit: Mapping[str, Any] | None = None) -> Span:
-    """Return the computed time of one inference, by `fitted` unless another fit is given.
-
-    Raises ParamsError for threads that a Pi 5 does not have.
-    """
-    fit = fit or fitted()
-    (cycles, near, far), ns = work.terms(threads), fit["ns"]
-    ms = 1e3 * ((cycles * ns[0] + near * ns[1]) ** 2 + (far * ns[2]) ** 2) ** 0.5
-    off = fit["off"]["1" if threads == 1 else "4"]
+def predict_ms(work: Work) -> Span:
+    """Return the computed time of one inference in DRIVING threads, by `fitted`."""
+    ns, off = fitted()["ns"], fitted()["off"]["4"]
+    part = work.alone + (1 - work.alone) / DRIVING  # of the work, what the busiest thread does
+    busiest = work.cycles_g * part * ns[0] + work.near_lines_g * part * ns[1]
+    ms = 1e3 * (busiest**2 + (work.far_lines_g * ns[2]) ** 2) ** 0.5
     return Span(ms * math.exp(-off), ms, ms * math.exp(off))
 
 
 def estimate_ms(gmac: float) -> float:
     """Return the high end for INT8 that was not counted, by its 10**9 multiply-accumulates: a rough estimate."""
     return 1e3 * gmac / fitted()["gmac_per_s"]
+
+
+def floor_ms(gmac: float | None, mode: str) -> float | None:
+    """Return the least time that a Pi 5 needs for one inference, by arithmetic alone; None where `gmac` is not known.
+
+    gmac: 10**9 multiply-accumulates of one inference. mode: an artifact's: `mixed` and `dynamic` count as INT8, a floor
+    that they cannot reach.
+    """
+    return None if gmac is None else gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000

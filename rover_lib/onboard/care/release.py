@@ -15,6 +15,7 @@ and the folder before `current` is renamed. Leftovers of an interrupted command 
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import socket
@@ -89,10 +90,6 @@ class Releases:
         """Return what is wrong with the bytes of a release, "" if nothing. Needs no torch."""
         return self._look_at(name)["wrong"]
 
-    def all(self) -> list[dict[str, Any]]:
-        """Return name, current, mode, origin, sha256, megabytes and wrong of each release: the last used first."""
-        return [self._look_at(name) for name in self._by_use()]
-
     def _look_at(self, name: str) -> dict[str, Any]:
         policy, about, megabytes, wrong = self.releases / name / POLICY, {}, 0.0, ""
         try:
@@ -110,10 +107,10 @@ class Releases:
     def status(self) -> dict[str, Any]:
         """Return the present state: current, mode, since, healthy, trouble, releases, disk_free_mb.
 
-        since: when `current` was switched. healthy: whether the bytes of the release in use are intact; if not, trouble
-        says why.
+        releases: name, current, mode, origin, sha256, megabytes and wrong of each, the last used first. since: when
+        `current` was switched. healthy: whether the bytes of the release in use are intact; if not, trouble says why.
         """
-        releases, current, since = self.all(), self.current, None
+        releases, current, since = [self._look_at(name) for name in self._by_use()], self.current, None
         none = f"current points to {current}, not to a release" if current else "no model: deploy one"
         in_use = next((r for r in releases if r["current"]), {"mode": None, "wrong": none})
         with contextlib.suppress(OSError):
@@ -129,19 +126,24 @@ class Releases:
             "disk_free_mb": round(shutil.disk_usage(nearest).free / 1e6),
         }
 
-    def verify(self, name: str = "current") -> None:
+    def verify(self, name: str = "current", confined: bool = False) -> None:
         """Check that a release's bytes are intact, and that it computes correctly here (parity vectors).
 
-        Raises RoverError.
+        confined: give up every right that no inference needs before, for good. Raises RoverError.
         """
         path = self.path_of(name)
         if not path.exists():
             raise RoverError(f"{path}: not there", remedy="deploy one" if name == "current" else "stage it again")
-        from rover_lib.onboard.policy.load import load_policy
-
         if wrong := self.wrong_with(path.parent.resolve().name):
             raise RoverError(f"{path}: {wrong}", remedy="deploy it again")
-        load_policy(path)
+        if confined:
+            from rover_lib.onboard.policy.confined import load_confined
+
+            load_confined({name: path}, threads=os.cpu_count() or 1)
+        else:
+            from rover_lib.onboard.policy.load import load_policy
+
+            load_policy(path)
 
     # Changes
 

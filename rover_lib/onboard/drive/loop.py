@@ -34,7 +34,6 @@ LATE_MOST_S = 0.15
 LATE_WITHIN_S = 0.5
 
 Arm = Callable[[], Telemetry | None]  # arms the car and returns the status that says so; None: no motor is driven
-Warnings = Callable[[], Iterable[str]]  # sentences about what was unusual since the last call
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Hooks:
     """
 
     arm: Arm | None = None
-    warnings: Warnings = lambda: ()
+    warnings: Callable[[], Iterable[str]] = lambda: ()
     record: Callable[..., None] | None = None
     show: Callable[[Tick], None] | None = None
 

@@ -141,8 +141,7 @@ class PolicyPilot:
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
             self.sight.watch(frame, now_s)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
-        plan = self._planner.newest()
-        if plan is not None and plan is not self._follower.plan:
+        if plan := self._planner.newest():
             self._follower.add(plan, now_s)
         command = self._follower.command(now_s)
         if command is None:

@@ -125,7 +125,6 @@ class TakeoverRecorder:
             reasons = {
                 "nothing more can be recorded": self.recorder.failure is not None,
                 "told to stop": stop.is_set(),
-                "another program has armed the car": newest and newest.state is State.AUTONOMOUS,
                 f"the sticks have been at rest for {LET_GO_S:g} s": rest_s is not None and heard_s - rest_s >= LET_GO_S,
                 f"the transmitter has had no signal for {SILENT_S:g} s": now_s - signal_s > SILENT_S,
                 f"after {MOST_S:g} s": now_s - start_s >= MOST_S,

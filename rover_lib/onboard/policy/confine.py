@@ -4,14 +4,13 @@
 
 Nobody can tell what an artifact's program does. So before a process runs it, it gives up every right that a policy does
 not need: it can no longer open a file for writing, the serial port or a socket, start a program, or touch another
-process, and its memory has a limit.
+process, and its memory has a limit. libseccomp makes the kernel's filter of system calls.
 """
 
 import ctypes
+import errno
 import os
-import platform
 import resource
-import struct
 from pathlib import Path
 
 from rover_lib.onboard.errors import ArtifactError
@@ -20,35 +19,36 @@ from rover_lib.onboard.errors import ArtifactError
 # takes 183 MB of it in INT8 (a file of 68 MB) and 334 in FP32 (261), measured on x86-64.
 MEMORY_MB, MEMORY_PER_FILE, THREAD_MB = 80, 2.5, 20
 AS_ROOT = "ROVER_AS_ROOT"  # the services unset it: roles/rover/templates/sandbox.j2
-PR_SET_NO_NEW_PRIVS = 38
-SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC = 1, 1  # TSYNC: for all threads, also those that torch has started
 
-# Numbers of system calls: (x86_64, aarch64), from linux/arch/x86/entry/syscalls/syscall_64.tbl and
-# linux/include/uapi/asm-generic/unistd.h; None: that processor has none. The frequent ones first.
-ALLOWED = {
-    "futex": (202, 98), "read": (0, 63), "write": (1, 64), "sched_yield": (24, 124), "mmap": (9, 222),
-    "munmap": (11, 215), "mprotect": (10, 226), "madvise": (28, 233), "mremap": (25, 216), "brk": (12, 214),
-    "clock_gettime": (228, 113), "clock_getres": (229, 114), "clock_nanosleep": (230, 115), "nanosleep": (35, 101),
-    "gettimeofday": (96, 169), "close": (3, 57), "fstat": (5, 80), "newfstatat": (262, 79), "statx": (332, 291),
-    "stat": (4, None), "lstat": (6, None), "access": (21, None), "faccessat": (269, 48), "faccessat2": (439, 439),
-    "readlink": (89, None), "readlinkat": (267, 78), "lseek": (8, 62), "pread64": (17, 67), "readv": (19, 65),
-    "writev": (20, 66), "getdents64": (217, 61), "getcwd": (79, 17), "rt_sigaction": (13, 134),
-    "rt_sigprocmask": (14, 135), "rt_sigreturn": (15, 139), "sigaltstack": (131, 132), "getpid": (39, 172),
-    "gettid": (186, 178), "getuid": (102, 174), "geteuid": (107, 175), "getgid": (104, 176), "getegid": (108, 177),
-    "uname": (63, 160), "sysinfo": (99, 179), "getrusage": (98, 165), "times": (100, 153),
-    "sched_getaffinity": (204, 123), "getcpu": (309, 168), "set_robust_list": (273, 99), "rseq": (334, 293),
-    "set_tid_address": (218, 96), "getrandom": (318, 278), "membarrier": (324, 283), "restart_syscall": (219, 128),
-    "exit": (60, 93), "exit_group": (231, 94),
-}  # fmt: skip
-OPEN, OPENAT, CLONE, CLONE3, PRLIMIT, SECCOMP = (2, None), (257, 56), (56, 220), (435, 435), (302, 261), (317, 277)
-# By processor: the column of its numbers above, and the kernel's number for its architecture
-PROCESSORS = {"x86_64": (0, 0xC000003E), "aarch64": (1, 0xC00000B7)}
+LIBRARY = "libseccomp.so.2"  # on each Debian and Ubuntu, whose apt needs it; what follows is of its seccomp.h
+ALLOW, REFUSE = 0x7FFF0000, 0x00050000  # actions; REFUSE | errno
+BAD_NUMBERS, ALL_THREADS, MASKED_EQUAL = 2, 4, 7  # SCMP_FLTATR_ACT_BADARCH, SCMP_FLTATR_CTL_TSYNC, SCMP_CMP_MASKED_EQ
+ALLOWED = (
+    "futex", "read", "write", "sched_yield", "mmap", "munmap", "mprotect", "madvise", "mremap", "brk",
+    "clock_gettime", "clock_getres", "clock_nanosleep", "nanosleep", "gettimeofday", "close", "fstat", "newfstatat",
+    "statx", "stat", "lstat", "access", "faccessat", "faccessat2", "readlink", "readlinkat", "lseek", "pread64",
+    "readv", "writev", "getdents64", "getcwd", "rt_sigaction", "rt_sigprocmask", "rt_sigreturn", "sigaltstack",
+    "getpid", "gettid", "getuid", "geteuid", "getgid", "getegid", "uname", "sysinfo", "getrusage", "times",
+    "sched_getaffinity", "getcpu", "set_robust_list", "rseq", "set_tid_address", "getrandom", "membarrier",
+    "restart_syscall", "exit", "exit_group",
+)  # fmt: skip
 TO_WRITE = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC  # a file opened with any of these bits is not only read
 CLONE_THREAD = 0x10000
-EPERM, ENOSYS = 1, 38
-# Instructions of the kernel's filters: load a word of (number, architecture, address, six arguments), compare, return
-LOAD, JUMP_EQUAL, JUMP_ANY_BIT, RETURN = 0x20, 0x15, 0x45, 0x06
-ALLOW, REFUSE = 0x7FFF0000, 0x00050000  # REFUSE | errno
+# Allowed by one of its arguments: which, a mask, and what it must be under the mask
+ALLOWED_IF = {
+    "open": (1, TO_WRITE, 0),
+    "openat": (2, TO_WRITE, 0),
+    "clone": (0, CLONE_THREAD, CLONE_THREAD),
+    "prlimit64": (0, 0xFFFFFFFF, 0),  # for this process itself
+}
+
+
+class _Condition(ctypes.Structure):
+    """struct scmp_arg_cmp of libseccomp."""
+
+    _fields_ = (
+        ("argument", ctypes.c_uint), ("comparison", ctypes.c_int), ("mask", ctypes.c_uint64), ("value", ctypes.c_uint64)
+    )  # fmt: skip
 
 
 def refuse_root() -> None:
@@ -65,34 +65,6 @@ def memory_mb(artifact: Path | str, threads: int) -> float:
     return MEMORY_MB + MEMORY_PER_FILE * Path(artifact).stat().st_size / 1e6 + THREAD_MB * threads
 
 
-def filter_of(processor: str) -> bytes:
-    """Return the kernel's filter for a processor of PROCESSORS: 8 bytes per instruction, see linux/filter.h."""
-    column, architecture = PROCESSORS[processor]
-    program = [_step(LOAD, 4), _step(JUMP_EQUAL, architecture, 1, 0), _step(RETURN, REFUSE | EPERM), _step(LOAD, 0)]
-
-    def when(call: tuple[int | None, ...], *steps: bytes) -> None:
-        if (number := call[column]) is not None:
-            program.extend([_step(JUMP_EQUAL, number, 0, len(steps)), *steps])
-
-    def if_argument(index: int, jump: bytes) -> list[bytes]:
-        """Allow a call by one of its arguments. jump: skips one step, the refusal, if the argument is allowed."""
-        return [_step(LOAD, 16 + 8 * index), jump, _step(RETURN, REFUSE | EPERM), _step(RETURN, ALLOW)]
-
-    for call in ALLOWED.values():
-        when(call, _step(RETURN, ALLOW))
-    for call, flags in ((OPEN, 1), (OPENAT, 2)):
-        when(call, *if_argument(flags, _step(JUMP_ANY_BIT, TO_WRITE, 0, 1)))
-    when(CLONE, *if_argument(0, _step(JUMP_ANY_BIT, CLONE_THREAD, 1, 0)))
-    when(CLONE3, _step(RETURN, REFUSE | ENOSYS))  # its flags are in memory; the C library then takes clone
-    when(PRLIMIT, *if_argument(0, _step(JUMP_EQUAL, 0, 1, 0)))  # only for this process itself
-    program.append(_step(RETURN, REFUSE | EPERM))
-    return b"".join(program)
-
-
-def _step(code: int, value: int, if_true: int = 0, if_false: int = 0) -> bytes:
-    return struct.pack("<HBBI", code, if_true, if_false, value)
-
-
 def confine(limit_mb: float) -> str:
     """Give up every right that an inference does not need: in all threads of this process, and for good.
 
@@ -101,19 +73,29 @@ def confine(limit_mb: float) -> str:
     """
     _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb))
     _lower(resource.RLIMIT_CORE, 0)
-    processor = platform.machine()
-    if processor not in PROCESSORS:
-        return f"no filter of system calls is known for {processor}"
-    program = filter_of(processor)
-    steps = ctypes.create_string_buffer(program, len(program))
-    described = struct.pack("HxxxxxxP", len(program) // 8, ctypes.addressof(steps))
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
-        return f"the kernel does not let it give up privileges ({os.strerror(ctypes.get_errno())})"
-    number = SECCOMP[PROCESSORS[processor][0]]
-    if libc.syscall(number, SECCOMP_SET_MODE_FILTER, SECCOMP_FILTER_FLAG_TSYNC, described):
-        return f"the kernel takes no filter of system calls ({os.strerror(ctypes.get_errno())})"
-    return ""
+    try:
+        library = ctypes.CDLL(LIBRARY)
+    except OSError:
+        return f"there is no {LIBRARY}, of the package libseccomp2"
+    library.seccomp_init.restype = ctypes.c_void_p
+    context = ctypes.c_void_p(library.seccomp_init(REFUSE | errno.EPERM))
+    codes = [library.seccomp_attr_set(context, BAD_NUMBERS, REFUSE | errno.EPERM)]  # of another processor
+    codes.append(library.seccomp_attr_set(context, ALL_THREADS, 1))  # also those that torch has started
+
+    def add(name: str, action: int = ALLOW, *conditions: _Condition) -> None:
+        number = library.seccomp_syscall_resolve_name(name.encode())
+        if number >= 0:  # else this processor has no such call
+            array = (_Condition * len(conditions))(*conditions)
+            codes.append(library.seccomp_rule_add_array(context, action, number, len(conditions), array))
+
+    for name in ALLOWED:
+        add(name)
+    for name, (argument, mask, value) in ALLOWED_IF.items():
+        add(name, ALLOW, _Condition(argument, MASKED_EQUAL, mask, value))
+    add("clone3", REFUSE | errno.ENOSYS)  # its flags are in memory; the C library then takes clone
+    failed = next((code for code in codes if code), 0) or library.seccomp_load(context)
+    library.seccomp_release(context)
+    return f"the kernel takes no filter of system calls ({os.strerror(-failed)})" if failed else ""
 
 
 def _bytes_with(limit_mb: float) -> int:

@@ -11,11 +11,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.artifact.engines import UNCONFINED
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import PolicyError, RoverError
 from rover_lib.onboard.policy.confine import confine, memory_mb
@@ -58,16 +56,10 @@ def load_confined(
     notify: told why, if the process is not confined.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
-    with ExitStack() as unless_all_are_loaded:
-        for artifact in artifacts.values():
-            unless_all_are_loaded.enter_context(artifact)
-        reasons = [UNCONFINED[engine] for engine in map(import_engine, artifacts.values()) if engine in UNCONFINED]
-        limit_mb = sum(memory_mb(path, threads) for path in paths.values())
-        if reason := reasons[0] if reasons else confine(limit_mb):
-            notify(reason)
-        policies = {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}
-        unless_all_are_loaded.pop_all()
-    return policies, artifacts
+    reasons = [getattr(import_engine(artifact), "UNCONFINED", "") for artifact in artifacts.values()]
+    if reason := next(filter(None, reasons), "") or confine(sum(memory_mb(path, threads) for path in paths.values())):
+        notify(reason)
+    return {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}, artifacts
 
 
 def main(module: str, name: str, arguments: str) -> None:

@@ -17,6 +17,7 @@ from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
 
+UNCONFINED = "HailoRT talks to the chip through its driver"
 TIMEOUT_MS = 1000  # for one inference: about thirty times what it should take
 
 

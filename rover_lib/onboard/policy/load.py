@@ -1,5 +1,6 @@
 """Run an artifact, with whichever engine it needs: it turns a frame and a state into a chunk of actions."""
 
+import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.artifact.archive import refused
-from rover_lib.onboard.artifact.engines import PACKAGES, Engine, module_of
+from rover_lib.onboard.artifact.engines import MODULES, PACKAGES, Engine
 from rover_lib.onboard.artifact.manifest import Artifact, car_of
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
@@ -81,18 +82,17 @@ class Policy:
         return self._engine.threads
 
 
-def import_engine(artifact: Artifact) -> str:
-    """Import the engine that an artifact needs, and return its name. Raises ArtifactError if it is not installed."""
+def import_engine(artifact: Artifact) -> Any:
+    """Import the module of the engine that an artifact needs. Raises ArtifactError if it is not installed."""
     path, name = artifact.path, artifact.manifest["engine"]
     try:
-        module_of(name)
+        return importlib.import_module(MODULES[name])
     except KeyError:
         known = f"this rover_lib knows {', '.join(PACKAGES)}"
         raise ArtifactError(f"{path}: needs the engine '{name[:80]}'", remedy=known) from None
     except ImportError as e:
         what = f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})"
         raise ArtifactError(what, remedy=f"install {PACKAGES[name]}, or use an artifact of another engine") from None
-    return name
 
 
 def load_policy(source: Path | str | Artifact, *, threads: int | None = None) -> Policy:
@@ -106,7 +106,7 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
         with Artifact(source) as artifact:
             return load_policy(artifact, threads=threads)
     source.prove()
-    engine = module_of(import_engine(source)).load(source, threads)
+    engine = import_engine(source).load(source, threads)
     path, vectors = source.path, source.parity
     policy = Policy(path, engine, source.manifest)
     chunks = _predict(policy, vectors)

@@ -52,7 +52,6 @@ LARGEST = 1e15  # no time, pulse or id is larger; differences of such numbers st
 ARDUINO_WRAP_MS = 1 << 32  # its clock starts at 0 again after 49.7 days
 BURST_SHARE = 0.3  # two controls that arrive within this share of the usual interval had waited in a buffer
 BURST_MIN = 3  # fewer than this in a row are the USB line's jitter, shorter than a frame, and left as they are
-SIMULATED = "playground"  # the port of the balloon world's Arduino
 
 
 @dataclass(frozen=True)
@@ -165,7 +164,6 @@ class EpisodeWriter:
         Pulses and periods of 0 mean "not measured"; with flags, None does too. The normalised values have 4 decimals.
         Without flags they are 0 where no pulse was measured, as the firmware has it.
         """
-        self._must_be_open()
         self._check_time(t_system_s)
         row: dict[str, Any] = dict.fromkeys(CONTROL_FIELDS)
         row["arduino_timestamp"], row["system_timestamp"] = arduino_ms, float(t_system_s)
@@ -188,7 +186,8 @@ class EpisodeWriter:
 
     def frame(self, t_s: float, frame_bgr: np.ndarray) -> None:
         """Add one picture, (height, width, 3) uint8 BGR of the episode's resolution, at system time `t_s`."""
-        part = self._must_be_open()
+        part = self._part
+        assert part, "not open"
         self._check_time(t_s)
         if self.resolution is None and isinstance(frame_bgr, np.ndarray) and frame_bgr.ndim == 3:
             self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
@@ -213,7 +212,8 @@ class EpisodeWriter:
 
     def finish(self) -> Path:
         """Make the folder appear and return it. If that fails, the hidden folder stays, and EpisodeError says why."""
-        part = self._must_be_open()
+        part = self._part
+        assert part, "not open"
         try:
             with self._disk():
                 if (part / "control.rows").is_file() or not (part / DATA).is_file():  # else only the rename is missing
@@ -297,12 +297,6 @@ class EpisodeWriter:
         except OSError as e:
             remedy = f"make room; `rover record {self.folder.parent} --finish` keeps what was recorded"
             raise EpisodeError(f"{self.folder}: cannot be written ({e.strerror or e})", remedy=remedy) from e
-
-    def _must_be_open(self) -> Path:
-        """Return the hidden folder. Raises EpisodeError if there is none."""
-        if self._part is None:
-            raise EpisodeError(f"{self.folder.name}: not open", remedy="use it as `with EpisodeWriter(...) as writer:`")
-        return self._part
 
     def _check_time(self, t_s: float) -> None:
         if not is_number(t_s):
@@ -479,13 +473,8 @@ def read_car_of(folder: Path | str) -> Car:
 
 def car_in(metadata: Any, folder: Path | str) -> Car:
     """Return the car that an episode's metadata describe, or the default. Raises CarError for no car."""
-    if not isinstance(metadata, dict):
-        return Car()
-    described, said = metadata.get("car"), metadata.get("steering_positive")
-    before = metadata.get("arduino_port") == SIMULATED and said is None
-    car = Car() if described is None else Car.of(described, f"{folder}: its car")
-    # In the balloon world the default car turned left until recordings said which side is positive.
-    return replace(car, positive="left") if before and car.drives_like(Car()) else car
+    described = metadata.get("car") if isinstance(metadata, dict) else None
+    return Car() if described is None else Car.of(described, f"{folder}: its car")
 
 
 def _data_of(path: Path) -> bytes:

@@ -6,7 +6,6 @@ It assumes a speed proportional to the throttle, and a level camera that looks s
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from rover_lib.onboard.car.car import WIDTH_PX, Car, this_car
 from rover_lib.onboard.checked import is_number
@@ -88,12 +87,3 @@ class CarShape:
     def _seen(self, ahead: float, left: float, aspect: float) -> tuple[float, float]:
         x = 0.5 - self.focal * left / ahead
         return round(x, 4), round(self.horizon + self.focal * aspect * self.camera_height_m / ahead, 4)
-
-
-def from_now(plan: dict[str, Any], now_s: float, seconds: float = 1.0) -> list[list[float]]:
-    """A plan's actions from now on, for at most `seconds`.
-
-    plan: has actions, rate_hz and captured_s, as in a message of feed.py.
-    """
-    first = max(0, round((now_s - plan["captured_s"]) * plan["rate_hz"]))
-    return plan["actions"][first : first + round(seconds * plan["rate_hz"])]

@@ -37,7 +37,7 @@ from rover_lib.onboard.car.host import is_listened_at, throttled_means
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_plain
-from rover_lib.onboard.view.path_overlay import CarShape, from_now
+from rover_lib.onboard.view.path_overlay import CarShape
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
@@ -165,11 +165,11 @@ class View:
         pins = head.get("pins")
         pins = pins if pins and None not in pins else None
         plan = head.pop("plan", None)
-        ribbon: list[tuple[float, ...]] = []
+        ribbon: list[tuple[float, float, float, float]] = []
         if plan and "size" in head:
-            width, height = head["size"]
-            actions = from_now(plan, head["sent_s"])
-            ribbon = [tuple(p) for p in self._shape.ribbon(actions, 1 / plan["rate_hz"], width / height)]
+            (width, height), rate_hz = head["size"], plan["rate_hz"]
+            now = max(0, round((head["sent_s"] - plan["captured_s"]) * rate_hz))
+            ribbon = self._shape.ribbon(plan["actions"][now : now + round(rate_hz)], 1 / rate_hz, width / height)
         means = throttled_means((head.get("machine") or {}).get("throttled"))
         channels = self._pwm.steering, self._pwm.throttle
         head |= {"n": self._number, "ribbon": ribbon, "left": self._shape.left, "pins": pins}

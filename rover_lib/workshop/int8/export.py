@@ -5,7 +5,6 @@ export(quantized, checkpoint, "policy_static.pt", samples, calibration)  # or .o
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +20,8 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.wheel_version import release
+from rover_lib.onboard.params import params
+from rover_lib.onboard.wheel_version import VERSION
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.observe import Calibration
@@ -97,35 +97,22 @@ class Onnx:
 Form = TorchScript | Onnx
 
 
-@dataclass(frozen=True)
-class Parity:
-    """How far an artifact's answers may differ when it is loaded elsewhere, and how many questions it is asked.
-
-    tolerance: of FP32, in action units; relative to the largest planned action if that is above 1. int8_errors: INT8
-    may differ by this many times its own largest error against FP32, if that is more. vectors: stored samples.
-    """
-
-    tolerance: float = 1e-4
-    int8_errors: float = 2.0
-    vectors: int = 3
-
-
 class Exporter:
     """Writes artifacts of one checkpoint.
 
-    samples: recorded observations; `parity.vectors` of them become the parity vectors, INT8's largest error is taken
-    over all. Raises ArtifactError without samples, and for samples of several cars.
+    samples: recorded observations; some of them, as the section `parity` of params.yml says, become the parity vectors,
+    INT8's largest error is taken over all. Raises ArtifactError without samples, and for samples of several cars.
     """
 
-    def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample], parity: Parity | None = None):
+    def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample]):
         if not samples:
             raise ArtifactError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
-        self.checkpoint, self.parity = checkpoint, parity or Parity()
+        self.checkpoint, self.parity = checkpoint, params()["parity"]
         self.car = car_of(samples)
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
-        self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity.vectors).round().astype(int))
+        self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity["vectors"]).round().astype(int))
         for i in self.stored:
             state, *frames = self.inputs[i]
             self.inputs[i] = (state, *map(_in_blocks, frames))
@@ -200,7 +187,7 @@ class Exporter:
             "normalisation": "inside the graph: uint8 RGB frames and raw states in, raw actions out",
             "checkpoint": {"sha256": self.checkpoint.sha256, "format": self.checkpoint.format},
             "calibration": calibrated,
-            "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": release(), **form.versions},
+            "versions": {"torch": torch.__version__.split("+")[0], "rover_lib": VERSION, **form.versions},
             **({"car": self.car.description()} if names_car else {}),
             "weights_mb": _weights_mb(policy.module if isinstance(policy, QuantizedPolicy) else policy),
             "gmac": self.gmac,
@@ -210,10 +197,10 @@ class Exporter:
         """Return by action how far another computation may be off `actions`, (n, C, A), of the samples `rows`."""
         # Float rounds in proportion: an arm's degrees are a hundred times a car's shares.
         sizes = actions.abs().amax((0, 1)).clamp(min=1).tolist()
-        allowed = [self.parity.tolerance * size for size in sizes]
+        allowed = [self.parity["fp32"] * size for size in sizes]
         if isinstance(policy, QuantizedPolicy):
             errors = (actions - self.float_actions[rows]).abs().amax((0, 1)).tolist()
-            allowed = [max(a, self.parity.int8_errors * e) for a, e in zip(allowed, errors, strict=True)]
+            allowed = [max(a, self.parity["int8_errors"] * e) for a, e in zip(allowed, errors, strict=True)]
         return dict(zip(self.checkpoint.config.action_names, allowed, strict=True))
 
 
@@ -223,10 +210,9 @@ def export(
     path: Path | str,
     samples: Sequence[Sample],
     calibration: Calibration | None = None,
-    parity: Parity | None = None,
 ) -> str:
     """Write one artifact as `Exporter.export` does."""
-    return Exporter(checkpoint, samples, parity).export(policy, path, calibration)
+    return Exporter(checkpoint, samples).export(policy, path, calibration)
 
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:

@@ -46,7 +46,6 @@ class QuantizedPolicy:
     """An INT8 policy in eager form; `module` is called like ACT. `report` goes into quantize.json."""
 
     scheme: Scheme
-    config: ActConfig
     module: nn.Module = field(repr=False)
     report: dict[str, Any] = field(repr=False)
 
@@ -74,7 +73,7 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
         "warnings": [f"{', '.join(dead[:3])}: output never changed in calibration; is it dead?"] if dead else [],
         "seconds": time.monotonic() - start,
     }
-    return QuantizedPolicy(scheme, config, module, report)
+    return QuantizedPolicy(scheme, module, report)
 
 
 def int8_layers(module: nn.Module) -> dict[str, Int8Layer]:

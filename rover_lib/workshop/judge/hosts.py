@@ -23,14 +23,18 @@ CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # its pr
 class Benchmarks:
     """by_host: contents of benchmark-<host>.json by host, this machine first. unusable: a sentence for each bad file.
 
-    Artifacts are named by their mode, one that is not byte for byte the run's "static, another".
+    modes: {sha256: mode} of the run's artifacts.
     """
 
     by_host: dict[str, dict[str, Any]]
     unusable: list[str]
+    modes: dict[str, str]
 
     def table(self) -> Table:
-        """A row for each host and artifact, with notes below. A dash means that the host has no such sensor."""
+        """A row for each host and artifact, with notes below. A dash means that the host has no such sensor.
+
+        A rover's artifacts are named by their mode, one that is not byte for byte the run's "static, another".
+        """
         header = ("host", "artifact", "p50 ms", "p95 ms", "p99 ms", "n", "C, most", "MHz, least", "throttled")
         rows = []
         for host, b in self.by_host.items():
@@ -40,6 +44,8 @@ class Benchmarks:
             state = (*sensed, m.get("throttled") or "-")
             for name, v in m["artifacts"].items():
                 times = [f"{v[f'latency_{p}_ms']:.1f}" for p in ("p50", "p95", "p99")]
+                if b is not self.by_host.get(THIS):  # on a rover the file in use is always called policy.pt
+                    name = self.modes.get(b["inputs"].get(f"{name}.pt"), f"{v['mode'] or name}, another")
                 rows.append((host, name, *times, str(v["n"]), *state))
                 host, state = "", ("", "", "")  # shown only once for each host
         notes = [f"left out: {sentence}" for sentence in self.unusable]
@@ -68,9 +74,9 @@ def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
                 continue
             here = folder == Path(run_dir) and content["env"]["host"] == socket.gethostname()
             by_host[THIS if here else path.stem.removeprefix("benchmark-")] = content
-    ours = {sha: _mode(file) for file, sha in by_host.get(THIS, {"inputs": {}})["inputs"].items()}
-    by_host = {host: content if host == THIS else _name_by_mode(content, ours) for host, content in by_host.items()}
-    return Benchmarks({h: by_host[h] for h in sorted(by_host, key=lambda h: (h != THIS, h))}, unusable)
+    ours = by_host.get(THIS, {"inputs": {}})["inputs"]
+    modes = {sha256: Path(file).stem.removeprefix("policy_") for file, sha256 in ours.items()}
+    return Benchmarks({h: by_host[h] for h in sorted(by_host, key=lambda h: (h != THIS, h))}, unusable, modes)
 
 
 def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> Path | None:
@@ -87,21 +93,3 @@ def is_of(inputs: Mapping[str, str], made: Mapping[str, Mapping[str, Any]]) -> b
     ours = {f"policy_{mode}.pt": each["content_hash"] for mode, each in made.items()}
     named = {file: digest for file, digest in inputs.items() if file in ours}
     return bool(named) and all(ours[file] == digest for file, digest in named.items())
-
-
-def _mode(name: str) -> str:
-    return Path(name).stem.removeprefix("policy_")
-
-
-def _name_by_mode(content: Mapping[str, Any], ours: Mapping[str, str]) -> dict[str, Any]:
-    """Return a benchmark with its artifacts named by mode. On a rover the file in use is always called policy.pt.
-
-    ours: {sha256: mode} of the run's artifacts.
-    """
-    metrics = content["metrics"]
-    names: dict[str, str] = {}
-    for name, v in metrics["artifacts"].items():
-        mode = ours.get(content["inputs"].get(f"{name}.pt"), f"{v.get('mode') or _mode(name)}, another")
-        names[name] = name if mode in names.values() else mode
-    artifacts = {names[name]: v for name, v in metrics["artifacts"].items()}
-    return {**content, "metrics": {**metrics, "artifacts": artifacts, "main": names[metrics["main"]]}}

@@ -8,17 +8,9 @@ Each subject has a module; `style` has what all figures share.
 # ruff: noqa: F401, these are the names that notebooks use
 
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.benchmarks import latency
-from rover_lib.workshop.plots.comparison import action_error, hits, worst_frames
+from rover_lib.workshop.plots.comparison import action_error, worst_frames
 from rover_lib.workshop.plots.counting import whole_size
 from rover_lib.workshop.plots.quantization import sensitivity
-from rover_lib.workshop.plots.recordings import (
-    checkpoint_size,
-    episode_overview,
-    faults,
-    frame,
-    odd_frames,
-    work_per_block,
-)
+from rover_lib.workshop.plots.recordings import episode_overview, odd_frames
 from rover_lib.workshop.plots.style import save
 from rover_lib.workshop.plots.tables import gates

@@ -1,14 +1,11 @@
-"""Notebook 04: INT8 beside FP32, in error and hits."""
-
-from collections.abc import Mapping
-from typing import Any
+"""Notebook 04: INT8 beside FP32."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.plots import style
-from rover_lib.workshop.plots.style import COLOURS, GREY, MOST_ACTIONS, Note, legend_below, line_of, new_figure
+from rover_lib.workshop.plots.style import GREY, MOST_ACTIONS, Note, legend_below, line_of, new_figure
 
 AHEAD = "step of the plan (s ahead)"
 
@@ -23,7 +20,9 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
         ax.set_title(action)
         if (pct := report.pct(action)) is None:
-            style.note(ax, "never changes in these\nrecordings: not judged")
+            text = "never changes in these\nrecordings: not judged"
+            ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
+            ax.set_axis_off()
             continue
         for mode in report.chunks:
             ax.plot(times_s, report.in_pct(report.errors(mode)[..., i].mean(0), action), **line_of(mode))
@@ -36,14 +35,12 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     return fig
 
 
-def worst_frames(
-    report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0, *, first: int = 0
-) -> Figure | Note:
+def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure | Note:
     """Draw the frames on which a mode differs most from FP32: the picture, both plans, and what was recorded.
 
-    Of many actions, only the worst of each frame is drawn. first: how many of the worst frames to skip.
+    Of many actions, only the worst of each frame is drawn.
     """
-    frames = report.worst(mode, first + count)[first:]
+    frames = report.worst(mode, count)
     if not frames:
         return Note("no action changes in these recordings: no frame is the worst")
     every = report.action_names if len(report.action_names) <= MOST_ACTIONS else ()
@@ -66,23 +63,4 @@ def worst_frames(
     for ax in axes[-1, 1:]:
         ax.set_xlabel(AHEAD)
     legend_below(fig, axes[0, 1], 3)
-    return fig
-
-
-def hits(metrics: Mapping[str, Any]) -> Figure:
-    """Draw the balloons hit in unseen worlds, with Wilson's 95 % interval, which shows how little so few drives say.
-
-    metrics: those of compare.json.
-    """
-    rows = {m: v for m, v in ({"fp32": metrics["fp32"]} | dict(metrics["modes"])).items() if v["trials"]}
-    fig, ax = style.bars_figure(max(len(rows), 1), 1.5)
-    for y, (mode, v) in enumerate(rows.items()):
-        colour = COLOURS.get(mode, GREY)
-        ax.plot([100 * v["hits_wilson_low"], 100 * v["hits_wilson_high"]], [y, y], color=colour, lw=3, alpha=0.5)
-        ax.plot(100 * v["hits"] / v["trials"], y, "o", color=colour, ms=8)
-        style.annotate_row(ax, y, f"{v['hits']} of {v['trials']}")
-    lows = [100 * v["hits_wilson_low"] for v in rows.values()]
-    ax.set(xlim=(max(0, min(lows, default=0) - 5), 101), ylim=(-0.5, len(rows) - 0.5))
-    style.name_rows(ax, rows)
-    ax.set_xlabel("worlds in which the balloon was hit (%), with the 95 % interval")
     return fig

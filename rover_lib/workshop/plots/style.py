@@ -1,6 +1,6 @@
 """What all figures share: axes, legends, colours, names of artifacts.
 
-A colour has the same meaning in every figure: a mode, an action, a part of the policy, or an alarm. Everything else is
+A colour has the same meaning in every figure: a mode, an action, or an alarm. Everything else is
 slate or grey, and differs by marker or line; categories that only one figure has take their colours from OTHERS. The
 colours are Okabe and Ito's and Paul Tol's, which colour-blind people can tell apart.
 
@@ -20,8 +20,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.judge.recorded_range import worst
-
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 BLACK = "#333333"
 ORANGE = "#E69F00"
@@ -39,15 +37,12 @@ COLOURS = {
     "static": BLUE,
     "mixed": GREEN,
     "static_affine": SKY,
-    "lerobot": "#777777",
     "steering": "#332288",
     "throttle": "#CC79A7",
 }
-PARTS = {"backbone": "#999933", "encoder": "#DDCC77", "decoder": "#882255"}  # of the policy; all others are grey
 NAMES = {
     "fp32": "FP32",
     "static_affine": "static, affine",
-    "lerobot": "LeRobot, eager FP32",
     "torch_affine": "torch, affine",
     "onnxruntime": "ONNX Runtime INT8",
     "fp32.onnx": "FP32, for ONNX Runtime",
@@ -90,12 +85,6 @@ def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: A
     return fig, axes
 
 
-def bars_figure(rows: int, height_in: float) -> tuple[Figure, Axes]:
-    """Make a figure of one row of axes, with room for this number of horizontal bars. height_in: of the rest."""
-    fig, axes = new_figure(1, height_in=height_in + 0.36 * rows)
-    return fig, axes[0, 0]
-
-
 def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any]]:
     """Make a figure with axes for each of `count` things, in rows of `columns`."""
     columns = min(columns, count)
@@ -106,18 +95,13 @@ def figure_of(count: int, columns: int, row_in: float) -> tuple[Figure, list[Any
     return fig, list(axes.flat[:count])
 
 
-def picture_of(sample: Any) -> np.ndarray:
-    """Return what a sample saw, (h, w, 3) uint8 RGB, the pictures of several cameras side by side."""
+def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
+    """Draw what a sample saw, the pictures of several cameras side by side, without axes."""
     seen = sample.frame_bgr()
     frames = list(seen.values()) if isinstance(seen, Mapping) else [seen]
     height = max(len(frame) for frame in frames)
     same = [cv2.resize(f, (round(f.shape[1] * height / len(f)), height)) if len(f) != height else f for f in frames]
-    return np.concatenate(same, axis=1)[..., ::-1]
-
-
-def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
-    """Draw what a sample saw, without axes."""
-    ax.imshow(picture_of(sample))
+    ax.imshow(np.concatenate(same, axis=1)[..., ::-1])
     ax.set_title(title, fontsize=9)
     ax.axis("off")
 
@@ -125,13 +109,6 @@ def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
 def line_of(mode: str) -> dict[str, Any]:
     """Return the colour and the label of a mode's line."""
     return {"color": COLOURS.get(mode, GREY), "label": NAMES.get(mode, mode), "lw": 1.8}
-
-
-def name_rows(ax: Axes, names: Iterable[str]) -> None:
-    """Name the rows of horizontal bars, the first one on top. Modes get their names of NAMES."""
-    shown = [NAMES.get(name, name) for name in names]
-    ax.set_yticks(range(len(shown)), shown)
-    ax.invert_yaxis()
 
 
 def legend(ax: Axes, **options: Any) -> None:
@@ -151,17 +128,6 @@ def bar_values(ax: Axes, y: Iterable[float], x: Iterable[Any], form: str) -> Non
     ax.margins(x=0.16)
 
 
-def annotate_row(ax: Axes, y: float, text: str) -> None:
-    """Write a text to the right of the axes, at the height of a row."""
-    ax.annotate(text, (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=9)
-
-
-def note(ax: Axes, text: str) -> None:
-    """Write a sentence into axes in which there is nothing to draw."""
-    ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
-    ax.set_axis_off()
-
-
 def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
     """Return the keys <action>_mae_pct of the judged actions. The others are named in the legend of `ax`."""
     keys = [k for k in errors if k.endswith("_mae_pct")]
@@ -169,26 +135,6 @@ def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
         if errors[key] is None:
             ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
     return [k for k in keys if errors[k] is not None]
-
-
-def few_actions(table: Mapping[str, Mapping[str, float | None]]) -> tuple[dict[str, dict[str, float | None]], str]:
-    """Return a table of <action>_mae_pct, of many actions only the worst of each row, and what it has, in words."""
-    keys = [k for k in next(iter(table.values())) if k.endswith("_mae_pct")]
-    if len(keys) <= MOST_ACTIONS:
-        return {name: {k: row[k] for k in keys} for name, row in table.items()}, "mean error"
-    worst_of = {name: {"worst action_mae_pct": worst(row[k] for k in keys)} for name, row in table.items()}
-    return worst_of, f"mean error of the worst of {len(keys)} actions"
-
-
-def draw_errors(ax: Axes, table: Mapping[str, Mapping[str, Any]], keys: list[str], *, values: bool = False) -> None:
-    """Draw a bar for each action of each row of a table. keys: of the actions. values: write the numbers too."""
-    height = 0.8 / max(len(keys), 1)
-    for i, key in enumerate(keys):
-        y, x = np.arange(len(table)) + (i - (len(keys) - 1) / 2) * height, [row[key] for row in table.values()]
-        ax.barh(y, x, height, color=action_colour(key, i), label=key.removesuffix("_mae_pct"))
-        if values:
-            bar_values(ax, y, x, "{:.2f}")
-    name_rows(ax, table)
 
 
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
@@ -205,14 +151,3 @@ def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:
 def action_colour(key: str, index: int) -> str:
     """Return the colour of an action, or of a key such as steering_mae_pct. index: chooses one for other actions."""
     return COLOURS.get(key.split("_")[0], OTHERS[index % len(OTHERS)])
-
-
-def label_parts(ax: Axes, colours: Mapping[str, str]) -> None:
-    """Give the legend of a bar chart an entry for each of these."""
-    for name, colour in colours.items():
-        ax.barh(0, 0, color=colour, label=name)
-
-
-def part_colours(blocks: Iterable[str]) -> list[str]:
-    """Return the colours of blocks such as "encoder.0.attention"."""
-    return [PARTS.get(block.split(".")[0], GREY) for block in blocks]

@@ -99,6 +99,9 @@ def load_recordings(
     if source.action_names not in ((), ACTION_NAMES):
         what, found = f"{root}: our recordings name their actions", f"--action-names {','.join(source.action_names)}"
         raise EpisodeError(what, found=found, remedy="leave it out")
+    if source.cameras:
+        what, found = f"{root}: our recordings have one camera", f"--camera {','.join(source.cameras)}"
+        raise EpisodeError(what, found=found, remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
         if any((root / name).exists() for name in EPISODE_FILES):

@@ -40,8 +40,6 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"run": _run(path)}
     if kind == "flight log":
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
-    if kind == "calibration":
-        return {"calibration": _calibration(path)}
     if kind == "stage":
         return {"report": _report(path)}
     if kind == "tub":
@@ -63,14 +61,6 @@ def _run(folder: Path) -> dict[str, Any]:
     stages = [stage for stage in STAGES if (folder / f"{stage}.json").is_file()]
     stages += sorted(p.stem for p in folder.glob("benchmark-*.json"))
     return {"verdict": verdict_of(folder), "stages": stages, "artifacts": artifacts}
-
-
-def _calibration(path: Path) -> dict[str, Any]:
-    from rover_lib.workshop.int8.observe import Calibration
-
-    found = Calibration.load(path)
-    described = {"samples": found.samples, "smooth": found.smooth, "tensors": len(found.frames)}
-    return described | {"checkpoint_sha256": found.checkpoint}
 
 
 def _report(path: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@
     chosen, note = recipe.choose(loaded.parts.calibration)
     calibration = calibrate(loaded.checkpoint, chosen, smooth=recipe.scheme.smooth)
     policy = quantize(loaded.checkpoint, recipe.scheme, calibration)
-    export_policies("runs/mine", loaded.checkpoint, {"static": policy}, calibration, samples, recipe.parity)
+    export_policies("runs/mine", loaded.checkpoint, {"static": policy}, calibration, samples)
 
 The steps are in `observe`, `quantize`, `choose` and `export`; here, which frames, which options, which files.
 """
@@ -22,7 +22,7 @@ from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.choose import Chooser
-from rover_lib.workshop.int8.export import Exporter, Parity, export
+from rover_lib.workshop.int8.export import Exporter, export
 from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
@@ -46,18 +46,16 @@ class Recipe:
     samples: int  # at most this many frames calibrate
     seed: int  # of their choice
     scheme: Scheme  # static INT8, before its observer is chosen
-    parity: Parity  # what an artifact must answer where it is loaded
     observers: tuple[str, ...]  # to choose from
 
     @classmethod
     def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
         """The recipe of params.yml. p: its content. samples: how many calibrate, None for what it says."""
-        said, parity = p["quantization"], p["parity"]
+        said = p["quantization"]
         return cls(
             samples=samples or p["calibration"]["samples"],
             seed=p["calibration"]["seed"],
             scheme=Scheme(kind=said["scheme"], smooth=said["smooth"], percentile=said["percentile"]),
-            parity=Parity(parity["fp32"], parity["int8_errors"], parity["vectors"]),
             observers=tuple(said["observers"]),
         )
 
@@ -114,7 +112,7 @@ def make_artifact(
     if odd_share(calibration.frames):
         scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, recipe.observers, progress)
     policy = quantize(checkpoint, scheme, calibration)
-    digest = export(policy, checkpoint, path, samples, calibration, recipe.parity)
+    digest = export(policy, checkpoint, path, samples, calibration)
     return digest, ([note] if note else []) + policy.report["warnings"]
 
 
@@ -124,13 +122,12 @@ def export_policies(
     policies: Mapping[str, ACT | QuantizedPolicy],
     calibration: Calibration,
     samples: Sequence[Sample],
-    parity: Parity,
 ) -> dict[str, dict[str, Any]]:
     """Write policy_<name>.pt of each policy into `folder`, without other modes' of before; what quantize.json says."""
     described = {}
     for mode in set(ARTIFACTS) - policies.keys():
         (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
-    exporter = Exporter(checkpoint, samples, parity)
+    exporter = Exporter(checkpoint, samples)
     for name, policy in policies.items():
         forget_graphs()
         path = Path(folder) / f"policy_{name}.pt"
@@ -142,49 +139,40 @@ def export_policies(
     return described
 
 
-def requantize(run_dir: Path | str, checkpoint: Checkpoint) -> QuantizedPolicy:
-    """The policy of a run's policy_static.pt, made again. Raises ArtifactError unless all are of one quantize.json."""
+def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
+    """policy_fp32 and policy_static of a run once more, for ONNX Runtime: {file's name: content hash}.
+
+    Static INT8 is made again from the run's calibration. Raises ArtifactError, before anything is written, if
+    policy_static.pt and calibration.pt are not those of quantize.json, and as `export` does; RoverError if the run's
+    checkpoint or recordings have changed.
+    """
     run_dir = Path(run_dir)
+    again = open_run(run_dir, progress)
+    checkpoint, parts = again.checkpoint, again.parts
+    exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES))
     stage = read_stage(run_dir / "quantize.json", "quantize")
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
     if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
         what = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
         raise ArtifactError(what, remedy="quantize again")
-    return quantize(checkpoint, Scheme.of(made["scheme"]), Calibration.load(calibrated))
-
-
-def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, str]:
-    """policy_fp32 and policy_static of a run once more, for ONNX Runtime: {file's name: content hash}.
-
-    Raises ArtifactError as `requantize` and `export` do, RoverError if the run's checkpoint or recordings have changed.
-    """
-    run_dir = Path(run_dir)
-    again = open_run(run_dir, progress)
-    checkpoint, parts = again.checkpoint, again.parts
-    samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
-    exporter = Exporter(checkpoint, samples, Recipe.of(params()).parity)
-    static = requantize(run_dir, checkpoint)  # before anything is written: it refuses a run whose files do not fit
-    made = {
-        "fp32": (ACT(checkpoint.config, checkpoint.weights), None),
-        "static": (static, Calibration.load(run_dir / "calibration.pt")),
+    calibration = Calibration.load(calibrated)
+    policies: dict[str, ACT | QuantizedPolicy] = {
+        "fp32": ACT(checkpoint.config, checkpoint.weights),
+        "static": quantize(checkpoint, Scheme.of(made["scheme"]), calibration),
     }
-    hashes = {}
-    for name, (policy, calibration) in progress(made.items(), desc="for ONNX Runtime", total=len(made)):
+    written = {}
+    for name, policy in progress(policies.items(), desc="for ONNX Runtime", total=len(policies)):
         path = run_dir / f"policy_{name}{ONNX_SUFFIX}"
-        hashes[path.name] = exporter.export(policy, path, calibration)
+        written[path.name] = exporter.export(policy, path, calibration if name == "static" else None)
         forget_graphs()
-    return hashes
+    return written
 
 
 def write_load(
-    run_dir: Path | str,
-    loaded: Opened,
-    note: str = "",
-    fit: Mapping[str, Any] | None = None,
-    sides: Sides | None = None,
+    run_dir: Path | str, loaded: Opened, fit: Mapping[str, Any] | None = None, sides: Sides | None = None
 ) -> None:
-    """load.json: where a run starts from. note: what is special about its policy. fit: `plausible.Fit.summary`."""
+    """load.json: where a run starts from. fit: `plausible.Fit.summary`."""
     checkpoint, recordings = loaded.checkpoint, loaded.recordings
     model = ACT(checkpoint.config, checkpoint.weights)
     work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
@@ -193,8 +181,6 @@ def write_load(
         "recordings": recordings.summary(),
         "split": loaded.parts.episodes,
     }
-    if note:
-        metrics["note"] = note
     if fit:
         metrics["fit"] = fit
     if sides and sides.turnings:

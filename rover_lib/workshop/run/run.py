@@ -91,7 +91,6 @@ def run(
     *,
     runs_dir: Path | str = "runs",
     progress: Progress = silent,
-    notebooks: Path | str = NOTEBOOKS,
     **overrides: Any,
 ) -> Path:
     """Execute the five notebooks in order, and return the run's folder.
@@ -107,7 +106,7 @@ def run(
     """
     refuse_root()
     folder = run_folder(runs_dir, name, RoverError)
-    sources = [Path(notebooks) / f"{n}.ipynb" for n in NAMES]
+    sources = [NOTEBOOKS / f"{n}.ipynb" for n in NAMES]
     _refuse_unknown(sources, overrides)
     given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
     texts = [s.read_text() for s in sources]
@@ -145,12 +144,12 @@ def find_notebook(asked: str) -> str:
     return found[0]
 
 
-def execute(name: str, run_dir: Path | str, *, notebooks: Path | str = NOTEBOOKS, **overrides: Any) -> Path:
+def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
     Raises RoverError for an unknown parameter, or with the cell and its error; an earlier executed one then stays.
     """
-    folder, source = Path(run_dir).resolve(), Path(notebooks) / f"{name}.ipynb"
+    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{name}.ipynb"
     if not folder.is_dir():
         raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
     _refuse_unknown([source], overrides)

@@ -36,8 +36,6 @@ FIGURES = {  # of the run's folder, with what each shows
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
     "02_odd_frames": "Frames that the policy answers far more strongly than the others",
     "03_sensitivity": "How much of the error each block causes",
-    "04_hits": "Balloons hit, by mode",
-    "05_latency": "How long a plan takes, by mode",
 }
 
 

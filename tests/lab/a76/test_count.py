@@ -2,6 +2,7 @@
 
 import os
 import struct
+import subprocess
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, emulate, prepare
 from lab.a76.count import STEADY, Counted, count_artifact
 from lab.a76.count_run import count_run
-from lab.a76.symbols import by_kernel
+from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.care import pi5
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
@@ -119,6 +120,19 @@ def test_lines_are_counted_by_the_cache_that_lacks_them(plugin_only, tmp_path, a
     path = program(tmp_path / "walks", [*code, *mov(8, 93), *mov(0, 0), SVC])
     done = emulate(plugin_only, [path], tmp_path, watch=f"memory={SECTION}")
     assert done.lines(SECTION) == (near, far)
+
+
+def test_functions_are_named_by_address(tmp_path):
+    source, library = tmp_path / "two.c", tmp_path / "two.so"
+    source.write_text("int first(int a) { return a * 3; }\nint second(int a) { return first(a) - 1; }\n")
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, source], check=True)
+    at = {name: address for address, _, name in Functions(library)._symbols}
+    names = GuestFunctions(
+        f"5000000000-5000010000 r-xp 0 08:01 1234    {library}\n5000010000-5000011000 rw-p 0 0:0 0\n"
+    )
+    assert names[0x5000000000 + at["first"]] == names[0x5000000000 + at["second"] - 1] == "first"
+    assert names[0x5000000000 + at["second"] + 4] == "second"
+    assert names[0x5000010010] == names[0x10] == "[unknown]"
 
 
 def test_kernels_are_summed_and_the_rest_is_other():

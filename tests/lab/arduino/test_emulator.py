@@ -1,6 +1,7 @@
 """Arduinos without a board: what goes for the stand-in too, and what only the real firmware does."""
 
 import time
+from dataclasses import astuple
 
 import needs
 import pytest
@@ -23,7 +24,7 @@ def arm(link):
 
 
 def drive(link, seconds, steering=0.1, throttle=0.1):
-    needs.keep_sending(lambda: link.send_action(steering, throttle), seconds)
+    needs.keep_sending(lambda: link.send(*astuple(PwmCalibration().pulses(steering, throttle))), seconds)
 
 
 @pytest.mark.parametrize("kind", BOARDS)
@@ -42,7 +43,7 @@ def test_a_link_arms_drives_and_stops(kind):
             assert link.latest().why == "stopped: no valid command for 150 ms"
             assert time.monotonic() - stopped > 0.1
             time.sleep(0.05)
-            link.send_action(0.1, 0.1)  # latched
+            link.send(sent.steering_us, sent.throttle_us)  # latched
             time.sleep(0.1)
             assert (link.latest().state, link.latest().result) == (State.STOPPED, "i")
             assert (link.latest().steering_us, link.latest().throttle_us) == (1456, 120)

@@ -63,7 +63,7 @@ def test_what_proves_safety_exists():
 @pytest.mark.emulated
 @needs.simavr
 def test_some_faults_in_the_command(tmp_path):
-    """Two on the pins, of which one's line only the next start writes; `python -m lab faults` has all."""
+    """Two on the pins; `python -m lab faults` has all."""
     assert CliRunner().invoke(main, ["faults", "--only", "camera melted"]).exit_code == 1
     names = ["camera frozen", "Arduino loop hung", "SIGKILL"]
     done = CliRunner().invoke(main, ["faults", str(tmp_path / "f.json"), *(f"--only={name}" for name in names)])

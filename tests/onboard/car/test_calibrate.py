@@ -128,4 +128,4 @@ def test_the_command_writes_what_it_measured_and_replaces_nothing_without_force(
         result, _ = run(desk := Desk(CRAWLER), *options)
         assert result.exit_code == 1 and word in result.output and not desk.asked
     assert read_car(path) == Car()
-    assert run(Desk(CRAWLER), "--force")[0].exit_code == 0 and not read_car(path).is_default
+    assert run(Desk(CRAWLER), "--force")[0].exit_code == 0 and read_car(path) != Car()

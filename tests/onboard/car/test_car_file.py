@@ -40,14 +40,15 @@ def no_file(monkeypatch, tmp_path):
 
 def test_without_a_file_it_is_the_recordings_car(no_file):
     car = this_car()
-    assert car.pwm == PwmCalibration() and car.is_default
+    assert car.pwm == PwmCalibration() and car.numbers == module.DEFAULT_NUMBERS
     assert (car.focal_px, car.wheelbase_m, car.cap, car.reverses) == (400, 0.26, pytest.approx(0.2, abs=1e-3), False)
     np.testing.assert_array_equal(car.limits, [[-1, 0], [1, 1]])
 
 
 def test_the_default_written_down_is_the_same_to_the_bit_and_a_named_file_counts_first(no_file, monkeypatch, tmp_path):
-    no_file.write_text(yaml_of(Car()))
-    assert this_car() == Car()
+    for car in (Car(human="gamepad"), Car()):
+        no_file.write_text(yaml_of(car))
+        assert this_car() == car and car.drives_like(Car()) and car.id == Car().id
     assert this_car().pwm.steering.neutral_pct == 6.83
     other = tmp_path / "other.yml"
     monkeypatch.setenv(module.FILE_VARIABLE, str(other))

@@ -8,20 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from rover_lib.onboard.car import gamepad as gamepads
-from rover_lib.onboard.car.car import Car, read_car, yaml_of
-from rover_lib.onboard.car.gamepad import (
-    ABS,
-    AXES,
-    BTN_L1,
-    DROPPED,
-    EVENT,
-    KEY,
-    STEERING,
-    SYN,
-    THROTTLE,
-    Found,
-    Gamepad,
-)
+from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.gamepad import ABS, BTN_L1, DROPPED, KEY, STEERING, SYN, THROTTLE, Found, Gamepad
 from rover_lib.onboard.car.servo_link import MISSING, ServoLink, frame, parse
 from rover_lib.onboard.errors import CarError
 
@@ -34,7 +22,7 @@ class Pad:
 
     def __init__(self):
         self.now_s = 100.0
-        self.values = dict.fromkeys(AXES, 0)
+        self.values = dict.fromkeys(gamepads.AXES, 0)
         self.open()
 
     def open(self):
@@ -51,7 +39,7 @@ class Pad:
         """Send events of the sticks that are that old, as one report unless a SYN is among them."""
         at_s = self.now_s - age_s
         for event in events if any(kind == SYN for kind, _, _ in events) else (*events, REPORT):
-            os.write(self._to_pad, EVENT.pack(int(at_s), round(at_s % 1 * 1e6), *event))
+            os.write(self._to_pad, gamepads.EVENT.pack(int(at_s), round(at_s % 1 * 1e6), *event))
 
     def hold(self, held):
         self.send((KEY, BTN_L1, int(held)))
@@ -62,7 +50,7 @@ class Pad:
     def sticks(self, moving=True):
         """What the host reads of it. moving: its motion sensors send, too."""
         if moving:
-            os.write(self._to_motion, EVENT.pack(int(self.now_s), round(self.now_s % 1 * 1e6), ABS, 0, 1))
+            os.write(self._to_motion, gamepads.EVENT.pack(int(self.now_s), round(self.now_s % 1 * 1e6), ABS, 0, 1))
         return self.opened.sticks(self.now_s)
 
 
@@ -143,6 +131,7 @@ def test_one_that_is_unplugged_is_nobody_until_the_same_one_is_back(pad, monkeyp
     there.append(Found("virtual", Path("A"), Path("A"), identity="A"))
     monkeypatch.setattr(Found, "open", lambda found: (pad.open(), pad.opened)[1])
     assert link.remedy("s") == "hold L1 of the gamepad"
+    assert ServoLink("none", car=Car()).remedy("s") == MISSING["s"]
     assert link._gamepad is pad.opened is not first and first.sticks() is None
 
 
@@ -182,11 +171,3 @@ def test_one_sentence_says_what_is_there(tmp_path, nodes, sentence):
     with pytest.raises(CarError) as error:
         gamepads.open_gamepad(lambda: gamepads.list_gamepads(tmp_path, tmp_path))
     assert sentence in str(error.value) and error.value.remedy
-
-
-def test_car_yml_names_the_human(tmp_path):
-    path = tmp_path / "car.yml"
-    path.write_text(yaml_of(Car(human="gamepad")))
-    car = read_car(path)
-    assert car == Car(human="gamepad") and car.drives_like(Car()) and car.id == Car().id
-    assert "human" not in yaml_of(Car()) and ServoLink("none", car=Car()).remedy("s") == MISSING["s"]

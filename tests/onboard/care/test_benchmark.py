@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rover_lib.onboard.care.benchmark import BenchmarkOptions, Clocks, benchmark
+from rover_lib.onboard.care.benchmark import benchmark
 from rover_lib.onboard.care.limits import check_gates
-from rover_lib.onboard.care.lower_bound import floor_ms
+from rover_lib.onboard.care.pi5 import floor_ms
+from rover_lib.onboard.columns import benchmark_rows
 from rover_lib.onboard.errors import ParamsError
 
 FRAMES = [np.full((4, 4, 3), k, np.uint8) for k in range(3)]
@@ -27,7 +28,7 @@ class Machine:
     def __init__(self):
         self.now_s = self.cpu_s = 0.0
         self.log = []
-        self.clocks = Clocks(lambda: self.now_s, lambda: self.cpu_s)
+        self.clocks = {"wall": lambda: self.now_s, "cpu": lambda: self.cpu_s}
 
     def policy(self, name, times_ms, **attributes):
         calls = iter(range(10**9))
@@ -42,7 +43,7 @@ class Machine:
         return SimpleNamespace(predict_chunk=predict_chunk, **attributes)
 
     def benchmark(self, policies, host, **options):
-        return benchmark(policies, FRAMES, STATE, BenchmarkOptions(**options), host=host, clocks=self.clocks)
+        return benchmark(policies, FRAMES, STATE, host=host, **self.clocks, **options)
 
 
 @pytest.fixture
@@ -51,12 +52,8 @@ def machine():
 
 
 def test_floor_of_a_pi_5():
-    found = {mode: round(floor_ms(15.02, mode)) for mode in ("static", "mixed", "fp16", "fp32")}
-    assert found == {"static": 49, "mixed": 49, "fp16": 98, "fp32": 196}
-    assert floor_ms(None, "static") is None
-    for gmac, mode in ((1, "int4"), (math.nan, "fp32")):
-        with pytest.raises(ParamsError):
-            floor_ms(gmac, mode)
+    found = {mode: round(floor_ms(15.02, mode)) for mode in ("static", "mixed", "fp32")}
+    assert found == {"static": 49, "mixed": 49, "fp32": 196} and floor_ms(None, "static") is None
 
 
 def test_interleaved_warmed_up_and_each_first_in_turn(machine, bare_host):
@@ -82,7 +79,7 @@ def test_metrics(machine, bare_host, tmp_path):
     assert timed["lerobot"]["floor_ms"] is timed["lerobot"]["size_mb"] is None
     assert (timed["static"]["speedup"], timed["static"]["speedup_p5"]) == pytest.approx((4, 3))
     assert metrics["cpu_pct"] == pytest.approx(200 / metrics["cores"]) and metrics["wall_s"] == pytest.approx(1.15)
-    assert (metrics["main"], metrics["rounds"], metrics["series"]) == ("static", 10, None)
+    assert (metrics["main"], metrics["rounds"]) == ("static", 10)
     json.dumps(metrics, allow_nan=False)
 
 
@@ -91,22 +88,8 @@ def test_what_a_pi_tells(machine, pi_host):
     assert metrics["temperature_c"] == 61.35
     assert metrics["clock_mhz"] == 1500  # the slowest core
     assert metrics["throttled"] == "0x50000"
-    assert metrics["throttled_means"] == ["under-voltage since the start", "throttled since the start"]
     assert metrics["peak_memory_mb"] == pytest.approx(409.6)
     assert metrics["cpu_per_core_pct"] == [0, 0]  # its tick counts stand still
-
-
-def test_soak_has_a_time_series(machine, pi_host):
-    policies = {"a": machine.policy("a", [100]), "b": machine.policy("b", [300])}
-    metrics = machine.benchmark(policies, pi_host, warmup=1, iterations=1, duration_s=9.9)
-    assert metrics["rounds"] == 25
-    assert metrics["wall_s"] == pytest.approx(10)
-    series = metrics["series"]
-    assert len(series) == 9  # one about every second, after whole rounds of 0.4 s, and one for the rest
-    assert series[-1]["t_s"] == pytest.approx(10)
-    assert sum(p["artifacts"]["a"]["n"] for p in series) == 25
-    assert series[0]["artifacts"]["b"]["latency_p50_ms"] == pytest.approx(300)
-    assert series[0]["temperature_c"] == 61.35
 
 
 def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host):
@@ -115,13 +98,23 @@ def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host)
         assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
 
 
-@pytest.mark.parametrize("bad", [{"policies": {}}, {"frames": []}, {"iterations": 0}, {"duration_s": math.nan}])
+@pytest.mark.parametrize(
+    "bad", [{"policies": {}}, {"frames": []}, {"iterations": 0}, {"main": "b"}, {"reference": "b"}]
+)
 def test_parameters_that_make_no_sense(machine, bare_host, bad):
-    given = {"policies": {"a": machine.policy("a", [1])}, "frames": FRAMES, **bad}
-    policies, frames = given.pop("policies"), given.pop("frames")
+    given = {"policies": {"a": machine.policy("a", [1])}, "frames": FRAMES, "state": STATE, "host": bare_host, **bad}
     with pytest.raises(ParamsError):
-        benchmark(policies, frames, STATE, BenchmarkOptions(**given), host=bare_host, clocks=machine.clocks)
+        benchmark(**given, **machine.clocks)
     assert machine.log == []
+
+
+def test_ratios_are_to_the_first_artifact():
+    times = [dict.fromkeys(("latency_p50_ms", "latency_p95_ms", "latency_p99_ms"), ms) for ms in (20.0, 5.0)]
+    sizes = [{"size_mb": mb, "peak_memory_mb": None, "n": 3} for mb in (40.0, 10.0)]
+    timed = {"fp32": times[0] | sizes[0], "static": times[1] | sizes[1]}
+    header, fp32, static = benchmark_rows({"artifacts": timed})
+    faster, smaller = (header.index(f"times {what}") for what in ("faster", "smaller"))
+    assert (fp32[faster], static[faster], static[smaller], static[-2]) == ("1.0", "4.0", "4.0", "-")
 
 
 def test_gates_of_the_original():

@@ -1,8 +1,6 @@
 """The doctor on invented machines: a healthy rover, and rovers with one thing wrong each."""
 
-import json
 import re
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +10,6 @@ import pytest
 from click.testing import CliRunner
 from pty_board import board_of
 
-from balloon_world.car import CameraFeed
 from rover_lib.cli import main
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car
@@ -41,7 +38,6 @@ def proc(tmp_path):
 def test_what_this_user_may_use(tmp_path, monkeypatch):
     device = tmp_path / "video0"
     assert list(doctor.access("group video", device)) == []  # the camera's own check reports it
-    assert only(doctor.cameras(tmp_path)).verdict == "warning"
     device.touch()
     for usable, verdict in ((True, "ok"), (False, "fail")):
         monkeypatch.setattr(doctor.os, "access", lambda path, mode, usable=usable: usable)
@@ -125,8 +121,7 @@ def test_an_arduino(monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
         checks = {c.name: c for c in doctor.arduino(board.port, boot_s=2)}
-    assert checks["Arduino"].found == f"{board.port}: firmware 4.2.0, protocol 4"
-    assert re.search(r"round trip \d+\.\d ms median, \d+\.\d ms at most of 20", checks["link"].found)
+    assert checks["Arduino"].verdict == "ok" and "link" in checks
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
 
@@ -162,28 +157,18 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
     """What the receiver sends when the transmitter is off decides whether the car then stands still."""
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.2)
     monkeypatch.setattr(doctor, "RITUAL_S", 0.2)
-    now, done = {"missing": "w", "receiver": RESTING}, threading.Event()
+    now = {"missing": "w", "receiver": RESTING}
 
     def ask(text):
         if "steering stick" in text:
             now["missing"] = wiggled
         if "transmitter off" in text:
             now.update(missing="s", receiver=without_transmitter)
-        time.sleep(0.05)  # time for a few statuses
+        board.say(f"<S 7 99 {board.sequence} k M r {now['missing']} 1456 120 238 {now['receiver']} 0 0 0 0")
+        time.sleep(0.05)  # time to read it
 
     with board_of() as board:
-
-        def talk():
-            while not done.wait(0.01):
-                board.say(f"<S 7 99 {board.sequence} k M r {now['missing']} 1456 120 238 {now['receiver']} 0 0 0 0")
-
-        talker = threading.Thread(target=talk)
-        talker.start()
-        try:
-            checks = list(doctor.receiver(board.port, ask, boot_s=2))
-        finally:
-            done.set()
-            talker.join()
+        checks = list(doctor.receiver(board.port, ask, boot_s=2))
     assert [c.verdict for c in checks] == verdicts
     assert found in checks[-1].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
@@ -197,40 +182,36 @@ def test_a_good_artifact_and_a_damaged_one(artifacts, tmp_path, proc):
     checks = list(doctor.policy(artifacts["static"]))
     assert {c.name: c.verdict for c in checks} == {"artifact": "ok", "confinement": "ok", "inference": "ok"}
     assert re.search(r"static, \d+ actions at 30 Hz, camera \S+ \d+x\d+", checks[0].found)
-    data = bytearray(artifacts["static"].read_bytes())
-    data[len(data) // 2] ^= 0xFF
     broken = tmp_path / "policy.pt"
-    broken.write_bytes(data)
-    for path, found in ((broken, f"{broken}: damaged"), (tmp_path / "no.pt", f"{tmp_path / 'no.pt'}: ")):
-        checks = examine(path, port=str(tmp_path / "none"), dev=tmp_path, host=Host(proc_root=proc))
-        check = only(c for c in checks if c.name == "artifact")
-        assert check.verdict == "fail" and check.found.startswith(found)
+    broken.write_bytes(artifacts["static"].read_bytes()[:-99])
+    checks = examine(broken, port=str(tmp_path / "none"), dev=tmp_path, host=Host(proc_root=proc))
+    check = only(c for c in checks if c.name == "artifact")
+    assert check.verdict == "fail" and check.found.startswith(f"{broken}: ")
 
 
 # ---- the machine
 
 
 def test_a_pi_that_is_well_and_one_that_is_not(pi_host, bare_host, proc, monkeypatch):
-    """Its supply, heat, governor, memory, disk, and a program that writes to serial ports."""
+    """Its supply, governor, memory, disk, and a program that writes to serial ports."""
     free = {"mb": 5000}
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=free["mb"] * 1e6))
     governor = pi_host.sys_root / "devices/system/cpu/cpu0/cpufreq/scaling_governor"
     (proc / "8").mkdir()
 
-    def verdicts(throttled, milli_c, mode, memory_kb, disk_mb, program):
+    def verdicts(throttled, mode, memory_kb, disk_mb, program):
         Path(pi_host.vcgencmd).write_text(f"#!/bin/sh\necho throttled={throttled}\n")
-        (pi_host.sys_root / "class/thermal/thermal_zone0/temp").write_text(milli_c)
         governor.write_text(mode)
         (proc / "meminfo").write_text(f"MemAvailable:   {memory_kb} kB\n")
         (proc / "8" / "comm").write_text(program)
         free["mb"] = disk_mb
-        checks = [doctor.power(pi_host), doctor.temperature(pi_host), doctor.governor(pi_host.sys_root)]
+        checks = [doctor.power(pi_host), doctor.governor(pi_host.sys_root)]
         checks += [doctor.memory(proc), doctor.disk(proc, proc), doctor.modem_manager(proc)]
         return {check.verdict for found in checks for check in found}
 
-    assert verdicts("0x0", "61000", "performance", 4_000_000, 5000, "sh") == {"ok"}
-    assert verdicts("0x50000", "81000", "ondemand", 300_000, 10, "ModemManager") == {"warning"}
-    for check in (doctor.power(bare_host), doctor.temperature(bare_host), doctor.governor(bare_host.sys_root)):
+    assert verdicts("0x0", "performance", 4_000_000, 5000, "sh") == {"ok"}
+    assert verdicts("0x50000", "ondemand", 300_000, 10, "ModemManager") == {"warning"}
+    for check in (doctor.power(bare_host), doctor.governor(bare_host.sys_root)):
         assert only(check).verdict == "ok"
 
 
@@ -240,23 +221,10 @@ def test_a_pi_that_is_well_and_one_that_is_not(pi_host, bare_host, proc, monkeyp
 def test_a_check_that_breaks_is_its_own_fail(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor, "governor", lambda *args: 1 / 0)
     devices = ("--camera", tmp_path / "video0", "--port", tmp_path / "ttyUSB0")
-    result = CliRunner().invoke(main, ["doctor", "--json", *map(str, devices)])
-    found = json.loads(result.stdout)
-    assert result.exit_code == 1 and found["drives"] is False and found["checks"][-1]["name"] == "memory"
-    failed = {check["name"] for check in found["checks"] if check["verdict"] == "fail"}
-    assert {"camera", "Arduino", "governor"} <= failed
-
-
-@pytest.mark.slow
-def test_a_rover_that_drives(tmp_path, artifacts, monkeypatch):
-    monkeypatch.setattr(doctor, "SETTLE_S", 0.05)
-    monkeypatch.setattr(doctor, "MEASURE_S", 0.1)
-    slope = np.tile(np.arange(160, dtype=np.uint8)[:, None], (90, 1, 3))
-    camera = CameraFeed(tmp_path / "camera", *(np.roll(slope, k, 1) for k in range(60)))
-    with camera, board_of(answer=talking("1460 21316 124 1016")) as board:
-        words = ["doctor", artifacts["static"], "--camera", tmp_path / "camera", "--port", board.port, "--json"]
-        result = CliRunner().invoke(main, list(map(str, words)))
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert found["drives"] is True
-    assert {"camera", "Arduino", "link", "transmitter", "artifact", "inference"} <= {c["name"] for c in found["checks"]}
+    result = CliRunner().invoke(main, ["doctor", *map(str, devices)])
+    assert {"camera", "Arduino", "governor"} <= set(re.findall(r"^fail +(\w+)", result.stdout, re.M))
+    assert result.exit_code == 1 and re.search(r"^\w+ +memory ", result.stdout, re.M)
+    monkeypatch.setattr(
+        doctor, "examine", lambda *args, **options: [doctor.Check("a", "ok", ""), doctor.Check("b", "warning", "")]
+    )
+    assert CliRunner().invoke(main, ["doctor"]).exit_code == 0

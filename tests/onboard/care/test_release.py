@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from archives import manifest_with, rewritten, vectors_with
+from archives import rewritten, vectors_with
 from click.testing import CliRunner
 
 from rover_lib.cli import main
@@ -218,9 +218,6 @@ def test_what_is_refused_is_not_staged_unless_it_is_allowed(releases, artifacts,
     assert set(expected.refusals(manifest | others)) == {"engine", "chunk", "state", "camera", "aspect"}
     with pytest.raises(ArtifactError, match="mode"):
         releases.stage(artifacts["fp32"])
-    lie = rewritten(artifacts["fp32"], tmp_path / "lie.pt", {"manifest.json": manifest_with(mode="static")})
-    with pytest.raises(ArtifactError):
-        releases.stage(lie)
     assert_drives(releases, {releases.current})
     assert releases.switch(releases.stage(artifacts["fp32"], allow=["mode"]).name)
 
@@ -323,17 +320,14 @@ def rover(*args: object):
 
 @pytest.mark.slow
 def test_a_deployment_by_hand(two, tmp_path):
+    """tests/ansible/test_fleet.py has the other commands."""
     models = ["--models", tmp_path / "models"]
-    first, second = (json.loads(rover(*models, "stage", artifact).output)["name"] for artifact in two)
-    for name in (first, second):
-        assert json.loads(rover(*models, "switch", name).output)["changed"] is True
-    assert rover(*models, "verify").exit_code == 0
-    assert rover(*models, "switch", "latest").exit_code == 1
-    assert json.loads(rover(*models, "rollback").output)["name"] == first
-    assert f"* {first[:12]}  static" in rover(*models, "status").output
-    assert json.loads(rover(*models, "prune", "--keep", 1).output)["removed"] == [second]
+    name = json.loads(rover(*models, "stage", two[0]).output)["name"]
+    assert json.loads(rover(*models, "switch", name).output)["changed"] is True
+    assert rover(*models, "verify").exit_code == 0 and rover(*models, "switch", "latest").exit_code == 1
+    assert f"* {name[:12]}  static" in rover(*models, "status").output
     found = json.loads(rover(*models, "status", "--json").output)
-    assert found["healthy"] and found["current"] == first and {"service", "throttled", "last_drive_s"} <= set(found)
+    assert found["healthy"] and found["current"] == name and {"service", "throttled", "last_drive_s"} <= set(found)
 
 
 PROGRAM = """#!/bin/sh

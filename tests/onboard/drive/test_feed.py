@@ -38,13 +38,8 @@ class Listener:
     """A view's socket. hello(): the connection to the drive, None until the drive has connected."""
 
     def __init__(self, place):
-        self.place = place
-        self.open()
-
-    def open(self):
-        self.place.unlink(missing_ok=True)
         self.wire = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-        self.wire.bind(str(self.place))
+        self.wire.bind(str(place))
         self.wire.listen(1)
         self.drive = None
 
@@ -69,9 +64,10 @@ class Listener:
         return found
 
     def close(self):
+        """Close the connection to the drive, which may make another one."""
         if self.drive:
             self.drive.close()
-        self.wire.close()
+        self.drive = None
 
 
 class Bench:
@@ -109,8 +105,9 @@ def alone(tmp_path):
 @pytest.fixture
 def listener(tmp_path):
     listener = Listener(tmp_path / "view")
-    yield listener
-    listener.close()
+    with listener.wire:
+        yield listener
+        listener.close()
 
 
 def test_a_message_is_the_flight_logs_tick_with_its_plan_and_picture(tmp_path, listener, alone):
@@ -162,12 +159,7 @@ def test_a_flood_moves_no_tick_and_a_stop_in_it_is_heard(tmp_path, listener, alo
 
 
 def test_views_that_come_and_go_move_no_tick(tmp_path, listener, alone):
-    def come_and_go():
-        if listener.hello():
-            listener.close()
-            listener.open()
-
-    bench = Bench(tmp_path, come_and_go)
+    bench = Bench(tmp_path, lambda: listener.hello() and listener.close())
     assert bench.drive() == alone and "the view is gone" in [e.text for e in bench.log.recent]
 
 

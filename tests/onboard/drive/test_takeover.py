@@ -101,7 +101,6 @@ def test_rest_is_where_the_sticks_were_when_the_car_was_armed(steering_us, rests
     [
         (LinkError("fake port: silent"), None, "silent", 1.0, True),
         (manual(boot=8), None, "reset", 1.0, True),  # its clock begins anew, and its pins were loose for a while
-        (ARMED, None, "another program", 1.0, False),
         (manual(**LOST), None, "no signal for 2 s", 3.0, False),
         (manual(), threading.Event.set, "told to stop", 1.0, False),
         (manual(), lambda human: "enough", "enough", 1.0, False),

@@ -1,25 +1,13 @@
-"""What a confined process can still do: on this machine's kernel, and according to each processor's filter."""
+"""What a confined process can still do, on this machine's kernel."""
 
+import ctypes
 import json
 import os
-import platform
 import pty
-import re
-import struct
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from rover_lib.onboard.policy import confine
-
-ALLOWED, REFUSED, UNKNOWN = confine.ALLOW, confine.REFUSE | confine.EPERM, confine.REFUSE | confine.ENOSYS
-HEADERS = {
-    "x86_64": Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h"),
-    "aarch64": Path("/usr/include/asm-generic/unistd.h"),
-}
-here = pytest.mark.skipif(platform.machine() not in confine.PROCESSORS, reason="no filter for this processor")
 
 PROGRAM = r"""
 import ctypes, json, os, resource, signal, socket, subprocess, sys, threading, time
@@ -37,6 +25,10 @@ def asked(name, action):
         found[name] = "works"
     except BaseException as error:
         found[name] = type(error).__name__
+
+def by_number(number):
+    if libc.syscall(number) < 0:
+        raise OSError(ctypes.get_errno(), "refused")
 
 def in_a_thread(name, action):
     thread = threading.Thread(target=asked, args=(name, action))
@@ -56,25 +48,31 @@ asked("open the port to write", lambda: os.open(port, os.O_RDWR | os.O_NOCTTY))
 asked("make a file", lambda: os.open(f"{folder}/made", os.O_WRONLY | os.O_CREAT))
 asked("empty a file", lambda: os.open(f"{folder}/there", os.O_RDONLY | os.O_TRUNC))
 asked("remove a file", lambda: os.unlink(f"{folder}/there"))
+asked("rename a file", lambda: os.rename(f"{folder}/there", f"{folder}/else"))
+asked("make a link", lambda: os.symlink("/", f"{folder}/made"))
 asked("make a socket", lambda: socket.socket(socket.AF_UNIX).close())
+asked("make a network socket", lambda: socket.socket().close())
 asked("start a program", lambda: subprocess.run(["true"]))
+asked("become a program", lambda: os.execv("/bin/true", ["true"]))
 asked("fork", lambda: os.fork() or os._exit(0))
 asked("signal another", lambda: os.kill(other, 0))
+asked("change a mode", lambda: os.chmod(f"{folder}/there", 0o777))
 asked("change another's limits", lambda: resource.prlimit(other, resource.RLIMIT_CORE))
+asked("ask by x32's number", lambda: by_number(39 | 1 << 30))  # the other numbering on x86-64
 in_a_thread("make a file from a thread", lambda: os.open(f"{folder}/made", os.O_WRONLY | os.O_CREAT))
 asked("read a file", lambda: open(f"{folder}/there").read())
 asked("take some memory", lambda: bytearray(50 << 20))
 asked("take much memory", lambda: bytearray(400 << 20))
 in_a_thread("start a thread", lambda: None)
+asked("change its own limits", lambda: resource.prlimit(0, resource.RLIMIT_CORE))
 forbid_opening()
 asked("read a file at the end", lambda: open(f"{folder}/there").read())
 asked("read what is open", lambda: os.read(opened, 1))
 print(json.dumps({"reason": reason, "found": found}))
 """
-WORKS = {"read a file", "take some memory", "start a thread", "read what is open"}
+WORKS = {"read a file", "take some memory", "start a thread", "change its own limits", "read what is open"}
 
 
-@here
 def test_a_confined_process_computes_and_does_nothing_else(tmp_path):
     (tmp_path / "there").write_text("there")
     master, slave = pty.openpty()
@@ -89,59 +87,20 @@ def test_a_confined_process_computes_and_does_nothing_else(tmp_path):
     assert told["reason"] == ""
     found = told["found"]
     assert {name for name, what in found.items() if what == "works"} == WORKS
-    assert len(found) > 12 and found["take much memory"] == "MemoryError"
+    assert (found["take much memory"], found["ask by x32's number"]) == ("MemoryError", "PermissionError")
     assert [p.name for p in tmp_path.iterdir()] == ["there"] and (tmp_path / "there").read_text() == "there"
 
 
-def judged(processor: str, call: tuple[int | None, ...] | int, *arguments: int, architecture: int | None = None) -> int:
-    """Return the filter's answer to a system call, by interpreting the four kinds of instructions that it has."""
-    column, own = confine.PROCESSORS[processor]
-    number = call if isinstance(call, int) else call[column]
-    given = (*arguments, *([0] * (6 - len(arguments))))
-    data = struct.pack("<IIQ6Q", number, own if architecture is None else architecture, 0, *given)
-    program, at, word = confine.filter_of(processor), 0, 0
-    while True:
-        code, if_true, if_false, value = struct.unpack_from("<HBBI", program, 8 * at)
-        at += 1
-        if code == confine.RETURN:
-            return value
-        if code == confine.LOAD:
-            (word,) = struct.unpack_from("<I", data, value)
-        else:
-            holds = word == value if code == confine.JUMP_EQUAL else bool(word & value)
-            at += if_true if holds else if_false
+def test_the_library_knows_each_call():
+    """A name that it does not know would be refused, here or on a Pi, where nobody has tried it."""
+    library = ctypes.CDLL(confine.LIBRARY)
+    for processor in (0xC000003E, 0xC00000B7):  # SCMP_ARCH_X86_64, SCMP_ARCH_AARCH64
+        for name in (*confine.ALLOWED, *confine.ALLOWED_IF, "clone3"):
+            number = library.seccomp_syscall_resolve_name_arch(ctypes.c_uint32(processor), name.encode())
+            assert number != -1, name
 
 
-@pytest.mark.parametrize("processor", confine.PROCESSORS)
-def test_the_filter_of_each_processor(processor):
-    column, _ = confine.PROCESSORS[processor]
-    for call in confine.ALLOWED.values():
-        if call[column] is not None:
-            assert judged(processor, call) == ALLOWED
-            assert judged(processor, call, architecture=0x40000003) == REFUSED  # another processor's numbers
-            assert judged(processor, call[column] | 1 << 30) == REFUSED  # x32, the other numbering on x86-64
-    assert judged(processor, confine.OPENAT, 0, 0, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW) == ALLOWED
-    for flags in (os.O_WRONLY, os.O_RDWR, os.O_CREAT, os.O_TRUNC, os.O_RDWR | os.O_NOCTTY, 0o20200001):
-        assert judged(processor, confine.OPENAT, 0, 0, flags) == REFUSED
-    assert judged(processor, confine.CLONE, 0x3D0F00) == ALLOWED  # the flags of pthread_create
-    assert judged(processor, confine.CLONE, 17) == judged(processor, confine.CLONE, 0x4111) == REFUSED  # fork, vfork
-    assert judged(processor, confine.CLONE3) == UNKNOWN
-    assert judged(processor, confine.PRLIMIT, 0) == ALLOWED and judged(processor, confine.PRLIMIT, 1) == REFUSED
-    known = {call[column] for call in confine.ALLOWED.values()}
-    known |= {call[column] for call in (confine.OPEN, confine.OPENAT, confine.CLONE, confine.CLONE3, confine.PRLIMIT)}
-    for number in set(range(600)) - known:
-        assert judged(processor, number) == REFUSED
-
-
-@pytest.mark.parametrize("processor", confine.PROCESSORS)
-def test_the_numbers_are_the_kernels(processor):
-    if not HEADERS[processor].exists():
-        pytest.skip(f"no {HEADERS[processor]}: apt install linux-libc-dev")
-    text = HEADERS[processor].read_text()
-    numbers = {m[1]: int(m[2]) for m in re.finditer(r"#define __NR(?:3264)?_(\w+)\s+(\d+)", text)}
-    numbers["newfstatat"] = numbers.get("newfstatat", numbers.get("fstatat"))
-    given = {**confine.ALLOWED, "openat": confine.OPENAT, "clone": confine.CLONE, "clone3": confine.CLONE3,
-             "prlimit64": confine.PRLIMIT, "seccomp": confine.SECCOMP, "open": confine.OPEN}  # fmt: skip
-    column, _ = confine.PROCESSORS[processor]
-    ours = {name: call[column] for name, call in given.items() if call[column] is not None}
-    assert ours.items() <= numbers.items()
+def test_without_the_library_it_says_so(monkeypatch):
+    monkeypatch.setattr(confine, "LIBRARY", "libnone.so")
+    monkeypatch.setattr(confine, "_lower", lambda *_: None)  # of this process
+    assert "libseccomp2" in confine.confine(200)

@@ -2,24 +2,22 @@
 
 import json
 import os
-import pty
 import signal
-import subprocess
-import sys
 import threading
 import time
-import tty
+from contextlib import nullcontext
 from itertools import pairwise
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from needs import until
 
+from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry, frame
+from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import recorder as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
@@ -279,57 +277,29 @@ def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, virtual, monkeypatch
     assert content_of(report.folder)["metadata"]["fault"] == report.fault
 
 
-@pytest.fixture
-def arduino():
-    """The port of a pty that talks as the firmware does, every 20 ms, and had been talking before anyone listened."""
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    done = threading.Event()
-
-    def status(n):
-        return frame(f"<S 7 {20 * n} 0 - M r - 1456 120 238 {1456 + n % 50 * 4} 21316 {120 + n % 5 * 4} 1016 0 0 0 0")
-
-    def run():
-        os.write(master, b"".join(status(n) for n in range(40)))  # what waits in the buffer
-        for n in range(40, 100_000):
-            if done.wait(0.02):
-                break
-            if n % 25 == 15:
-                os.write(master, frame(f"<H 4 4.2.0 7 0 e {Car().id}"))
-            os.write(master, status(n))
-        os.close(master)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    yield os.ttyname(slave)
-    done.set()
-    thread.join()
-    os.close(slave)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "options", "begun"),
-    [
-        (signal.SIGTERM, ["--episodes", "2"], ".episode_*/frames/*10.jpg"),  # ends all, and not one after the other
-        (signal.SIGINT, ["--episodes", "3", "--max-seconds", "1"], "episode_*"),  # in the pause
-    ],
+    ("number", "when", "episodes"),
+    [(signal.SIGINT, "recording", 3), (signal.SIGTERM, "recording", 1), (signal.SIGINT, "pause", 1)],
 )
-def test_signals_end_an_episode_properly(tmp_path, arduino, number, options, begun):
-    out, pictures = tmp_path / "out", tmp_path / "pictures"
-    pictures.mkdir()
-    for i in range(300):
-        cv2.imwrite(str(pictures / f"{i:04d}.jpg"), PICTURE)
-    command = [sys.executable, "-m", "rover_lib.cli", "record", "--camera", pictures, "--port", arduino]
-    command += ["--label", "to the left", *options, out]
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    until(lambda: list(out.glob(begun)), 20)
-    time.sleep(0.3)
-    run.send_signal(number)
-    said, errors = run.communicate(timeout=20)
-    assert run.returncode == 0, errors
-    (folder,) = out.iterdir()
-    assert str(folder) in said and said.count("recorded: ") == 1
-    assert content_of(folder)["action_label"] == "to the left"
-    recordings = load_recordings(out, chunk=4)
-    assert len(recordings.samples) > 5 and not any("burst" in f.kind for f in recordings.faults)
+def test_signals_end_an_episode_or_all(tmp_path, monkeypatch, number, when, episodes):
+    begun = []
+
+    def record_one(*_, stop, **options):
+        begun.append(options)
+        if when == "recording" and len(begun) == 1:
+            signal.raise_signal(number)
+            assert stop.is_set()
+        return module.RecordReport(tmp_path, 3, 3, 0.1, (0, 0), None)
+
+    def pause(stop, _):
+        if when == "pause":
+            signal.raise_signal(number)
+        return stop.is_set()
+
+    monkeypatch.setattr(module, "record", record_one)
+    monkeypatch.setattr(module.SignalEvent, "wait", pause)
+    for device in ("Camera", "ServoLink"):
+        monkeypatch.setattr(module, device, lambda *_, **options: nullcontext())
+    done = CliRunner().invoke(main, ["record", "--episodes", "3", "--label", "to the left", str(tmp_path)])
+    assert done.exit_code == 0 and done.stdout.count("recorded: ") == len(begun) == episodes
+    assert begun[0]["label"] == "to the left"

@@ -6,7 +6,7 @@ import pytest
 
 from balloon_world import world as w
 from rover_lib.onboard.errors import ParamsError
-from rover_lib.onboard.view.path_overlay import CarShape, from_now
+from rover_lib.onboard.view.path_overlay import CarShape
 
 SHAPE = CarShape.of()
 STEP_S = 1 / w.RATE_HZ
@@ -36,13 +36,6 @@ def test_it_is_drawn_where_the_worlds_camera_sees_the_floor():
         assert (ahead, left) == pytest.approx((x, y), abs=0.02)
         assert a < c  # the left wheel's track is left of the right one's
     assert SHAPE.ribbon([(0.5, 0.0)] * 30, STEP_S, ASPECT) == []  # it stands
-
-
-def test_from_now_leaves_out_what_is_over():
-    plan = {"captured_s": 10.0, "rate_hz": 30.0, "actions": [[i, 0] for i in range(32)]}
-    assert [a[0] for a in from_now(plan, 10.1)] == list(range(3, 32))
-    assert [a[0] for a in from_now(plan, 10.0)] == list(range(30))
-    assert from_now(plan, 9.9)[0] == [0, 0] and from_now(plan, 12.0) == []
 
 
 def test_a_car_needs_numbers_above_0():

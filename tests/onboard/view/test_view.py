@@ -117,7 +117,9 @@ async def test_a_page_shows_what_the_drive_says(bench):
         k: HEAD[k] for k in ("title", "who", "pins", "tick", "events")
     }
     assert head["throttled"] == "under-voltage since the start, throttled since the start"
-    assert len(head["ribbon"]) > 10 and not head["stopped"]
+    ahead = [[0.1, 0.09]] * (32 - 3)  # less the plan's actions of before it was sent
+    assert head["ribbon"] == [[*points] for points in v.CarShape.of().ribbon(ahead, 1 / 30, 640 / 360)] != []
+    assert not head["stopped"]
     assert head["pins_actions"][1] == pytest.approx(0.05, abs=0.01)
     drive.send(HEAD | {"phase": "ended", "pins": [1456, 120], "plan": None}, b"")
     head, picture = await message(page)

@@ -29,16 +29,11 @@ def named(inputs, config: ActConfig) -> dict[str, torch.Tensor]:
     return dict(zip(["state", *(f"frame_{c}" for c in config.cameras)], inputs, strict=True))
 
 
-def plain_session(model: bytes) -> onnxruntime.InferenceSession:
-    """Nothing fused, so that INT8 gives what its numbers say; and fusing two cameras of odd sizes fails in it."""
-    options = onnxruntime.SessionOptions()
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
 def answers(model: onnx.ModelProto, inputs, config: ActConfig, exact: bool = False) -> np.ndarray:
-    content = model.SerializeToString()
-    run = (plain_session(content) if exact else session_of(content, threads=1)).run
+    """exact: with nothing fused, so that INT8 gives what its numbers say; fusing two cameras of odd sizes fails."""
+    content, options = model.SerializeToString(), onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    run = (onnxruntime.InferenceSession(content, options) if exact else session_of(content, threads=1)).run
     return np.concatenate([run(None, {k: v.numpy() for k, v in named(x, config).items()})[0] for x in inputs])
 
 
@@ -68,42 +63,36 @@ def test_float_policy_is_the_same(name, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", [Scheme(), Scheme(kind="affine")], ids=["static", "affine"])
-def test_int8_policy_is_the_same_up_to_flipped_roundings(scheme, tiny, calibration):
-    quantized = quantize(tiny, scheme, calibration)
-    inputs = [inputs_of(s, tiny.config) for s in memory_samples(4, seed=1)]
-    written = onnx_model(graph_of(quantized.module), named(inputs[0], tiny.config), ("chunk",))
-    torchs = predictions(quantized.module, inputs).numpy()
-    own_error = np.abs(torchs - predictions(ACT(tiny.config, tiny.weights), inputs).numpy()).max()
-    # A rounding that flips grows over the layers: 0.4 times its own error to FP32
-    assert np.abs(answers(written, inputs, tiny.config) - torchs).max() < 1.5 * own_error
-    stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
-    for name, layer in int8_layers(quantized.module).items():
-        weight = layer.weight().int_repr()
-        weight = stack_stem(weight) if name == "backbone.stem.0" else weight
-        assert np.array_equal(stored[f"{name}.weight"], weight.numpy())
-
-
-@pytest.mark.slow
-def test_int8_policy_of_two_cameras_is_the_same(tmp_path):
-    """They share a backbone's weights, but not the steps of its numbers."""
-    saved(lerobot_policy(**SHAPES["two cameras, odd"]), tmp_path)
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        ("tiny", Scheme()),
+        ("tiny", Scheme(kind="affine")),
+        ("two cameras, odd", Scheme()),  # they share a backbone's weights, but not the steps of its numbers
+    ],
+)
+def test_int8_policy_is_the_same_up_to_flipped_roundings(name, scheme, tmp_path):
+    saved(lerobot_policy(**SHAPES[name]), tmp_path)
     checkpoint, rng = load_checkpoint(tmp_path), np.random.default_rng(0)
-    named_sizes = dict(zip(checkpoint.config.cameras, checkpoint.config.image_sizes, strict=True))
-    samples = [
-        MemorySample(
-            sample.state,
-            {name: smooth_frame(rng, *size) // at for at, (name, size) in enumerate(named_sizes.items(), 1)},
-        )
-        for sample in memory_samples(10)
-    ]
-    quantized = quantize(checkpoint, Scheme(), calibrate(checkpoint, samples[:8]))
+    sizes = dict(zip(checkpoint.config.cameras, checkpoint.config.image_sizes, strict=True))
+    samples = []
+    for s in memory_samples(12):
+        seen = {camera: smooth_frame(rng, *size) // at for at, (camera, size) in enumerate(sizes.items(), 1)}
+        samples.append(MemorySample(s.state, seen))
+    quantized = quantize(checkpoint, scheme, calibrate(checkpoint, samples[:8]))
     inputs = [inputs_of(s, checkpoint.config) for s in samples[8:]]
     written = onnx_model(graph_of(quantized.module), named(inputs[0], checkpoint.config), ("chunk",))
     torchs = predictions(quantized.module, inputs).numpy()
     own_error = np.abs(torchs - predictions(ACT(checkpoint.config, checkpoint.weights), inputs).numpy()).max()
-    assert np.abs(answers(written, inputs, checkpoint.config, exact=True) - torchs).max() < 1.5 * own_error
+    # A rounding that flips grows over the layers: 0.4 times its own error to FP32
+    found = answers(written, inputs, checkpoint.config, exact=len(sizes) > 1)
+    assert np.abs(found - torchs).max() < 1.5 * own_error
     assert len(written.SerializeToString()) < 15e6  # 12 with one camera
+    stored = {i.name: onnx.numpy_helper.to_array(i) for i in written.graph.initializer}
+    for layer_name, layer in int8_layers(quantized.module).items():
+        weight = layer.weight().int_repr()
+        weight = stack_stem(weight) if layer_name == "backbone.stem.0" else weight
+        assert np.array_equal(stored[f"{layer_name}.weight"], weight.numpy())
 
 
 def test_part_with_two_outputs():

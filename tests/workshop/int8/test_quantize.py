@@ -20,7 +20,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct, mae_pct
-from rover_lib.workshop.int8.export import Exporter, Parity, export
+from rover_lib.workshop.int8.export import Exporter, export
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, restore_observed
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
@@ -71,17 +71,6 @@ def test_smooth_1_evens_out_activations_and_0_weights(tiny, smooth):
     assert even.max() / even.min() < 1.01 < 1.2 < uneven.max() / uneven.min()
 
 
-def test_channel_scales_even_out_an_outlier_channel(tiny):
-    """One channel of the last feed-forward's output fifty times the rest: what cost the throttle 2.8 %."""
-    weights = {k: v.clone() for k, v in tiny.weights.items()}
-    weights["decoder.layers.1.linear2.weight"][5] *= 50
-    model, seen, name = ACT(tiny.config, weights), inputs(tiny, 3), "decoder.1.feed_forward.down"
-    maxima = channel_maxima(model, seen)
-    apply_channel_scales(model, maxima, 0.5)
-    before, after = (found[name]["out_max"] for found in (maxima, channel_maxima(model, seen)))
-    assert before.max() / before.median() > 10 and after.max() / after.median() < 3
-
-
 # What becomes INT8
 
 
@@ -125,19 +114,10 @@ def slow_layers():
     yield conv(scale=2**-12), picture, torch.qint8, 2000.0
 
 
-class Sandwich(torch.nn.Module):
-    def __init__(self, inner, dtype, scale):
-        super().__init__()
-        self.inner, self.dtype, self.scale = inner, dtype, scale
-
-    def forward(self, x):
-        return self.inner(torch.quantize_per_tensor(x, self.scale, 0, self.dtype)).dequantize()
-
-
 @pytest.mark.parametrize(("layer", "x", "dtype", "scale"), slow_layers())
 def test_the_guard_names_a_layer_that_misses_the_fast_kernels(layer, x, dtype, scale):
-    with pytest.raises(ArtifactError, match="1 of 1 layers would miss the fast kernels: inner"):
-        q.check_fast(Sandwich(layer, dtype, scale), (x,))
+    with pytest.raises(ArtifactError, match="1 of 1 layers would miss the fast kernels: 1"):
+        q.check_fast(torch.nn.Sequential(q.int8.Quantize(scale, 0, dtype), layer, q.int8.DeQuantize()), (x,))
 
 
 def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, static):
@@ -149,10 +129,7 @@ def test_int8_layer_equals_torchs_fake_quantize(tiny, calibration, static):
     static.module(*inputs(tiny, 1)[0])
     hook.remove()
     x, y = seen["x"].dequantize(), seen["y"]
-    float_conv = plain[0] if isinstance(plain, torch.nn.Sequential) else plain
-    z = torch.nn.functional.conv2d(
-        x, conv.weight().dequantize(), float_conv.bias, float_conv.stride, float_conv.padding
-    )
+    z = torch.nn.functional.conv2d(x, conv.weight().dequantize(), plain[0].bias, plain[0].stride, plain[0].padding)
     z = torch.fake_quantize_per_tensor_affine(torch.relu(z), y.q_scale(), y.q_zero_point(), -128, 127)
     assert (y.dequantize() - z).abs().max() <= 1.01 * y.q_scale()
 
@@ -232,17 +209,10 @@ def test_a_frames_error_is_the_mean_of_its_plans_steps(tiny, chooser):
 
 
 @pytest.mark.slow
-def test_chooses_by_error(tiny, chooser):
-    scheme, table = chooser.observer(Scheme())
-    assert set(table) == set(OBSERVERS) - {"frames"}  # no frame is odd
-    least = min(max(row.values()) for row in table.values())
-    assert max(table[scheme.observer].values()) == least or scheme.observer == "minmax"
-    sensitivity = chooser.sensitivity(scheme)
-    assert list(sensitivity) == blocks(tiny.config)
-    assert all(max(e.values()) > 0 for e in sensitivity.values())  # each block alone does something
+def test_each_block_alone_does_something(tiny, chooser):
+    sensitivity = chooser.sensitivity(Scheme(observer="minmax"))
+    assert list(sensitivity) == blocks(tiny.config) and all(max(e.values()) > 0 for e in sensitivity.values())
     assert 300 < sum(float_costs_pct(tiny).values()) <= 100 * 3.2  # all in float: 4.2 times the instructions
-    mixed, steps = chooser.mixed(scheme, sensitivity, budget_pct=1e-6, max_cost_pct=20)
-    assert len(steps) > 1 and list(mixed.float_blocks) == steps[-1]["float_blocks"]
 
 
 @pytest.fixture
@@ -355,7 +325,7 @@ def off_by(checkpoint, *by):
     """Static INT8 whose actions are this far from FP32's."""
     bias = checkpoint.weights["action_head.bias"] + torch.tensor(by)
     act = ACT(checkpoint.config, {**checkpoint.weights, "action_head.bias": bias})
-    return q.QuantizedPolicy(Scheme(), checkpoint.config, act, {})
+    return q.QuantizedPolicy(Scheme(), act, {})
 
 
 def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
@@ -365,7 +335,7 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     car = Car.of(described)
     recorded = load_recordings(record_drives(tmp_path / "drives", drives=1)).samples[::6]
     policy = replace(tiny, config=replace(tiny.config, rate_hz=12.0, image_sizes=((72, 96),)))
-    exporter = Exporter(policy, [replace(s, car=car) for s in recorded], Parity(1e-4, 2.0, 3))
+    exporter = Exporter(policy, [replace(s, car=car) for s in recorded])
     exporter.export(off_by(policy, 0.02, 0.5), tmp_path / "a.pt", calibration)
     found = load_policy(tmp_path / "a.pt")
     assert found.rate_hz == 12 and found.car.drives_like(car) and not found.car.drives_like(Car())

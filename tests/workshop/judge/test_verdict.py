@@ -161,6 +161,10 @@ def test_what_weakens_a_verdict_is_said(demo):
     assert judged["deploy"] == "static" and "throttle" not in judged["why"][0]
     for part in ("5 of 6 episodes", "throttle up to 0.27", "mirrored?", "Nobody drove"):
         assert part in "\n".join(judged["cautions"])
+    demo["load"]["split"] = {"calibration": ["a"], "held_out": ["a"]}
+    demo["quantize"]["warnings"] = [f"layer{i}: dead" for i in range(9)]
+    cautions = judge(demo)["cautions"]
+    assert len(cautions) == 5 and "1 episode, which were also used to calibrate" in cautions[1]
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
@@ -196,22 +200,12 @@ def test_on_a_busy_machine_the_least_times_are_compared(demo):
     assert any("busy" in line and "53 %" in line for line in judged["cautions"])
 
 
-def test_one_drive_that_judges_itself_is_too_little_to_be_sure(demo):
-    demo["load"]["split"] = {"calibration": ["a"], "held_out": ["a"]}
-    demo["quantize"]["warnings"] = [f"layer{i}: dead" for i in range(9)]
-    cautions = judge(demo)["cautions"]
-    assert "1 episode, which were also used to calibrate: too few" in cautions[0] and len(cautions) <= 5
-
-
 def test_odd_frames_are_named(demo):
-    odd = {"steering_mae_pct": None, "throttle_mae_pct": 7.84}
-    errors = {"usual": {"steering_mae_pct": 0.21, "throttle_mae_pct": 0.59}, "odd": odd}
+    errors = {"odd": {"steering_mae_pct": None, "throttle_mae_pct": 7.84}}
     where = {"block": "backbone.layer4", "times": 235.7, "episodes": {"a": 1, "b": 1}, "rows": [0, 3]}
     demo["quantize"]["odd"] = {"share_pct": 3.5, "errors": errors} | where
     miss(demo, 2.8, "static", "mixed")
     judged = judge(demo)
     (said,) = (line for line in judged["cautions"] if "backbone.layer4" in line)
-    for part in ("3.5 %", "(a, b, frame 3 or earlier)", "236 times", "7.84 %"):
-        assert part in said
-    remedies = " ".join(judged["failed"][0]["remedies"])
-    assert "leave out drives" in remedies
+    assert all(part in said for part in ("3.5 %", "(a, b, frame 3 or earlier)", "236 times", "7.84 %"))
+    assert "leave out drives" in " ".join(judged["failed"][0]["remedies"])

@@ -19,7 +19,7 @@ def demo(tmp_path):
     return shutil.copytree(DEMO, tmp_path / "runs" / "demo")
 
 
-def test_a_run_its_report_a_flight_log_and_a_calibration(demo, calibration, tmp_path):
+def test_a_run_its_report_and_a_flight_log(demo, tmp_path):
     (demo / "policy_static.pt").write_bytes(b"x" * 1_200_000)
     described = describe(Source(demo))["run"]
     assert described["artifacts"] == {"policy_static.pt": "1.2 MB"} and "compare" in described["stages"]
@@ -28,9 +28,6 @@ def test_a_run_its_report_a_flight_log_and_a_calibration(demo, calibration, tmp_
     with FlightLog(tmp_path / "flight.log", header={"hz": 30}, max_bytes=1_000_000, keep=1):
         pass
     assert "drives" in describe(Source(tmp_path / "flight.log"))["flight log"]
-    calibration.save(tmp_path / "calibration.pt")
-    described = describe(Source(tmp_path / "calibration.pt"))["calibration"]
-    assert described["samples"] == calibration.samples and described["tensors"] == len(calibration.frames)
 
 
 def test_runs_are_listed_with_their_verdicts(demo):

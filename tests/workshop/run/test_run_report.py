@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.run import run_report as report
@@ -35,27 +34,17 @@ def change_stage(path, part, **values):
 
 
 def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
-    """`rover distill --name` leaves its student's in a run that is there, `rover quantize -o` what was asked for."""
+    """`rover distill --name` leaves its student's in a run that is there."""
     shutil.copy(artifacts["static"], run_dir / "policy_static.pt")
     (run_dir / "run.json").write_bytes(before := b"of before")
     with pytest.raises(RoverError, match=r"policy_static\.pt: not the artifact"):
         report.write(run_dir)
     assert (run_dir / "run.json").read_bytes() == before
-    its = content_hash(artifacts["static"])
-    modes = read_stage(run_dir / "quantize.json", "quantize")["metrics"]["modes"]
-    change_stage(
-        run_dir / "quantize.json", "metrics", modes=modes | {"static": modes["static"] | {"content_hash": its}}
-    )
-    for path in (run_dir / "compare.json", next(run_dir.glob("benchmark-*.json"))):
-        change_stage(path, "inputs", **{"policy_static.pt": its})
-    report.write(run_dir)
 
 
 def of_another_run(path):
     content = json.loads(path.read_text())
     content["inputs"] = {name: "0" * 64 for name in content["inputs"]}
-    for timed in content["metrics"].get("artifacts", {}).values():
-        timed["latency_p50_ms"] = 9999.0
     return json.dumps(content)
 
 
@@ -63,9 +52,8 @@ def test_times_of_what_the_run_was_before_are_no_verdict(run_dir):
     """A run that is made again keeps the benchmarks of other hosts."""
     (own,) = run_dir.glob("benchmark-*.json")
     (run_dir / "benchmark-a-host.json").write_text(of_another_run(own))
-    content = report.write(run_dir)
-    assert own.name in content["inputs"] and "benchmark-a-host.json" not in content["inputs"]
-    assert all(mode["latency_p50_ms"] < 9999 for mode in content["metrics"]["modes"])
+    inputs = report.write(run_dir)["inputs"]
+    assert own.name in inputs and "benchmark-a-host.json" not in inputs
     own.unlink()
     with pytest.raises(RoverError, match="no benchmark of its artifacts"):
         report.write(run_dir)

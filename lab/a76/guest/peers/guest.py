@@ -9,7 +9,6 @@ camera's BGR frame goes in, actions come out, and everything in between is count
 
 import ctypes
 import sys
-import types
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -18,13 +17,7 @@ import numpy as np
 from inferences import leave, loaded, predict_all
 from planes import planes
 
-import rover_lib
-
-# The package's own __init__ loads torch, whose memory would count as the peer's; prepare_frame does not need it.
-package = types.ModuleType("rover_lib.onboard")
-package.__path__ = [str(Path(rover_lib.__file__).parent / "onboard")]
-sys.modules[package.__name__] = package
-from rover_lib.onboard.policy.preprocess import prepare_frame  # noqa: E402
+from rover_lib.onboard.policy.preprocess import prepare_frame
 
 Run = Callable[[np.ndarray, np.ndarray], np.ndarray]  # state (1, S), planes -> (chunk, A), all float32
 
