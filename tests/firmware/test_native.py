@@ -22,17 +22,14 @@ PULSES = "PERIOD", "MIN", "NEUTRAL", "MAX"
 SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 
-def fuzz(program, lines, seed):
-    return subprocess.run([program, str(lines), str(seed)], capture_output=True, text=True, timeout=600)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [100_000, pytest.param(10_000_000, marks=pytest.mark.release)])
 @pytest.mark.parametrize("human", ["receiver", "gamepad"])
 def test_random_and_mutated_lines(count, human):
     """Never an unsafe pulse, no stuck state, no access out of bounds: tests/firmware/fuzz.c says what is unsafe."""
     gamepad = ["-DHUMAN_GAMEPAD"] * (human == "gamepad")
-    done = fuzz(uno.compiled(f"fuzz-{human}", *SANITIZE, *gamepad, FUZZ, *SOURCES), count, 1)
+    program = uno.compiled(f"fuzz-{human}", *SANITIZE, *gamepad, FUZZ, *SOURCES)
+    done = subprocess.run([program, str(count), "1"], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     numbers = map(int, re.findall(r"\d+", done.stdout))
     lines, commands, driven, *kinds, starts, clock_wraps, sequence_wraps, cars = numbers

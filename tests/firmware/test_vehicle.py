@@ -25,6 +25,14 @@ def board():
     return board
 
 
+@pytest.fixture
+def armed(board):
+    """Running, and armed by its human."""
+    board.wiggle()
+    assert board.command("A") == "k"
+    return board
+
+
 def throttles(pins):
     return [throttle_us for _, throttle_us in pins]
 

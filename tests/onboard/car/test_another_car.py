@@ -1,13 +1,14 @@
 """A car other than the first: its recordings, its artifacts, its reverse, and its policy on a different car."""
 
 import json
+from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from rover_lib.onboard.artifact.manifest import car_of
-from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.arming import arm_capped
 from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
@@ -16,13 +17,7 @@ from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, json_controls, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 
-CRAWLER = Car.of(
-    {
-        "name": "crawler",
-        "steering": {"period_us": 20000, "left_us": 2000, "neutral_us": 1500, "right_us": 1000},
-        "throttle": {"period_us": 20000, "neutral_us": 1500, "forward_us": 2000, "reverse_us": 1000},
-    }
-)
+CRAWLER = read_car(Path(__file__).parents[3] / "lab" / "cars" / "crawler.yml")
 
 
 def episode(folder, car, name="episode_20260101_000000"):

@@ -1,6 +1,7 @@
 """The newest frame: from streams and devices, also when these stop, change or repeat themselves."""
 
 import os
+from unittest.mock import Mock, call
 
 import cv2
 import hostile
@@ -155,30 +156,16 @@ def test_stamps_that_become_old_are_a_fault_and_those_that_always_were_no_frames
     assert Readings().read(live(30), lambda now_s, i: stamp(now_s) - 2) == []
 
 
-class Device:
-    """The part of OpenCV's V4L2 device that is used here."""
-
-    def __init__(self, fourcc, picture):
-        self.fourcc, self.picture, self.converts = fourcc, picture, True
-        self.isOpened = self.release = lambda: True
-
-    def set(self, what, value):
-        if what == cv2.CAP_PROP_CONVERT_RGB:
-            self.converts = bool(value)
-        return True
-
-    def get(self, what):
-        return {cv2.CAP_PROP_FOURCC: self.fourcc, cv2.CAP_PROP_POS_MSEC: 2500.0}[what]
-
-    def read(self):
-        return True, cv2.imdecode(np.frombuffer(self.picture, np.uint8), 1) if self.converts else self.picture
-
-
 @pytest.mark.parametrize("fourcc", ["MJPG", "YUYV"])
 def test_jpegs_of_a_device_are_decoded_here_and_others_by_opencv(monkeypatch, fourcc):
     """OpenCV gives a device's JPEG as (1, bytes) uint8 if told not to convert it."""
-    device = Device(cv2.VideoWriter.fourcc(*fourcc), np.frombuffer(hostile.WHOLE, np.uint8)[None])
+    is_jpeg, given = fourcc == "MJPG", hostile.scene()
+    if is_jpeg:
+        given = np.frombuffer(hostile.WHOLE, np.uint8)[None]
+    device = Mock(read=lambda: (True, given))
+    device.get = {cv2.CAP_PROP_FOURCC: cv2.VideoWriter.fourcc(*fourcc), cv2.CAP_PROP_POS_MSEC: 2500.0}.get
     monkeypatch.setattr(cv2, "VideoCapture", lambda source, backend: device)
     picture, stamp_s = next(c._v4l2("/dev/video0", (640, 360), 30))
-    assert (picture == hostile.WHOLE) if fourcc == "MJPG" else picture.shape == (360, 640, 3)
+    assert (call(cv2.CAP_PROP_CONVERT_RGB, 0) in device.set.mock_calls) == is_jpeg
+    assert picture == hostile.WHOLE if is_jpeg else picture is given
     assert stamp_s == 2.5
