@@ -81,9 +81,10 @@ def test_a_file_that_a_killed_process_left_is_removed_by_the_next(tmp_path):
 
     in_fork(write_half)
     (tmp_path / ".a.json.mine.json").touch()
-    with atomic_path(tmp_path / "a.json") as first, atomic_path(tmp_path / "a.json") as second:
+    with atomic_path(tmp_path / "a.json") as first:
         first.write_text("first")
-        second.write_text("second")
+        with atomic_path(tmp_path / "a.json") as second:
+            second.write_text("second")
     assert (tmp_path / "a.json").read_text() == "first" and names_in(tmp_path) == [".a.json.mine.json", "a.json"]
 
 

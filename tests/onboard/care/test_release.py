@@ -271,6 +271,8 @@ def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, third):
     releases.rollback()
     assert releases.prune(1) == [second] and (releases.releases / ".git").exists()
     assert_drives(releases, {first})
+    damage(releases.path_of("current"))
+    assert releases.prune(1) == [] and releases.path_of("current").exists()
 
 
 @pytest.mark.parametrize("spoiled", ["damaged", "gone", "elsewhere"])

@@ -279,9 +279,14 @@ def test_an_unplugged_arduino_keeps_what_there_is(tmp_path, virtual, monkeypatch
 
 @pytest.mark.parametrize(
     ("number", "when", "episodes"),
-    [(signal.SIGINT, "recording", 3), (signal.SIGTERM, "recording", 1), (signal.SIGINT, "pause", 1)],
+    [
+        (signal.SIGINT, "recording", 3),
+        (signal.SIGTERM, "recording", 1),
+        (signal.SIGINT, "pause", 1),
+        (None, "fault", 1),
+    ],
 )
-def test_signals_end_an_episode_or_all(tmp_path, monkeypatch, number, when, episodes):
+def test_signals_and_faults_end_an_episode_or_all(tmp_path, monkeypatch, number, when, episodes):
     begun = []
 
     def record_one(*_, stop, **options):
@@ -289,7 +294,7 @@ def test_signals_end_an_episode_or_all(tmp_path, monkeypatch, number, when, epis
         if when == "recording" and len(begun) == 1:
             signal.raise_signal(number)
             assert stop.is_set()
-        return module.RecordReport(tmp_path, 3, 3, 0.1, (0, 0), None)
+        return module.RecordReport(tmp_path, 3, 3, 0.1, (0, 0), "unplugged" if when == "fault" else None)
 
     def pause(stop, _):
         if when == "pause":
@@ -301,5 +306,5 @@ def test_signals_end_an_episode_or_all(tmp_path, monkeypatch, number, when, epis
     for device in ("Camera", "ServoLink"):
         monkeypatch.setattr(module, device, lambda *_, **options: nullcontext())
     done = CliRunner().invoke(main, ["record", "--episodes", "3", "--label", "to the left", str(tmp_path)])
-    assert done.exit_code == 0 and done.stdout.count("recorded: ") == len(begun) == episodes
+    assert done.exit_code == (when == "fault") and done.stdout.count("recorded: ") == len(begun) == episodes
     assert begun[0]["label"] == "to the left"
