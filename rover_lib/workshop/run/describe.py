@@ -19,7 +19,6 @@ from rover_lib.workshop.recordings.turning import measure_sides
 
 FIRST = "make demo, or rover run, makes the first"
 BULK = 200  # characters; of a longer value in a report only the number of its items is shown
-STAGES = ("load", "calibrate", "quantize", "compare", "arm", "drive", "students", "distill", "finetune", "learn")
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -58,8 +57,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
 def _run(folder: Path) -> dict[str, Any]:
     files = sorted([*folder.glob("policy_*.pt"), *folder.glob(f"policy_*{ONNX_SUFFIX}")])
     artifacts = {p.name: f"{p.stat().st_size / 1e6:.1f} MB" for p in files}
-    stages = [stage for stage in STAGES if (folder / f"{stage}.json").is_file()]
-    stages += sorted(p.stem for p in folder.glob("benchmark-*.json"))
+    stages = sorted(p.stem for p in folder.glob("*.json") if p.name != "run.json")
     return {"verdict": verdict_of(folder), "stages": stages, "artifacts": artifacts}
 
 

@@ -18,7 +18,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import Source
-from rover_lib.workshop.run.units import Units, in_todays_units
+from rover_lib.workshop.run.units import in_todays_units
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
 
@@ -33,17 +33,13 @@ class Opened:
 
 
 def load(
-    checkpoint: Path | str,
-    episodes: Path | str | Source,
-    progress: Progress = silent,
-    units: Units | None = None,
-    checked: str | None = None,
+    checkpoint: Path | str, episodes: Path | str | Source, progress: Progress = silent, checked: str | None = None
 ) -> Opened:
     """Read a checkpoint and its recordings, and split the recordings as params.yml says.
 
     A LeRobot policy gets its own cameras of a LeRobotDataset unless the user chose others, and the dataset's order and
-    rate of numbers; one that was trained on the actions of older firmware gets today's units. units: that an earlier
-    call found. checked: as of `load_checkpoint`. Raises CheckpointError and EpisodeError.
+    rate of numbers; one that was trained on the actions of older firmware gets today's units. checked: as
+    of `load_checkpoint`. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
     policy = load_checkpoint(checkpoint, checked)
@@ -53,7 +49,7 @@ def load(
         source = replace(source, cameras=theirs if is_hub_id(source.path) or is_dataset(source.path) else ())
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
-    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration, units)
+    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration)
     check_limits(policy.path, recorded.config)  # again, because its rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 
@@ -67,8 +63,7 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     given, loaded = stage["params"], stage["metrics"]["checkpoint"]
     if sum(loaded["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
-    units = loaded.get("units", {})  # to find them again would take planning
-    again = load(given["checkpoint"], Source.loaded(given), progress, units, loaded["sha256"])
+    again = load(given["checkpoint"], Source.loaded(given), progress, loaded["sha256"])
     now = again.checkpoint
     then = stage["metrics"].get("recordings", {}).get("layout"), stage["metrics"]["split"]
     words = again.recordings.layout.words()

@@ -12,28 +12,23 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation
-from rover_lib.workshop.recordings.formula import OLD
+from rover_lib.workshop.recordings.formula import OLD, Formula
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
 FRAMES = 8  # planned twice, in FP32
-Units = Mapping[str, Sequence[float]]  # by action, neutral_pct and span_pct of the formula that the policy learned
 BETTER = 0.5  # the files' reading must leave at most this share of the error; one of the two is off by 222 us
 
 
-def in_todays_units(
-    policy: Checkpoint, recordings: Recordings, samples: Sequence[Sample], known: Units | None = None
-) -> Checkpoint:
+def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequence[Sample]) -> Checkpoint:
     """Return the policy, in the units of today's actions if it was trained on others.
 
     Recordings of the recorded car that follow today's formula may be newer than what the policy learned from: then OLD
-    is tried. samples: to plan on. known: what an earlier call found, as its report's "units" say.
+    is tried. samples: to plan on.
     """
     if policy.config.action_names != ACTION_NAMES or policy.config.state_names != ACTION_NAMES:
         return policy
     car = car_of(recordings.samples)
-    if known is not None:
-        return _in_units_of(policy, car, known) if known else policy
     recorded = {n: OLD[n] for e in recordings.episodes for n in e.formulas}
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
@@ -41,17 +36,18 @@ def in_todays_units(
     few = pick_evenly(samples, FRAMES)
     best, least = policy, BETTER * _error(policy, few) if tried else 0.0
     for formulas in tried:
-        converted = _in_units_of(policy, car, {n: (f.neutral_pct, f.span_pct) for n, f in formulas.items()})
+        converted = _in_units_of(policy, car, formulas)
         if (error := _error(converted, few)) <= least:
             best, least = converted, error
     return best
 
 
-def _in_units_of(policy: Checkpoint, car: Car, units: Units) -> Checkpoint:
+def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) -> Checkpoint:
     """Return the policy with today's actions outside, and those of the formulas inside."""
     # What a file says is gain * action + offset.
     channels = [car.pwm.channel(name) for name in ACTION_NAMES]
-    neutral, span = np.array([units.get(c.name, (c.neutral_pct, c.span_pct)) for c in channels]).T
+    learned = [formulas.get(c.name, c) for c in channels]
+    neutral, span = np.array([(f.neutral_pct, f.span_pct) for f in learned]).T
     gains = np.array([c.span_pct for c in channels]) / span
     offsets = (np.array([c.neutral_pct for c in channels]) - neutral) / span
     same = Affine((1.0, 1.0), (0.0, 0.0))
@@ -62,10 +58,9 @@ def _in_units_of(policy: Checkpoint, car: Car, units: Units) -> Checkpoint:
         state_norm=_affine(np.array(state.scale) * gains, np.array(state.scale) * offsets + np.array(state.shift)),
         action_unnorm=_affine(scale / gains, (shift - offsets) / gains),
     )
-    said = ", ".join(f"{name} = (duty % - {at:g}) / {by:g}" for name, (at, by) in units.items())
+    said = ", ".join(f"{name} = (duty % - {f.neutral_pct:g}) / {f.span_pct:g}" for name, f in formulas.items())
     words = normalisation(config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
-    report = policy.report | {"normalisation": words, "units": {name: list(pair) for name, pair in units.items()}}
-    return replace(policy, config=config, report=report)
+    return replace(policy, config=config, report=policy.report | {"normalisation": words})
 
 
 def _affine(scale: np.ndarray, shift: np.ndarray) -> Affine:

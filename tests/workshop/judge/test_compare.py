@@ -135,17 +135,15 @@ def test_an_action_that_never_changed_is_neither_judged_nor_drawn(policies):
     assert isinstance(plots.action_error(nothing), Note) and isinstance(plots.worst_frames(nothing), Note)
 
 
-@pytest.mark.parametrize(
-    ("samples", "names", "ranges"),
-    [
-        ([], ("steering", "throttle"), RANGE),
-        ([sample()], ("a", "b"), RANGE),  # of another checkpoint
-        ([sample()], ("steering", "throttle"), {"steering": (0, 1)}),
-    ],
-)
-def test_refusals(samples, names, ranges, tmp_path):
-    with pytest.raises(PolicyError):
-        compare.fidelity(Fixed(np.zeros((3, 2))), {"static": Fixed(np.zeros((3, 2)), names=names)}, samples, ranges)
+def test_refusals(tmp_path):
+    policy, another = (Fixed(np.zeros((3, 2)), names=names) for names in (("steering", "throttle"), ("a", "b")))
+    for other, samples, ranges in (
+        (policy, [], RANGE),
+        (another, [sample()], RANGE),  # of another checkpoint
+        (policy, [sample()], {"steering": (0, 1)}),
+    ):
+        with pytest.raises(PolicyError):
+            compare.fidelity(policy, {"static": other}, samples, ranges)
     with pytest.raises(PolicyError):
         compare.load_policies(tmp_path)  # no FP32 is there
 

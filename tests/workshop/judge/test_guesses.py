@@ -62,10 +62,6 @@ def test_only_a_policy_that_sees_beats_the_guesses(plan, unbeaten, episodes):
     assert {name for name, g in judged.guesses.items() if not g.beaten} >= set(unbeaten)
     assert bool(judged.warnings()) == bool(unbeaten)
     assert ("pieces" in judged.drawn) == (episodes == 1) and str(episodes) in judged.drawn
-    for guess in judged.guesses.values():
-        assert guess.low <= guess.better <= guess.high
-        errors = (np.mean(list(errors.values())) for errors in (guess.errors_pct, judged.errors_pct))
-        assert guess.better == pytest.approx(np.subtract(*errors))
     assert judged.summary()["guesses"].keys() == set(GUESSES) and "points" in str(judged.table())
 
 

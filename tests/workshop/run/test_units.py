@@ -13,8 +13,6 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.formula import OLD
-from rover_lib.workshop.run import session, units
-from rover_lib.workshop.run.pipeline import write_load
 from rover_lib.workshop.run.units import in_todays_units
 
 PWM = PwmCalibration()
@@ -75,16 +73,3 @@ def test_policies_of_todays_and_of_older_actions_on_newer_recordings(tiny, old_r
     of_it = [replace(e, samples=tuple(replace(s, car=crawler) for s in e.samples)) for e in newer.episodes]
     another = replace(newer, episodes=tuple(of_it))
     assert in_todays_units(older, another, another.samples) is older
-
-
-@pytest.mark.slow
-def test_what_notebook_01_found_is_not_planned_again(tiny, old_recordings, tmp_path, monkeypatch):
-    """Sixteen plans of a full-size policy take seconds, and five notebooks open a run."""
-    for neutral in (0.2, 0.05):
-        monkeypatch.setattr(session, "load_checkpoint", lambda *_, n=neutral: speaks(tiny, n, 1e-3))
-        with monkeypatch.context() as first:
-            opened = session.load(tiny.path, old_recordings.root)
-            write_load(tmp_path / "run", opened)
-            first.setattr(units, "_error", lambda *given: pytest.fail("it was planned again"))
-            again = session.open_run(tmp_path / "run").checkpoint
-        assert (again.config, again.report) == (opened.checkpoint.config, opened.checkpoint.report)
