@@ -22,7 +22,6 @@ SIZE = click.option(
 @click.command("export-dataset", short_help="Write recordings, or a tub, as a LeRobotDataset v3.")
 @click.argument("recordings", type=FILE)
 @click.argument("out", type=FILE)
-@click.option("--video", is_flag=True, help="Write AV1 video: far smaller than images, but lossy [default: images].")
 @SIZE
 @click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a tub that drives forward by < 0.")
 @AS_JSON

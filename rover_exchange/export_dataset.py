@@ -5,7 +5,6 @@ If a policy drove in one of the recordings, `intervention` says where a human ha
 """
 
 import json
-import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.lerobot_dataset import ACTION, BACKEND, CAR, DRIVEN_BY, INTERVENTION, REPORT, STATE
+from rover_lib.workshop.recordings.lerobot_dataset import ACTION, CAR, DRIVEN_BY, INTERVENTION, REPORT, STATE
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, CAMERA, LEAST_RATED, Episode, Recordings, Sample
 from rover_lib.workshop.recordings.turning import measure_sides
 
@@ -37,14 +36,13 @@ def export_dataset(
     episodes: Path | str | Recordings,
     out: Path | str,
     *,
-    video: bool = False,
     size: tuple[int, int] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Write all usable samples to `out`, a new folder, once it is complete, and return what was written and left out.
 
-    episodes: the recordings, or their folder. video: True writes AV1, which loses detail; False PNG inside parquet.
-    size: (height, width) to which the pictures are resized; None keeps the recorded size. Raises EpisodeError for
+    episodes: the recordings, or their folder. Pictures become PNG in parquet; `lerobot-edit-dataset` makes videos of
+    them. size: (height, width) to which the pictures are resized; None keeps the recorded size. Raises EpisodeError for
     recordings that cannot be used, of several cars, rates or (without `size`) picture sizes, a size that no artifact
     takes, and an existing `out`; RoverError while another process makes `out`.
     """
@@ -64,7 +62,7 @@ def export_dataset(
     car = recorded_as.car_of(recordings.samples)
     with build_folder(out) as new:
         made = new / "dataset"  # LeRobot makes its folder itself
-        report = _write(recordings, made, rate_hz, video, size, progress) | {CAR: car.description()}
+        report = _write(recordings, made, rate_hz, size, progress) | {CAR: car.description()}
         for path in made.iterdir():
             path.rename(new / path.name)
         made.rmdir()
@@ -116,9 +114,8 @@ def _parts(
 
 
 def _write(
-    recordings: Recordings, root: Path, rate_hz: int, video: bool, size: tuple[int, int] | None, progress: Progress
+    recordings: Recordings, root: Path, rate_hz: int, size: tuple[int, int] | None, progress: Progress
 ) -> dict[str, Any]:
-    os.environ.setdefault("SVT_LOG", "1")  # without it the AV1 encoder prints its settings at every episode
     # Imported here, because it takes seconds that no other command should wait for.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -129,11 +126,10 @@ def _write(
     dataset = LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=rate_hz,
-        features=_features(shape, video, by_policy),
+        features=_features(shape, by_policy),
         root=root,
         robot_type="rover",
-        use_videos=video,
-        video_backend=BACKEND,
+        use_videos=False,
     )
     left_out: Counter[str] = Counter(pictures_not_whole=0, too_short=0, nobody_drove=0)
     written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
@@ -157,7 +153,7 @@ def _write(
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
     lengths = [count for _, _, count in written]
     return {
-        "dataset": "LeRobotDataset v3, " + ("AV1 video" if video else "images"),
+        "dataset": "LeRobotDataset v3, images",
         "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
         "episodes": len(written),
         "frames": sum(lengths),
@@ -174,9 +170,9 @@ def _write(
     }
 
 
-def _features(shape: tuple[int, ...], video: bool, by_policy: bool) -> dict[str, Any]:
+def _features(shape: tuple[int, ...], by_policy: bool) -> dict[str, Any]:
     """Return the dataset's columns, as LeRobot's own commands declare them."""
-    picture = {"dtype": "video" if video else "image", "shape": shape, "names": ["height", "width", "channels"]}
+    picture = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
     features = {f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers}
     if by_policy:

@@ -55,7 +55,7 @@ class _Record:
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
     """Read all usable records as samples of two actions.
 
-    throttle: "as-recorded", "negated" or None. Raises EpisodeError for what is no tub or has no record, and if
+    throttle: "as-recorded", "negated" or None. Raises EpisodeError for another folder or one without records, and if
     `throttle` is None and three in four throttles are negative.
     """
     tub = Path(tub)

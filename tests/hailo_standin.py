@@ -73,11 +73,6 @@ class InferModel:
         answer.buffer[...] = y[0].transpose(1, 2, 0).reshape(answer.buffer.shape)
 
 
-class VDevice:
-    def create_infer_model(self, hef_source: bytes) -> InferModel:
-        return InferModel(hef_source)
-
-
 def compile_kit(kit: Path) -> Path:
     """Do what Hailo's compiler would, and return the path of the HEF."""
     content, model = json.loads((kit / "kit.json").read_text()), onnx.load(kit / "backbone.onnx")
@@ -96,4 +91,6 @@ def compile_kit(kit: Path) -> Path:
 def install(monkeypatch) -> None:
     """Install the package until the test ends."""
     formats = types.SimpleNamespace(UINT8=np.uint8, FLOAT32=np.float32)
-    monkeypatch.setitem(sys.modules, "hailo_platform", types.SimpleNamespace(VDevice=VDevice, FormatType=formats))
+    device = types.SimpleNamespace(create_infer_model=InferModel)
+    package = types.SimpleNamespace(VDevice=lambda: device, FormatType=formats)
+    monkeypatch.setitem(sys.modules, "hailo_platform", package)

@@ -48,7 +48,7 @@ def test_from_recordings_to_a_drive(tmp_path, monkeypatch):
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     rover("world", "record", recorded, "--count", 3)
-    rover("export-dataset", recorded, dataset, "--size", "64x36", "--video")
+    rover("export-dataset", recorded, dataset, "--size", "64x36")
     new = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY)
     last = lerobot_train(dataset, tmp_path / "train", *new, "--steps=2", "--save_freq=2", "--batch_size=2", cache=cache)
     words = json.loads(rover("inspect", tmp_path / "train", "--json"))["checkpoint"]

@@ -28,8 +28,8 @@ esac
 """
 DRIVING = """#!/bin/sh
 echo "$*" >> {folder}/rover
-case $1 in
-  heartbeat) [ $(grep -c ^heartbeat {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
+case $* in
+  *--heartbeat) [ $(grep -c heartbeat$ {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
 esac
 """
 
@@ -162,5 +162,6 @@ def test_the_model_that_was_checked_is_armed_and_the_laptop_is_heard(fleet, arti
     verified, doctor, *asked = (fleet.folder / "rover").read_text().splitlines()
     model = content_hash(artifacts["static"])
     assert verified.startswith("release ") and doctor.startswith("doctor ")
-    assert asked == [f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10", "heartbeat", "heartbeat"]
+    armed = f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10"
+    assert asked == [armed, "arm-car --heartbeat", "arm-car --heartbeat"]
     assert "stop" in (fleet.folder / "asked").read_text().splitlines()[-1]

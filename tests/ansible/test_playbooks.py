@@ -14,10 +14,8 @@ import jinja2
 import pytest
 import yaml
 from click.testing import CliRunner
-from pty_board import board_of, obedient
 
 from rover_lib.cli import main
-from rover_lib.onboard.car.car import Car, yaml_of
 from rover_lib.onboard.drive.watch import PRIORITY
 
 pytestmark = pytest.mark.slow  # Ansible takes a second to start
@@ -260,17 +258,6 @@ def test_the_service_may_open_what_its_camera_and_its_human_need_and_no_more():
         lines = render(DRIVE, rover_camera=camera, rover_gamepad=gamepad).splitlines()
         assert [f"DeviceAllow=char-{d} rw" in lines for d in ("media", "dma_heap")] == [not gamepad] * 2
         assert ("DeviceAllow=char-input r" in lines) == gamepad == ("SupplementaryGroups=video dialout input" in lines)
-
-
-@pytest.mark.parametrize(("firmware", "flashes"), [("4.2.0-gamepad", False), ("4.2.0", True)])
-def test_a_board_is_not_flashed_again_for_want_of_a_gamepad(tmp_path, firmware, flashes):
-    tasks = yaml.safe_load((ROLE / "tasks" / "firmware.yml").read_text())
-    (asks,) = [task["ansible.builtin.command"]["argv"] for task in tasks if "Ask the Arduino" in task["name"]]
-    (tmp_path / "car.yml").write_text(yaml_of(Car(human="gamepad")))
-    with board_of(answer=obedient, hello=f"<H 4 {firmware} 7 0 e {Car().id}") as board:
-        env = {**os.environ, "ROVER_CAR": str(tmp_path / "car.yml")}
-        done = subprocess.run([sys.executable, *asks[1:-1], board.port], env=env, capture_output=True, text=True)
-    assert bool(done.returncode) == flashes, done.stderr
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root: the playbook gives files to root")

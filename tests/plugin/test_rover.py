@@ -1,21 +1,16 @@
 """The robot by itself: what LeRobot may ask of it, and what it refuses. On a stand-in for the Arduino."""
 
-import ctypes
 import math
 import time
 from types import SimpleNamespace
 
 import cv2
-import needs
 import numpy as np
 import pytest
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
-from needs import real_time, simavr, until
+from needs import real_time, until
 
-from balloon_world.simulated_arduino import REST_US
-from lab.arduino.emulator import NICE, EmulatedArduino
-from lab.driving.pins import STOPPED, Observation, judge
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
 from lerobot_robot_rover.line import FEATURES, named
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -24,7 +19,6 @@ from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError
 
 GO = {"steering": 0.2, "throttle": 0.15}
-HUNG_S = 1.0
 
 
 def jpegs(blue=0):
@@ -73,7 +67,7 @@ def test_lerobot_makes_it_of_its_config(tmp_path):
         Rover(RoverConfig(calibration_dir=tmp_path, throttle_limit=1.5))
 
 
-def test_what_cannot_be_opened_keeps_nothing_open_and_connecting_waits_for_the_gesture(bench, monkeypatch):
+def test_connecting_waits_for_the_gesture_and_a_failure_closes_all(bench, monkeypatch):
     waited = []
     monkeypatch.setattr("lerobot_robot_rover.rover.arm_when_ready", lambda *given: waited.append(given))
     for options, error in (({"camera": "/dev/none"}, CameraError), ({"port": "/dev/none"}, LinkError)):
@@ -159,7 +153,7 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
     ],
     ids=["takeover", "unplugged"],
 )
-def test_what_a_drive_detects_is_detected(bench, happens, error, patient):
+def test_faults_of_a_drive_end_it(bench, happens, error, patient):
     with bench() as on:
         rover = connect(on)
         turn(rover, seconds=0.4)
@@ -215,27 +209,6 @@ def test_what_the_human_does_is_not_sent_and_ends_a_drive(bench):
         rover.disconnect()
         assert transmitter.get_action() == sticks  # the port is open as long as one of the two needs it
         transmitter.disconnect()
-
-
-@pytest.mark.emulated
-@pytest.mark.slow
-@simavr
-@real_time
-def test_a_hung_loop_leaves_a_stopped_car(bench):
-    """With the real firmware, on its pins: neither LeRobot's thread nor the drive's own goes on."""
-    with EmulatedArduino(transmitter=REST_US, ready=True, nice=NICE) as board, bench(board) as on:
-        on.robot.connect()
-        turn(on.robot, seconds=1.0)
-        at_s = time.monotonic()
-        events = board.pulses()
-        ctypes.PyDLL(None).usleep(int(HUNG_S * 1e6))  # native code that gives no other thread a turn
-        events += board.pulses()
-        on.robot.disconnect()
-    seen = Observation(events, [], at_s, at_s + HUNG_S)
-    _, wrong = judge(STOPPED, seen)
-    if wrong and seen.stalled_ms():
-        raise needs.Late(f"the emulated Arduino had no time: {wrong}")
-    assert wrong == []
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def artifact(tmp_path_factory):
     return path
 
 
-def test_what_is_no_artifact(tmp_path):
+def test_other_files_are_refused(tmp_path):
     with pytest.raises(ParamsError):
         RoverArtifactConfig(n_action_steps=0)
     with pytest.raises(ParamsError):

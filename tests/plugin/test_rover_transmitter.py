@@ -77,7 +77,7 @@ def test_the_sticks_by_car_yml(transmitter):
     assert transmitter.get_action() == named(1.0, 0.0)
 
 
-def test_a_lost_pulse_is_no_zero(transmitter):
+def test_a_lost_pulse_is_refused(transmitter):
     transmitter.connect()
     stretched = replace(status(1456, 120), receiver_steering_period_us=2 * 21316)
     for Link.status in (status(None, 120), status(1456, None), None, stretched):
@@ -85,7 +85,7 @@ def test_a_lost_pulse_is_no_zero(transmitter):
             transmitter.get_action()
 
 
-def test_a_throttle_that_the_car_does_not_get_is_no_data(transmitter):
+def test_a_withheld_throttle_is_refused(transmitter):
     transmitter.connect()
     withheld = partial(status, 1456, 170, pins=(1456, 120))
     for Link.status in (withheld(1.0), withheld(1.4), status(1456, 170, 1.45), withheld(1.6), withheld(2.0)):

@@ -38,12 +38,12 @@ def recorded(tmp_path):
     return tmp_path / "mine"
 
 
-def check_equal(found, expected, pixels=0):
+def check_equal(found, expected):
     assert len(found) == len(expected) > 0
     for ours, theirs in zip(found, expected, strict=True):
         for name in ("state", "chunk", "is_pad"):
             assert np.array_equal(getattr(ours, name), getattr(theirs, name))
-        assert np.abs(ours.frame_bgr().astype(int) - theirs.frame_bgr()).max() <= pixels
+        assert np.array_equal(ours.frame_bgr(), theirs.frame_bgr())
 
 
 def theirs_of(root):
@@ -73,7 +73,7 @@ def test_lerobot_reads_it_back_edits_it_and_so_do_we(recorded, tmp_path):
     check_equal(load(tmp_path / "less").samples, [s for s in original.samples if s.episode != original.episodes[1].id])
 
 
-def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
+def test_repairs_and_omissions_are_reported(recorded, tmp_path):
     first = recorded / "episode_20260101_120000"
 
     def change(content):
@@ -86,9 +86,9 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     (first / "frames/frame_000008.jpg").unlink()
     whole = (first / "frames/frame_000015.jpg").read_bytes()
     (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen in decoding
-    words = ["export-dataset", str(recorded), str(tmp_path / "out"), "--video", "--json"]
+    words = ["export-dataset", str(recorded), str(tmp_path / "out"), "--json"]
     result = CliRunner().invoke(main, words)
-    assert result.exit_code == 0 and list((tmp_path / "out").rglob("*.mp4")), result.output
+    assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "out/rover_export.json").read_text())
     kinds = {f["kind"]: f["count"] for f in report["faults_while_reading"]}
     assert kinds == {"serial_burst": 10, "throttle_zero_period": 1, "frame_missing": 1}
@@ -98,7 +98,7 @@ def test_what_is_repaired_and_left_out_is_said(recorded, tmp_path):
     again = load(tmp_path / "out").samples
     for ours, theirs in zip(again, original, strict=True):
         assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk[0], theirs.chunk[0])
-    check_equal(again[18:], original[18:], pixels=6)  # the first episode is in parts now; AV1 is close
+    check_equal(again[18:], original[18:])  # the first episode is in parts now
 
 
 def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
@@ -173,24 +173,17 @@ def test_interventions_are_lerobots(mixed, tmp_path):
     again = load(tmp_path / "out")
     assert [s.driver for s in again.samples] == [s.driver for s in ours] and again.faults == ()
     check_equal(again.samples, ours)
-    (tmp_path / "out" / "rover_export.json").unlink()  # without our report, all else is a policy's
+    path = tmp_path / "out" / "rover_export.json"
+    whole = json.loads(path.read_text())
+    for other in ({"car": {"name": "a cat"}}, {"driven_by": ["human"]}):  # a report of another dataset is not used
+        path.write_text(json.dumps(whole | other))
+        again = load(tmp_path / "out")
+        assert [f.kind for f in again.faults] == ["another_export"]
+        assert {s.driver for s in again.episodes[0].samples} == {"policy"}
+    path.unlink()  # without our report, all else is a policy's
     again = load(tmp_path / "out")
     assert [s.driver for s in again.episodes[0].samples] == ["policy"] * 40
     assert [s.driver for s in again.episodes[2].samples] == ["policy"] * 15 + ["human"] * 10
-
-
-@pytest.mark.parametrize(
-    "change", [lambda report: report.update(car={"name": "a cat"}), lambda report: report["driven_by"].pop()]
-)
-def test_a_report_of_another_dataset_is_not_used_and_said(mixed, tmp_path, change):
-    export_dataset(mixed, tmp_path / "out")
-    path = tmp_path / "out" / "rover_export.json"
-    report = json.loads(path.read_text())
-    change(report)
-    path.write_text(json.dumps(report))
-    again = load(tmp_path / "out")
-    assert [f.kind for f in again.faults] == ["another_export"]
-    assert {s.driver for s in again.episodes[0].samples} == {"policy"}
 
 
 # ---- whose car

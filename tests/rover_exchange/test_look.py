@@ -75,6 +75,9 @@ def test_pictures_of_another_drive_or_a_damaged_list_are_refused(tmp_path):
         listed.write_text(f"frame_id,timestamp,image_path\n{text}\n")
         with pytest.raises(EpisodeError, match=says):
             moments_of(flight)
+    (tmp_path / "episodes").rename(tmp_path / "gone")
+    with pytest.raises(EpisodeError, match="not there"):
+        moments_of(flight)
     flight.header.clear()
     with pytest.raises(RoverError, match="damaged"):
         moments_of(flight)
