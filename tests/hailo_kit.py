@@ -23,7 +23,7 @@ def normalised(tiny: Checkpoint) -> Checkpoint:
 
 
 def opened(checkpoint: Checkpoint) -> Opened:
-    parts = Split(tuple(memory_samples(FRAMES)), tuple(memory_samples(4, seed=1)), (), None, {})
+    parts = Split(tuple(memory_samples(FRAMES)), tuple(memory_samples(4, seed=1)), (), None)
     return Opened(checkpoint, None, parts)
 
 

@@ -12,8 +12,8 @@ from test_odd_policies import run_here
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.formula import OLD
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.describe import runs
 from rover_lib.workshop.run.run_report import PAGE, text, write, write_card

@@ -1,12 +1,11 @@
-"""Tables and figures of notebooks: cells can be copied, and figures are sharp."""
+"""Tables and figures of notebooks: cells can be copied."""
 
 import re
 
-from rover_lib.workshop import browse, plots
+from rover_lib.workshop import plots
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.style import Note
-from rover_lib.workshop.progress import TTY_VARIABLE
 
 
 def test_html_and_text_say_the_same():
@@ -30,16 +29,3 @@ def test_a_sentence_leaves_no_figure_and_takes_an_old_one_away(tmp_path):
     old.parent.mkdir()
     old.touch()
     assert repr(plots.save(Note("no faults"), tmp_path, "01_faults")) == "no faults" and not old.exists()
-
-
-def test_a_slider_is_for_somebody_who_can_move_it(monkeypatch):
-    drawn = []
-    monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
-    monkeypatch.delenv(TTY_VARIABLE, raising=False)
-    assert browse.browse(3, drawn.append) is None  # as under papermill and nbval
-    monkeypatch.setenv("JPY_SESSION_NAME", "/notebooks/01_load.ipynb")
-    slider, _ = browse.browse(3, drawn.append).children
-    slider.value = 2
-    assert drawn == [0, 2]
-    monkeypatch.setenv(TTY_VARIABLE, "/dev/pts/0")  # as in `rover run` from a terminal in JupyterLab
-    assert browse.browse(3, drawn.append) is None

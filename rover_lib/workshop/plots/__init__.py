@@ -12,13 +12,6 @@ from rover_lib.workshop.plots.benchmarks import latency
 from rover_lib.workshop.plots.comparison import action_error, hits, worst_frames
 from rover_lib.workshop.plots.counting import whole_size
 from rover_lib.workshop.plots.quantization import sensitivity
-from rover_lib.workshop.plots.recordings import (
-    checkpoint_size,
-    episode_overview,
-    faults,
-    frame,
-    odd_frames,
-    work_per_block,
-)
+from rover_lib.workshop.plots.recordings import checkpoint_size, episode_overview, faults, odd_frames, work_per_block
 from rover_lib.workshop.plots.style import save
 from rover_lib.workshop.plots.tables import gates

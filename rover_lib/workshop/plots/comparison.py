@@ -36,14 +36,12 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     return fig
 
 
-def worst_frames(
-    report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0, *, first: int = 0
-) -> Figure | Note:
+def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz: float = 30.0) -> Figure | Note:
     """Draw the frames on which a mode differs most from FP32: the picture, both plans, and what was recorded.
 
-    Of many actions, only the worst of each frame is drawn. first: how many of the worst frames to skip.
+    Of many actions, only the worst of each frame is drawn.
     """
-    frames = report.worst(mode, first + count)[first:]
+    frames = report.worst(mode, count)
     if not frames:
         return Note("no action changes in these recordings: no frame is the worst")
     every = report.action_names if len(report.action_names) <= MOST_ACTIONS else ()

@@ -82,20 +82,6 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     return fig
 
 
-def frame(sample: Sample, actions: Sequence[str] = ACTION_NAMES, rate_hz: float = 30.0) -> Figure:
-    """Draw what one sample saw, and what was done from there on, which is the plan that a perfect policy would make."""
-    fig, axes = new_figure(1, 2, height_in=2.6)
-    left, right = axes[0]
-    style.show_picture(left, sample, f"{sample.time_s:.1f} s in the episode")
-    known = ~sample.is_pad
-    times_s = np.arange(len(sample.chunk)) / rate_hz
-    for i, name in enumerate(actions):
-        right.plot(times_s[known], sample.chunk[known, i], color=style.action_colour(name, i), lw=1.8, label=name)
-    right.set(xlabel="s ahead", ylabel="what was done")
-    legend(right)
-    return fig
-
-
 def faults(recordings: Recordings) -> Figure | Note:
     """Draw what was wrong in the recordings, by kind, coloured by what was done about it."""
     counted = recordings.faults_by_kind()
