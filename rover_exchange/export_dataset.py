@@ -19,7 +19,6 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-from rover_lib.workshop.lerobot_moved import no_progress_bars
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -117,8 +116,10 @@ def _write(
     recordings: Recordings, root: Path, rate_hz: int, size: tuple[int, int] | None, progress: Progress
 ) -> dict[str, Any]:
     # Imported here, because it takes seconds that no other command should wait for.
+    from datasets import disable_progress_bars
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    disable_progress_bars()
     episodes = recordings.episodes
     recorded = recordings.samples[0].frame_bgr().shape
     shape = (*size, 3) if size else recorded
@@ -133,7 +134,7 @@ def _write(
     )
     left_out: Counter[str] = Counter(pictures_not_whole=0, too_short=0, nobody_drove=0)
     written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
-    with no_progress_bars(), warnings.catch_warnings():
+    with warnings.catch_warnings():
         # numpy warns when LeRobot computes statistics of yes and no
         warnings.filterwarnings("ignore", "Converting input from bool")
         try:

@@ -34,6 +34,7 @@ from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
 MOST_BYTES = 10_000_000  # of a manifest or a catalog; JSON takes 25 times its size, and a thousand records 200 kB
+MOST_LINES, MOST_CATALOGS = 50_000, 10_000  # donkeycar's catalogs have a thousand lines
 MOST_INDEX, MOST_MS = 10**9, 10**14
 OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
@@ -148,7 +149,11 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
         if Path(name).name != name or not (tub / name).is_file():
             faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
             continue
-        for number, line in enumerate(_read(tub / name).splitlines(), 1):
+        lines = _read(tub / name).splitlines()
+        if len(lines) > MOST_LINES:
+            faults.add(tub, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
+            continue
+        for number, line in enumerate(lines, 1):
             where = f"{name}, line {number}"
             try:
                 record = _parse(line)
@@ -174,9 +179,11 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
     """Return the names of the catalogs and the numbers of the deleted records, from the manifest's last line."""
     try:
         last = json.loads(_read(path).splitlines()[-1])
+        if len(last["paths"]) > MOST_CATALOGS:
+            raise ValueError
         return list(map(str, last["paths"])), set(map(int, last.get("deleted_indexes") or []))
     except (ValueError, RecursionError, TypeError, LookupError, AttributeError, OverflowError):
-        raise EpisodeError(f"{path}: lists no catalogs or no deleted records", remedy=OLDER) from None
+        raise EpisodeError(f"{path}: lists no catalogs, too many, or no deleted records", remedy=OLDER) from None
 
 
 def _parse(text: str) -> _Record:

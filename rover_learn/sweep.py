@@ -19,7 +19,6 @@ import yaml
 
 from rover_lib.onboard.errors import ParamsError, RoverError
 from rover_lib.onboard.params import FOR_THIS_RUN, params, read_params
-from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -74,7 +73,8 @@ def read_sheet(path: Path | str) -> list[Job]:
     jobs = []
     for checkpoint, student in itertools.product(checkpoints, students):
         for of_notebooks, of_params in itertools.product(*(_combinations(values) for values in varied.values())):
-            jobs.append(Job(absolute(checkpoint), absolute(str(episodes)), student, of_notebooks, of_params))
+            inputs = str(Path(checkpoint).resolve()), str(Path(str(episodes)).resolve())
+            jobs.append(Job(*inputs, student, of_notebooks, of_params))
     names = [job.name for job in jobs]
     if twice := sorted(name for name in names if names.count(name) > 1):
         raise ParamsError(f"{path}: the same run twice", found=twice[0])

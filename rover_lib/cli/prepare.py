@@ -62,8 +62,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
-    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command; give a dataset on the
-    Hub as user/name@revision.
+    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command.
     Executes five notebooks in the run's folder. Ends with a verdict, also in report.html and run.json: which artifact
     to deploy, what failed, and what to do about it.
 

@@ -2,14 +2,13 @@
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import Any, TypeVar
 
-LINES_S = 20.0  # seconds of silence in a log
+RARELY: dict[str, Any] = {"delay": 20.0, "mininterval": 20.0}  # seconds: how a bar moves in a log
 LOG_VARIABLE = "ROVER_PROGRESS_LOG"  # the file into which the run's messages go, if that is no terminal
 TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal where a run was started: the notebooks draw their bars there
 
@@ -23,30 +22,20 @@ def silent(items: Iterable[T], **_: object) -> Iterable[T]:
 
 
 def terminal_bar() -> Progress:
-    """A bar if the output is a terminal; a line now and then if it goes to a log."""
+    """A bar if the output is a terminal; one that moves now and then if it goes to a log."""
     from tqdm import tqdm
 
-    return partial(tqdm, leave=False) if sys.stderr.isatty() else partial(lines, sys.stderr)
-
-
-def lines(stream: TextIO, items: Iterable[T], *, desc: str = "", total: int | None = None, **_: object) -> Iterator[T]:
-    """Yield the items, and write a line to the stream each LINES_S."""
-    told_s = time.monotonic()
-    for count, item in enumerate(items):
-        if time.monotonic() - told_s > LINES_S:
-            told_s = time.monotonic()
-            print(f"rover: {desc or 'at work'}: {count}{f' of {total}' if total else ''}", file=stream, flush=True)
-        yield item
+    return partial(tqdm, leave=False) if sys.stderr.isatty() else partial(tqdm, leave=False, **RARELY)
 
 
 def notebook_bar() -> Progress:
-    """A bar in the terminal where `rover run` was started, lines in its log, or a bar in JupyterLab; else none."""
+    """A bar in the terminal where `rover run` was started, in its log, or in JupyterLab; else none."""
     from tqdm import tqdm
     from tqdm.auto import tqdm as widget
 
     if name := os.environ.get(LOG_VARIABLE):
         with suppress(OSError):
-            return partial(lines, Path(name).open("a"))
+            return partial(tqdm, file=Path(name).open("a"), leave=False, **RARELY)
     if name := os.environ.get(TTY_VARIABLE):
         with suppress(OSError):  # open as long as the kernel lives
             return partial(tqdm, file=Path(name).open("w"), leave=False)

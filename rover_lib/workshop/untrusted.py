@@ -1,29 +1,104 @@
-"""What a file from anywhere holds, put in a sentence: short, on one line, and without a walk through all of it."""
+"""Files of strangers: what a decoder is given, how much memory it may take, and what a sentence quotes of them."""
 
+import io
 import json
-from collections.abc import Iterable
+import resource
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_plain
 
 JSON_BYTES = 60_000_000  # an hour and a half of driving
-MOST_VALUES = 2_000_000  # lists and objects: each takes 70 bytes and more, and in the file three
 LONGEST = 60  # characters of one value
 LARGEST = 10**20  # Python refuses to print an integer of thousands of digits
+MEMORY_BYTES = 450_000_000  # a frame of 4608x2592 takes 36 MB; a decoder holds a few
+STATM = Path("/proc/self/statm")
+FORMATS = ("PNG", "JPEG")  # what LeRobot writes; Pillow would start Ghostscript for PostScript
+CODECS = ("h264", "hevc", "av1", "libdav1d")  # what LeRobot writes, by FFmpeg's names of decoders
+ROW_BYTES = 4  # in a table, a frame's index and its time alone take more
+_LOCK = threading.RLock()
+
+
+@contextmanager
+def limited_memory(more_bytes: int = 0) -> Iterator[None]:
+    """Inside the block this process may take MEMORY_BYTES + more_bytes more than it has; then allocations fail.
+
+    One thread at a time, because the limit is the process's. On systems without /proc there is no limit.
+    """
+    if not STATM.exists():
+        yield
+        return
+    with _LOCK:
+        before = resource.getrlimit(resource.RLIMIT_DATA)  # of private memory, without reserved addresses
+        taken = int(STATM.read_text().split()[5]) * resource.getpagesize()
+        ends = [end for end in (taken + MEMORY_BYTES + more_bytes, *before) if end != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_DATA, (min(ends), before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_DATA, before)
+
+
+def check_inside(root: Path, path: Path) -> None:
+    """Raise EpisodeError for a path that leads out of a dataset's folder; the Hub's cache keeps files beside it."""
+    real, home = path.resolve(), root.resolve()
+    in_hub = home.parent.name == "snapshots" and path.is_file() and real.is_relative_to(home.parents[1] / "blobs")
+    if not real.is_relative_to(home) and not in_hub:
+        raise EpisodeError(f"{path}: leads out of the dataset", found=quote(str(real)), remedy="copy the files into it")
+
+
+def check_encoded(where: str, encoded: Any, size: tuple[int, int]) -> None:
+    """Raise EpisodeError unless a table's picture is a PNG or JPEG of (height, width); nothing is decoded."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(encoded["bytes"]), formats=FORMATS) as picture:
+            found = picture.height, picture.width
+    except (OSError, TypeError, ValueError, Image.DecompressionBombError):
+        raise EpisodeError(f"{where} cannot be decoded: neither PNG nor JPEG", remedy="record it again") from None
+    if found != size:
+        remedy = "record pictures of one size in one dataset"
+        raise EpisodeError(f"{where} has another shape than {size}", found=found, remedy=remedy)
+
+
+def check_video(path: Path, size: tuple[int, int]) -> None:
+    """Raise EpisodeError unless a file is an MP4 of one of CODECS and of (height, width); nothing is decoded."""
+    import av
+
+    with path.open("rb") as file:
+        begins = file.read(8)
+    if begins[4:] != b"ftyp":  # FFmpeg would take a playlist, and read what that names
+        raise EpisodeError(f"{path}: cannot be decoded: not an MP4", found=quote(begins), remedy="record it again")
+    with av.open(str(path), format="mp4") as container:
+        stream = container.streams.video[0]
+        found = stream.codec_context.name, stream.height, stream.width
+    if found[0] not in CODECS or found[1:] != size:
+        what = f"{path}: has another shape or codec than {size} in h264, hevc or av1"
+        raise EpisodeError(what, found=found, remedy="encode it anew")
+
+
+def check_table(path: Path) -> list[str]:
+    """Return the names of a parquet table's columns. Raises EpisodeError for more rows than its bytes can hold."""
+    from pyarrow import parquet
+
+    table = parquet.read_metadata(path)
+    if (size := path.stat().st_size) < ROW_BYTES * table.num_rows:
+        what = f"{path}: its footer says {table.num_rows} rows"
+        raise EpisodeError(what, found=f"{size} bytes", remedy="copy the dataset again")
+    return table.schema.to_arrow_schema().names
 
 
 def read_json(path: Path, most_bytes: int = JSON_BYTES) -> Any:
-    """Return what a JSON file holds. Raises OSError if it cannot be read or is larger, else as `parse_json`."""
-    return parse_json(read_plain(path, most_bytes))
+    """Return what a JSON file holds, which may take 25 times its size: see `limited_memory`.
 
-
-def parse_json(data: bytes) -> Any:
-    """Return what JSON says. Raises ValueError for anything else, and for what would take many times its size."""
-    if (count := data.count(b"[") + data.count(b"{")) > MOST_VALUES:
-        raise ValueError(f"{count} lists and objects in it, at most {MOST_VALUES} are read")
+    Raises OSError if it cannot be read or is larger, and ValueError for what is no JSON.
+    """
     try:
-        return json.loads(data)
+        return json.loads(read_plain(path, most_bytes))
     except RecursionError:  # brackets nested too deep
         raise ValueError("nested too deep") from None
 

@@ -9,7 +9,6 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,19 +34,17 @@ class Wheelhouse:
     changed: bool
 
 
-def make(
-    folder: Path | str, *, pythons: Iterable[str] = PYTHONS, only_rover: bool = False, engine: str = "torch"
-) -> Wheelhouse:
+def make(folder: Path | str, *, only_rover: bool = False, engine: str = "torch") -> Wheelhouse:
     """Fill a folder with the rover's own wheel and those that it needs and that are not there. Raises RoverError.
 
-    pythons: the Pis'. only_rover: no others, for Pis with internet. engine: of REQUIREMENTS.
+    only_rover: no others, for Pis with internet. engine: of REQUIREMENTS.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     before = {p.name for p in folder.glob("*.whl")}
     wheel, version = _build(folder)
     if not only_rover:
-        for python in pythons:
+        for python in PYTHONS:
             for requirements in (REQUIREMENTS[engine], VIEW):
                 _fetch(folder, python, requirements)
     return Wheelhouse(wheel, version, {p.name for p in folder.glob("*.whl")} != before)

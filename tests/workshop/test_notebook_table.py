@@ -1,4 +1,4 @@
-"""Tables and figures of notebooks: cells can be copied, and figures are sharp."""
+"""Tables and figures of notebooks: cells can be copied."""
 
 import re
 

@@ -78,7 +78,7 @@ def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypat
 
     monkeypatch.setattr(w, "_build", lambda folder: (folder / "own.whl", "1"))
     monkeypatch.setattr(w, "run", run)
-    w.make(tmp_path, pythons=("3.11", "3.13"))
+    w.make(tmp_path)
     assert [a[a.index("--python-version") + 1] for a, _ in asked] == ["3.11", "3.11", "3.13", "3.13"]
     assert all("aiohttp==" in listed and "--hash=sha256:" in listed for _, listed in asked[1::2])
     for arguments, listed in asked[::2]:

@@ -14,7 +14,6 @@ from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop import hub
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import TWO_ACTIONS, Contents, check_limits, check_weights, tensor_bytes
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
@@ -143,20 +142,19 @@ def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
     """Read and check a checkpoint.
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
-    `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints; or the Hub's id
-    user/name@revision.
+    `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints.
 
     checked: the sha256 of weights that an earlier call has held against their config, for which LeRobot takes seconds.
 
     Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
     whose config and weights do not agree, and for a policy that this project cannot run.
     """
-    path = hub.fetch(path, "model", CheckpointError) if hub.is_hub_id(path) else Path(path)
+    path = Path(path)
     if path.is_dir():
         path = lerobot_folder(path)
         return _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path))
     if not path.is_file():
-        remedy = "give the trainer's .pth file, LeRobot's pretrained_model folder, or user/name@revision of the Hub"
+        remedy = "give the trainer's .pth file, or LeRobot's pretrained_model folder"
         raise CheckpointError(f"{path}: not found, or neither a file nor a folder", remedy=remedy)
     return _checkpoint(path, "trainer", path, checked, read_trainer(path))
 

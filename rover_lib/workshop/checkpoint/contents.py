@@ -24,27 +24,21 @@ COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 MIGRATE = "convert one of before LeRobot 0.4 by its lerobot.processor.migrate_policy_normalization"
 IS_IT_WHOLE = f"is it an ACTPolicy of LeRobot, and whole? {MIGRATE}"
-FIRST_WEIGHT = "backbone.conv1.weight"  # every ACT has it once, so what is before it is before all its names
 
 
-def name_weights(path: Path, state: dict[Any, Any]) -> tuple[dict[str, Tensor], list[str]]:
-    """Return the weights by LeRobot's names without `model.`, and a note if they began with anything else.
+def name_weights(path: Path, state: dict[Any, Any]) -> dict[str, Tensor]:
+    """Return the weights by LeRobot's names without `model.`.
 
-    A policy saved inside torch.compile or DistributedDataParallel has `_orig_mod.` or `module.` in all its names, and
-    the network alone has no `model.`. Raises CheckpointError unless all names begin alike and all weights are dense
-    floats with values.
+    Raises CheckpointError unless all names begin so and all weights are dense floats with values.
     """
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
     state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
     if odd := [k for k, v in state.items() if not isinstance(k, str) or not _is_weight(v)]:
         what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
         raise CheckpointError(what, remedy="save policy.state_dict() as it was trained")
-    begins = {k.removesuffix(FIRST_WEIGHT) for k in state if k.endswith(FIRST_WEIGHT)}
-    prefix = begins.pop() if len(begins) == 1 else "model."
-    if outside := [k for k in state if not k.startswith(prefix)]:
-        raise CheckpointError(f"{path}: names outside {quote(prefix)}: {quote_all(outside)}", remedy=IS_IT_WHOLE)
-    notes = [] if prefix == "model." else [f"its weights' names begin with {quote(prefix)}, which is taken off"]
-    return {k.removeprefix(prefix): v for k, v in state.items()}, notes
+    if outside := [k for k in state if not k.startswith("model.")]:
+        raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
+    return {k.removeprefix("model."): v for k, v in state.items()}
 
 
 def _is_weight(value: Any) -> bool:

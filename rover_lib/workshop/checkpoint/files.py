@@ -38,12 +38,9 @@ def write_trainer(
 ) -> None:
     """One file in the format of the user's trainer, without an optimizer's state, which was of another loss.
 
-    weights: by LeRobot's names without the leading `model.`. settings: as `trainer_config` wants them. Raises
-    CheckpointError unless `trainer_can_hold`, and as `atomic_path`.
+    config: one that `trainer_can_hold`. weights: by LeRobot's names without the leading `model.`. settings: as
+    `trainer_config` wants them. Raises as `atomic_path`.
     """
-    if not trainer_can_hold(config):
-        what = f"{path}: the trainer's format cannot hold this policy's normalisation or rate"
-        raise CheckpointError(what, remedy="use LeRobot's folder")
     content = {
         "epoch": 0,
         "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},

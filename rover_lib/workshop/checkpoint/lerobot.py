@@ -4,7 +4,6 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,13 +58,13 @@ def lerobot_folder(path: Path) -> Path:
 def read_lerobot(folder: Path) -> Contents:
     """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
     said, notes = _act_config(folder)
-    weights, more = name_weights(folder, _read_safetensors(folder / "model.safetensors"))
+    weights = name_weights(folder, _read_safetensors(folder / "model.safetensors"))
     inner, outer = Normaliser(folder, *INNER, said), Normaliser(folder, *OUTER, said)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
     with as_checkpoint_error(folder):
         config = ActConfig(
-            cameras=tuple(camera_names(inner.recorded_cameras(images))),
+            cameras=tuple(camera_names(images)),
             image_sizes=tuple((f.shape[1], f.shape[2]) for f in images.values()),
             state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
             action_names=name_numbers(actions.shape[0], "action"),
@@ -89,7 +88,7 @@ def read_lerobot(folder: Path) -> Contents:
             sees_state=numbers is not None,
             action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
         )
-    return config, weights, {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": more + notes}
+    return config, weights, {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": notes}
 
 
 def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
@@ -138,7 +137,6 @@ class Normaliser:
         from lerobot.processor.normalize_processor import NormalizerProcessorStep
 
         self.where = folder / file
-        self.renames: dict[str, str] = {}  # what the recordings call an observation: what the policy calls it
         if self.where.exists():
             self.step = self._read_step(folder, step)
         else:
@@ -157,23 +155,13 @@ class Normaliser:
                     read.append(NormalizerProcessorStep(**config))
                     if file := step.get("state_file"):
                         read[-1].load_state_dict(_read_safetensors(folder / Path(file).name))
-                elif name not in HARMLESS:
+                elif name not in HARMLESS or config.get("rename_map"):
                     what = f"{self.where}: has a processor step that is not known here: {quote(name)}"
                     raise CheckpointError(what, remedy="train without it, or do in the recordings what it does")
-                self.renames |= config.get("rename_map", {})
         if len(read) != 1 or read[0].normalize_observation_keys is not None:
             what = f"{self.where}: normalises {len(read)} times, or some of the observations only"
             raise CheckpointError(what, remedy="copy the folder again, or train with LeRobot's own single step")
         return read[0]
-
-    def recorded_cameras(self, images: Mapping[str, Any]) -> list[str]:
-        """Return each of the policy's cameras by its key in the recordings, as --rename_map was given in training."""
-        sources = {new: old for old, new in self.renames.items()}
-        if not sources.keys() <= images.keys() or len(sources) < len(self.renames):
-            found = quote_all(f"{old} to {new}" for old, new in self.renames.items())
-            remedy = "rename them in the dataset, in meta/info.json and the tables, and train without --rename_map"
-            raise CheckpointError(f"{self.where}: renames other observations than cameras", found=found, remedy=remedy)
-        return [sources.get(key, key) for key in images]
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.

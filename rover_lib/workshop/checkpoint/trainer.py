@@ -42,7 +42,7 @@ def read_trainer(path: Path) -> Contents:
             remedy = "is this a trainer checkpoint, or only its weights?"
             raise CheckpointError(f"{path}: no '{key}' in it", found=found, remedy=remedy)
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
-    weights, notes = name_weights(path, content["model_state_dict"])
+    weights = name_weights(path, content["model_state_dict"])
     loss = content.get("best_val_loss")  # NaN if the training had diverged
     with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
@@ -51,7 +51,7 @@ def read_trainer(path: Path) -> Contents:
         "best_val_loss": loss,
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
         "trainer_config": plain(raw),
-        "notes": notes,
+        "notes": [],
     }
     return _config(path, raw, weights), weights, extra
 

@@ -1,4 +1,8 @@
-"""Read the controls of a recording: what the transmitter's pulses meant, and when they were measured."""
+"""Read the controls of a recording: what the transmitter's pulses meant, and when they were measured.
+
+The pulses are right in all recordings. Firmware has computed actions from them by two formulas: this car's, and an
+older one. The duty is the pulse's share of its period.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -19,12 +23,44 @@ from rover_lib.onboard.recording.episode import (
     no_pulse,
     number_of,
 )
-from rover_lib.workshop.recordings.formula import EXACT, FOLLOWS, LEAST_READINGS, OLD, Formula
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Fault, relative
 from rover_lib.workshop.untrusted import quote
 
+EXACT = 1e-3  # an action agrees with a formula within this; recorded actions have 4 decimals
+FOLLOWS = 0.9  # the share of readings that must agree
+LEAST_READINGS = 8  # fewer do not show a formula, and are taken as recorded
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
 Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Formula:
+    """action = (duty % - neutral_pct) / span_pct, clipped to [low, high]."""
+
+    neutral_pct: float
+    span_pct: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, channel: Channel) -> "Formula":
+        return cls(channel.neutral_pct, channel.span_pct, channel.low, channel.high)
+
+    def __str__(self) -> str:
+        duty = f"(duty % - {self.neutral_pct:.3g})" if self.neutral_pct else "duty %"
+        return f"{duty} / {self.span_pct:.3g}"
+
+    def actions(self, duties_pct: np.ndarray) -> np.ndarray:
+        return ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
+
+    def is_followed(self, actions: np.ndarray, duties_pct: np.ndarray) -> bool:
+        """Whether recorded actions, (n,), are those of this formula at their duties, all but a few."""
+        agrees = np.abs(self.actions(duties_pct) - actions) <= EXACT
+        return len(actions) > 0 and agrees.mean() >= FOLLOWS
+
+
+# What the user's recorder wrote before October 2025.
+OLD = {"steering": Formula(7.0, 2.42, -1.0, 1.0), "throttle": Formula(0.0, 70.0, 0.0, 1.0)}
 
 
 @dataclass
@@ -87,7 +123,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         recorded, meant, formula = _read_actions(pwm.channel(name), rows_of, path, faults)
         pairs[name] = recorded, meant
         if formula:
-            formulas[name] = formula
+            formulas[name] = str(formula)
     # Too few readings to show a formula are of older firmware too, if the other channel's are.
     actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
     controls = []

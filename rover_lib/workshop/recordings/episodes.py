@@ -41,12 +41,11 @@ from rover_lib.onboard.recording.episode import (
     read_car_of,
 )
 from rover_lib.onboard.stage import read_plain
-from rover_lib.workshop import hub
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
-from rover_lib.workshop.untrusted import quote, quote_all, read_json
+from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What DATA has under these names, and where it is again with which columns.
 TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
@@ -61,14 +60,19 @@ JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 class Split:
     """Three parts that share no episode, or, if `note` says so, no moment in time.
 
-    choosing: to pick observers and mixed blocks. held_out: judges, and nothing else. episodes: ids of each part's.
+    choosing: to pick observers and mixed blocks. held_out: judges, and nothing else.
     """
 
     calibration: tuple[Sample, ...]
     choosing: tuple[Sample, ...]
     held_out: tuple[Sample, ...]
     note: str | None
-    episodes: dict[str, list[str]]
+
+    @property
+    def episodes(self) -> dict[str, list[str]]:
+        """The names of each part's episodes."""
+        parts = {"calibration": self.calibration, "choosing": self.choosing, "held_out": self.held_out}
+        return {part: list(dict.fromkeys(s.episode for s in samples)) for part, samples in parts.items()}
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ class _Frame:
 def load_recordings(
     root: Path | str | Source, chunk: int = 32, sync_s: float = 0.05, progress: Progress = silent
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset, also from the Hub.
+    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset.
 
     chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
     what they affect is repaired or skipped. Here only the two ends of each picture are checked; `Sample.frame_bgr`
@@ -92,8 +96,6 @@ def load_recordings(
     root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
-    if hub.is_hub_id(root):
-        return lerobot_dataset.load_dataset(lerobot_dataset.fetch_dataset(source), chunk, progress)
     if lerobot_dataset.is_dataset(root):
         return lerobot_dataset.load_dataset(source, chunk, progress)
     if source.action_names not in ((), ACTION_NAMES):
@@ -109,10 +111,8 @@ def load_recordings(
         else:
             folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
     except OSError as e:
-        remedy = "give the folder that holds episode_*, a LeRobotDataset's, or user/name@revision of the Hub"
+        remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
         raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
-    if {"data", "meta"} <= {p.name for p in folders}:
-        raise EpisodeError(f"{root}: a LeRobotDataset without meta/info.json", remedy=lerobot_dataset.COPY_AGAIN)
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
@@ -149,17 +149,23 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
-        content, tables = _read_tables(folder, faults)
-    except (OSError, ValueError, csv.Error) as e:
-        faults.add(folder, "unreadable", f"neither {DATA} nor its CSV files can be read: {quote(str(e))}")
+        with limited_memory():
+            content, tables = _read_tables(folder, faults)
+            # read_car_of reads larger files
+            car = car_in(content.get("metadata"), folder) if content else read_car_of(folder)
+    except (OSError, ValueError, csv.Error, MemoryError) as e:
+        why = quote(str(e) or "too much memory")
+        faults.add(folder, "unreadable", f"neither {DATA} nor its CSV files can be read: {why}")
+        return None
+    except CarError as e:
+        faults.add(folder, "no_car", str(e))
         return None
     (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
-    metadata, label = content.get("metadata"), content.get("action_label")
+    label = content.get("action_label")
     try:
-        car = car_in(metadata, folder) if content else read_car_of(folder)  # which reads larger files
         controls, formulas = read_controls(source, control_rows, car.pwm, faults)
-    except (CarError, EpisodeError) as e:
-        faults.add(folder, "no_car" if isinstance(e, CarError) else "no_formula", str(e))
+    except EpisodeError as e:
+        faults.add(folder, "no_formula", str(e))
         return None
     frames = _read_frames(folder, frames_source, frame_rows, faults)
     samples: tuple[Sample, ...] = ()
@@ -364,13 +370,9 @@ def _make_samples(
 
 def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
     """Return runs of consecutive frames with actions, as lists of indices. A new run begins at an index in `holes`."""
-    runs: list[list[int]] = []
-    for i in np.flatnonzero(known).tolist():
-        if runs and runs[-1][-1] == i - 1 and i not in holes:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return runs
+    index = np.flatnonzero(known).tolist()
+    cuts = [k for k, (before, i) in enumerate(pairwise(index), 1) if i > before + 1 or i in holes]
+    return [index[start:end] for start, end in pairwise([0, *cuts, len(index)])]
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
@@ -386,22 +388,18 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
         return _split_by_time(episodes, held_out_share)
     count = min(max(round(len(episodes) * held_out_share), 2), len(episodes) - 1)
     order = np.random.default_rng(seed).permutation(len(episodes)).tolist()
-    parts = {
-        "calibration": sorted(order[count:]),
-        "choosing": sorted(order[: count // 2]),
-        "held_out": sorted(order[count // 2 : count]),
-    }
     far = abs(count / len(episodes) - held_out_share) > 0.1
     note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}" if far else None
-    return Split(
-        **{part: tuple(s for i in indices for s in episodes[i].samples) for part, indices in parts.items()},
-        note=note,
-        episodes={part: [episodes[i].id for i in indices] for part, indices in parts.items()},
-    )
+
+    def samples_of(drawn: list[int]) -> tuple[Sample, ...]:
+        return tuple(s for i in sorted(drawn) for s in episodes[i].samples)
+
+    half = count // 2
+    return Split(samples_of(order[count:]), samples_of(order[:half]), samples_of(order[half:count]), note)
 
 
 def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Split:
-    parts: dict[str, list[Sample]] = {"calibration": [], "choosing": [], "held_out": []}
+    calibration, choosing, held_out = list[Sample](), list[Sample](), list[Sample]()
     for episode in episodes:
         samples = episode.samples
         gap = len(samples[0].chunk)
@@ -410,17 +408,14 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
             continue  # too short to leave a gap of one chunk between the parts
         held = min(max(round(left * held_out_share), 2), left - 1)
         first, second = left - held, held // 2
-        parts["calibration"] += samples[:first]
-        parts["choosing"] += samples[first + gap : first + gap + second]
-        parts["held_out"] += samples[first + gap + second + gap :]
-    if not parts["held_out"]:
+        calibration += samples[:first]
+        choosing += samples[first + gap : first + gap + second]
+        held_out += samples[first + gap + second + gap :]
+    if not held_out:
         what = f"{len(episodes)} episode(s) are too short to be parted"
         raise EpisodeError(what, remedy="record at least three episodes, or a longer one")
-    return Split(
-        **{part: tuple(samples) for part, samples in parts.items()},
-        note=f"only {len(episodes)} episode(s): parted along time, with a gap of one chunk between",
-        episodes={part: sorted({s.episode for s in samples}) for part, samples in parts.items()},
-    )
+    note = f"only {len(episodes)} episode(s): parted along time, with a gap of one chunk between"
+    return Split(tuple(calibration), tuple(choosing), tuple(held_out), note)
 
 
 def choose_calibration(

@@ -3,10 +3,12 @@
 What its numbers mean is read from the names of its features, or said by the user, and never guessed.
 """
 
+import shlex
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,10 +21,7 @@ from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
-from rover_lib.workshop import hub
-from rover_lib.workshop.lerobot_moved import conversion
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.limits import check_encoded, check_inside, check_table, check_video, limited_memory
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -33,7 +32,16 @@ from rover_lib.workshop.recordings.samples import (
     Source,
     camera_names,
 )
-from rover_lib.workshop.untrusted import quote, quote_all, read_json
+from rover_lib.workshop.untrusted import (
+    check_encoded,
+    check_inside,
+    check_table,
+    check_video,
+    limited_memory,
+    quote,
+    quote_all,
+    read_json,
+)
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -114,19 +122,20 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     with limited_memory():
         _check_files(root, info["features"], [key for key, _ in cameras.values()])
     tables = sum(path.stat().st_size for path in root.rglob("*.parquet"))
-    with _as_episode_error(f"{root}: LeRobot cannot read it"), limited_memory(3 * tables):
-        dataset = _open_local(root)
-        columns = _columns(root, dataset, layout)
-        starts = _check_frames(root, dataset, columns)
-        for key in dataset.meta.video_keys:
-            _check_videos(root, dataset.meta, key)
-        encoded = _encoded(dataset)
-    drivers, car, faults = _read_export(root, len(starts), INTERVENTION in columns)
-    _check_numbers(root, columns, layout, car)
     episodes = []
-    parts = np.split(np.arange(len(columns["index"])), starts[1:])
-    for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
-        episodes.append(_episode(dataset, encoded, cameras, columns, rows, chunk, drivers[i], car))
+    with _as_episode_error(f"{root}: LeRobot cannot read it"):
+        with limited_memory(3 * tables):
+            dataset = _open_local(root)
+            columns = _columns(dataset, layout)
+            starts = _check_frames(root, dataset, columns)
+            for key in dataset.meta.video_keys:
+                _check_videos(root, dataset.meta, key)
+            encoded = _encoded(dataset)
+        drivers, car, faults = _read_export(root, len(starts), INTERVENTION in columns)
+        _check_numbers(root, columns, layout, car)
+        parts = np.split(np.arange(len(columns["index"])), starts[1:])
+        for i, rows in enumerate(progress(parts, desc="reading episodes", total=len(starts))):
+            episodes.append(_episode(dataset, encoded, cameras, columns, rows, chunk, drivers[i], car))
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
@@ -152,15 +161,8 @@ def _read_export(root: Path, episodes: int, marked: bool) -> tuple[list[str], Ca
     return said, car, ()
 
 
-def fetch_dataset(source: Source) -> Source:
-    """Fetch a dataset of the Hub, its version first, and return the same source with its local folder."""
-    given = source.path, "dataset", EpisodeError
-    _read_info(hub.fetch(*given, files=("meta/*",)), hub_id=str(source.path).partition("@")[0])
-    return replace(source, path=hub.fetch(*given))
-
-
-def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
-    """Read meta/info.json. hub_id: user/name if the dataset is on the Hub. Raises EpisodeError."""
+def _read_info(root: Path) -> dict[str, Any]:
+    """Read meta/info.json. Raises EpisodeError."""
     path = root / INFO
     refuse_pointer(path, EpisodeError)
     try:
@@ -171,8 +173,7 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     if not str(version).startswith("v3"):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
         if str(version).startswith("v2.1"):
-            where = " and give the folder below ~/.cache/huggingface/lerobot that it names" if hub_id else ""
-            remedy = f"convert it once by LeRobot's own `{conversion(root, hub_id)}`{where}"
+            remedy = f"convert it once by LeRobot's own `{_conversion(root.resolve())}`"
         raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is read", remedy=remedy)
     features, fps = info.get("features"), info.get("fps")
     try:
@@ -185,6 +186,16 @@ def _read_info(root: Path, hub_id: str = "") -> dict[str, Any]:
     if not right or not is_number(fps, 0, 1000) or not fps:
         raise _broken(f"{path}: lacks frames per second, or plain features with a dtype and a shape", quote(fps))
     return info
+
+
+def _conversion(root: Path) -> str:
+    """Return LeRobot's command that converts a dataset of v2.1 to v3 in place, and publishes nothing."""
+    new = find_spec("lerobot") and find_spec("lerobot.scripts.convert_dataset_v21_to_v30")
+    module = "lerobot.scripts" if new else "lerobot.datasets.v30"
+    # 0.4 takes the folder around it, and joins the two
+    name, folder = (f"local/{root.name}", root) if new else (root.name, root.parent)
+    words = ["python", "-m", f"{module}.convert_dataset_v21_to_v30", f"--repo-id={name}", f"--root={folder}"]
+    return shlex.join([*words, "--push-to-hub=false"])
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, Any]]:
@@ -242,13 +253,9 @@ def _name_numbers(
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names in a feature, in any of the forms that LeRobot's users write; () if there are none."""
+    """Return the names in a feature, a list, or a list under one word; () if there are none."""
     names = feature.get("names")
-    if isinstance(names, dict) and names and all(type(v) is int for v in names.values()):
-        if len(set(names.values())) < len(names):
-            return ()  # two names for one column
-        names = sorted(names, key=names.__getitem__)  # in the order of their columns
-    elif isinstance(names, dict) and len(names) == 1:
+    if isinstance(names, dict) and len(names) == 1:
         return _names({"names": next(iter(names.values()))})  # {"motors": [...]}
     if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
         bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
@@ -311,8 +318,7 @@ def _open_local(root: Path) -> "LeRobotDataset":
 
         _download = download  # as LeRobot 0.6 calls it
 
-    with _as_episode_error(f"{root}: LeRobot cannot read it"):
-        return Local(f"local/{root.resolve().name}", root, revision="local", video_backend=BACKEND)
+    return Local(f"local/{root.resolve().name}", root, revision="local", video_backend=BACKEND)
 
 
 def _check_videos(root: Path, meta: Any, key: str) -> None:
@@ -321,9 +327,8 @@ def _check_videos(root: Path, meta: Any, key: str) -> None:
     The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
     """
     names = ("length", *(f"videos/{key}/{name}" for name in ("from_timestamp", "to_timestamp")))
-    with _as_episode_error(f"{root}: where its pictures lie cannot be read"):
-        lengths, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
-        files = [meta.get_video_file_path(number, key) for number in range(len(lengths))]
+    lengths, first_s, last_s = (np.asarray(meta.episodes[name], np.float64) for name in names)
+    files = [meta.get_video_file_path(number, key) for number in range(len(lengths))]
     for file in sorted(set(files)):
         check_inside(root, root / file)
         with _as_episode_error(f"{root / file}: cannot be decoded"):
@@ -351,16 +356,15 @@ def _as_episode_error(what: str) -> Iterator[None]:
         raise _broken(f"{what} ({type(cause).__name__}: {' '.join(str(cause).split())[:160]})") from None
 
 
-def _columns(root: Path, dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
+def _columns(dataset: "LeRobotDataset", layout: Layout) -> dict[str, np.ndarray]:
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
     marks = [INTERVENTION] if INTERVENTION in dataset.meta.features else []
-    with _as_episode_error(f"{root}: its numbers cannot be read"):
-        columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
-        for key in marks:
-            columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
-        for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
-            rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
-            columns[key] = np.ascontiguousarray(rows[:, list(order)])
+    columns = dataset.hf_dataset.select_columns([*NUMBERS, *marks]).with_format("numpy")[:]
+    for key in marks:
+        columns[key] = np.asarray(columns[key]).reshape(len(columns["timestamp"])).astype(bool)
+    for key, order in ((STATE, layout.state_order), (ACTION, layout.action_order)):
+        rows = np.stack(list(columns[key])).astype(np.float32).reshape(len(columns[key]), -1)
+        columns[key] = np.ascontiguousarray(rows[:, list(order)])
     return columns
 
 
@@ -389,9 +393,8 @@ def _check_frames(root: Path, dataset: "LeRobotDataset", columns: Mapping[str, n
     number, times_s = columns["episode_index"], columns["timestamp"].astype(np.float64)
     starts, rows = np.flatnonzero(np.diff(number, prepend=-1)), np.arange(len(number))
     lengths = np.diff([*starts, len(number)])
-    with _as_episode_error(f"{root}: its table of episodes cannot be read"):
-        names = ("episode_index", "dataset_from_index", "dataset_to_index")
-        table = np.stack([np.asarray(dataset.meta.episodes[name]) for name in names], 1)
+    names = ("episode_index", "dataset_from_index", "dataset_to_index")
+    table = np.stack([np.asarray(dataset.meta.episodes[name]) for name in names], 1)
     episodes = np.stack([np.arange(len(starts)), starts, starts + lengths], 1)
     within = rows - np.repeat(starts, lengths)
     ordered = np.array_equal(columns["index"], rows) and np.array_equal(columns["frame_index"], within)
@@ -420,12 +423,9 @@ def _episode(
     root, meta, first, n = dataset.root, dataset.meta, int(rows[0]), len(rows)
     number = int(columns["episode_index"][first])
     name, keys = f"episode_{number:06d}", [key for key, _ in cameras.values()]
-    with _as_episode_error(f"{root}: where the files of episode {number} lie cannot be read"):
-        data = root / meta.get_data_file_path(number)
-        files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
-        if not data.is_file():
-            raise FileNotFoundError(data)
-        tasks = dict(zip(meta.tasks["task_index"], meta.tasks.index, strict=True))
+    data = root / meta.get_data_file_path(number)
+    files = [root / meta.get_video_file_path(number, key) if key in meta.video_keys else data for key in keys]
+    tasks = dict(zip(meta.tasks["task_index"], meta.tasks.index, strict=True))
     index = np.arange(n)[:, None] + np.arange(chunk)
     actions, pads = columns[ACTION][rows], index >= n
     chunks = actions[np.minimum(index, n - 1)]

@@ -14,7 +14,6 @@ from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop.recordings.formula import Formula
 
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 LEAST_RATED = 10  # frames; fewer do not show a rate
@@ -181,7 +180,7 @@ class Episode:
     controls: int
     samples: tuple[Sample, ...]
     files: tuple[Path, ...]  # those that the numbers came from
-    formulas: Mapping[str, Formula] = field(default_factory=dict)
+    formulas: Mapping[str, str] = field(default_factory=dict)
     corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
 
     @cached_property

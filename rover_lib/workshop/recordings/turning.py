@@ -90,10 +90,6 @@ class Sides:
         if not self.turnings:
             return ""
         if self.side is None:
-            names = {side: ", ".join(t.episode for t in self.turnings if t.side == side) for side in ("right", "left")}
-            if all(names.values()):
-                where = "right in {right}; left in {left}: some are mirrored".format(**names)
-                return f"the pictures disagree on which side positive steering turns to: {where}"
             return f"which side positive steering turns to: {len(self.turnings)} episodes show too little to be sure"
         text = f"positive steering turns {self.side}, as the pictures of {agree} of {len(self.turnings)} episodes show"
         if self.denied:

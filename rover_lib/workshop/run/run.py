@@ -29,7 +29,6 @@ from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.hub import absolute
 from rover_lib.workshop.progress import LOG_VARIABLE, TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder
 
@@ -108,7 +107,7 @@ def run(
     folder = run_folder(runs_dir, name, RoverError)
     sources = [NOTEBOOKS / f"{n}.ipynb" for n in NAMES]
     _refuse_unknown(sources, overrides)
-    given = {"checkpoint": absolute(checkpoint), "episodes": absolute(episodes), **overrides}
+    given = {"checkpoint": str(Path(checkpoint).resolve()), "episodes": str(Path(episodes).resolve()), **overrides}
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
     with build_folder(folder, files_of_a_run, asked) as new:

@@ -12,7 +12,7 @@ import numpy as np
 from rover_lib.onboard.car.car import Car
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation
-from rover_lib.workshop.recordings.formula import OLD, Formula
+from rover_lib.workshop.recordings.controls import OLD, Formula
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 

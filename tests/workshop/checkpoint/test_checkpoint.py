@@ -11,8 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from policies import TINY, check_is, lerobot_policy, memory_samples, normalised, trainer_content
 from safetensors.torch import load_file, save_file
 
@@ -24,8 +22,8 @@ from rover_lib.workshop.checkpoint.lerobot import lerobot_folder
 from rover_lib.workshop.judge.compare import LerobotEager
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
+RENAMES = {"registry_name": "rename_observations_processor", "config": {"rename_map": {"a": "b"}}}
 INNER, OUTER, STATS = "policy_preprocessor.json", "policy_postprocessor.json", "stats.safetensors"
-WILD = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 def write(content, path):
@@ -61,8 +59,7 @@ def test_reads_the_trainers_file(tiny, tiny_policy):
     assert r["parameters"] == sum(p.numel() for p in tiny_policy.state_dict().values())
     assert r["parameters"] - r["parameters_acting"] > 0
     assert r["best_val_loss"] == pytest.approx(0.15) and r["epoch"] == 7 and json.dumps(r)
-    # Beside weights and optimizer a file has only names and a few numbers, so the sum must explain its size.
-    assert r["file_mb"] == pytest.approx(r["weights_mb"] + r["optimizer_mb"], rel=0.02) and r["optimizer_mb"] > 0
+    assert r["file_mb"] == pytest.approx(r["weights_mb"] + r["optimizer_mb"], rel=0.02)
     assert r["normalisation"] == {
         "cam_front": "(pixel / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)",
         "state": "state, as it is",
@@ -124,12 +121,10 @@ def weight(value):
     [
         (lambda c: c.pop("config"), "no 'config'"),
         (lambda c: c["config"].update(chunk_size="32"), "chunk_size"),
-        (lambda c: c["config"].update(n_heads=7), "divisible"),
         (lambda c: c["config"].update(image_height=8), "cameras must be"),
         (lambda c: c["config"].update(n_obs_steps=2), "n_obs_steps"),
         (lambda c: c["config"].update(vision_encoder="vit"), "'vit'"),
         (lambda c: c["config"].update(n_decoder_layers=10**6), "1000000"),
-        (lambda c: c["config"].update(feedforward_dim=64), "size mismatch"),
         (lambda c: c.update(best_val_loss="low"), "'low'"),
         (lambda c: c["model_state_dict"].pop("model.action_head.bias"), "action_head.bias"),
         (lambda c: c["model_state_dict"].update({"model.extra": torch.zeros(1)}), "Unexpected key"),
@@ -219,6 +214,8 @@ def in_step(change):
         (lambda c: c.update(input_features={}), "features"),
         (lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
         (lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
+        (lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, -72, 128]), "features"),
+        (lambda c: c.update(chunk_size=16, n_action_steps=16), "config and weights do not agree"),
         (lambda c: c["output_features"]["action"].update(type="STATE"), "features"),
     ],
 )
@@ -241,41 +238,6 @@ def test_refuses_damaged_and_divided_folders(copied):
         refused(copied)
 
 
-ODD = st.sampled_from(
-    [None, True, -1, 0, 1, 10**6, 10**400, 0.5, math.nan, "", "relu", "..", "a\nb", [], {}, [[]], [1], [3, -72, 128]]
-)
-
-
-def places(content, path=()):
-    """Yield the path of every value in nested JSON."""
-    yield path
-    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    for key, value in items:
-        yield from places(value, (*path, key))
-
-
-@pytest.mark.slow
-@WILD
-@given(data=st.data(), file=st.sampled_from(["config.json", INNER, OUTER]))
-def test_one_odd_value_is_a_sentence_or_changes_nothing(folder, data, file):
-    path = folder / file
-    before = path.read_text()
-    content = json.loads(before)
-    *parents, last = data.draw(st.sampled_from([p for p in places(content) if p]))
-    inner = content
-    for key in parents:
-        inner = inner[key]
-    inner[last] = data.draw(ODD)
-    path.write_text(json.dumps(content))
-    try:
-        found = load_checkpoint(folder)
-        assert np.isfinite([found.config.action_unnorm.scale, found.config.action_unnorm.shift]).all()
-    except CheckpointError as e:
-        assert "\n" not in str(e)
-    finally:
-        path.write_text(before)
-
-
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [
@@ -289,6 +251,7 @@ def test_one_odd_value_is_a_sentence_or_changes_nothing(folder, data, file):
         (INNER, in_step(lambda s: s["config"].update(normalize_observation_keys=[])), "some of the observations only"),
         (INNER, in_step(lambda s: s.update(registry_name="magic")), "'magic'"),
         (INNER, in_step(lambda s: s["config"].update(rename_map={"a": "b"})), "LeRobot cannot use it"),
+        (INNER, lambda c: c["steps"].append(RENAMES), "'rename_observations_processor'"),
         (OUTER, in_step(lambda s: s.pop("state_file")), "would not be normalised"),
         (OUTER, lambda c: c["steps"].clear(), "normalises 0 times"),
         (OUTER, lambda c: c["steps"].append(c["steps"][0]), "normalises 2 times"),
@@ -304,7 +267,6 @@ def test_a_feature_that_would_be_left_raw_is_refused(copied, file, change, says)
     [
         ("observation.state.std", [0.5, -0.5]),
         ("observation.state.mean", [math.inf, 0.0]),
-        ("observation.state.std", [0.5, 0.5, 0.5]),
         ("action.max", [0.5, -9.0]),
         ("action.max", None),
     ],
@@ -365,20 +327,14 @@ def test_statistics_in_the_weights_are_refused_with_lerobots_conversion(copied):
     assert "migrate_policy_normalization" in refused(copied)
 
 
-def rename(folder, change):
-    weights = load_file(folder / "model.safetensors")
-    save_file({change(name): value for name, value in weights.items()}, folder / "model.safetensors")
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda f: rename(f, "_orig_mod.{}".format), "'_orig_mod.model.'"),
         (lambda f: edit(f / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1)), "0.01"),
         (lambda f: edit(f / "config.json", lambda c: c.update(use_film=True, device="cuda")), "use_film"),
         (lambda f: edit(f / "config.json", lambda c: c.update(pretrained_revision="v1")), None),  # of LeRobot 0.6
     ],
-    ids=["compiled", "ensembling", "unknown field", "newer"],
+    ids=["ensembling", "unknown field", "newer"],
 )
 def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_path, change, says):
     inner, outer, _ = normalised(policy, "MEAN_STD")
@@ -388,17 +344,7 @@ def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_p
     check_is(checkpoint, policy, inner, outer)
 
 
-def test_cameras_have_the_recordings_names(policy, tmp_path):
-    inner, outer, _ = normalised(policy, "MEAN_STD")
-    save(tmp_path, policy, inner, outer)
-
-    def renamed(old, new):
-        return lambda c: c["steps"][0]["config"].update(rename_map={f"observation.images.{old}": new})
-
-    edit(tmp_path / INNER, renamed("top", "observation.images.cam_front"))
-    assert load_checkpoint(tmp_path).config.cameras == ("top",)
-    edit(tmp_path / INNER, renamed("top", "observation.state"))
-    assert "renames" in refused(tmp_path)
+def test_two_cameras_keep_their_names_and_sizes(tmp_path):
     cameras = {"observation.image": (32, 64), "observation.images.image": (64, 32)}
     lerobot_policy(**TINY, cameras=cameras).save_pretrained(tmp_path / "two")
     edit(tmp_path / "two/config.json", lambda c: c.update(normalization_mapping=RAW))

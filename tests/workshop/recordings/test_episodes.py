@@ -11,13 +11,11 @@ import hostile
 import numpy as np
 import pytest
 import simplejpeg
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from recorded import real_recordings
 
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import CONTROL_FIELDS, FRAME_FIELDS, About, EpisodeWriter
+from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
@@ -64,6 +62,12 @@ def kinds(recordings):
 
 def load(root, **options):
     return load_recordings(root, **{"chunk": CHUNK, **options})
+
+
+def changed(tmp_path, change):
+    """Load a faultless recording of which the JSON was changed."""
+    edit(record(tmp_path), change)
+    return load(tmp_path)
 
 
 # ---- a faultless recording -------------------------------------------------------------------------------
@@ -119,7 +123,7 @@ def test_no_chunk_and_no_state_goes_over_to_where_nobody_drove(tmp_path):
         for row in content["control_samples"]:
             row["driver"] = "nobody" if 15 <= round((row["system_timestamp"] - 1000.1) * 30) < 25 else "human"
 
-    recordings = load(edit(record(tmp_path), change).parent)
+    recordings = changed(tmp_path, change)
     by_row = {sample.row: sample for sample in recordings.samples}
     drivers = {row: sample.driver for row, sample in by_row.items()}
     begin, end = (f([row for row, driver in drivers.items() if driver == "nobody"]) for f in (min, max))
@@ -137,9 +141,6 @@ def test_summary_range_and_hashes(tmp_path):
     ends = recordings.action_range()
     assert ends["throttle"] == pytest.approx((0.01, 0.07), abs=0.004)
     assert ends["steering"][1] == pytest.approx(0.6, abs=0.01)
-    summary = recordings.summary()
-    assert json.loads(json.dumps(summary)) == summary
-    assert (summary["episodes"], summary["frames"], summary["samples"], summary["faults"]) == (1, 40, 40, [])
     hashes = recordings.hashes()
     assert len(hashes) == 43 and "episode_20260101_120000/frames/frame_000001.jpg" in hashes
     assert hashes == load(tmp_path / "episode_20260101_120000").hashes()
@@ -151,7 +152,7 @@ def test_pictures(tmp_path):
     assert np.abs(samples[0].frame_bgr().astype(int) - FRAME).max() <= 3
     picture = folder / "frames/frame_000001.jpg"
     whole = picture.read_bytes()
-    for damaged in (whole[:-30], b"", hostile.cut(whole), hostile.claims(whole, 16_000, 16_000)):
+    for damaged in (b"", hostile.cut(whole)):
         picture.write_bytes(damaged)
         with pytest.raises(EpisodeError, match="frame_000001"):
             samples[0].frame_bgr()
@@ -180,47 +181,67 @@ def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
     assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
 
 
-@pytest.mark.parametrize("period", [0, 2032])
-def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, period):
-    def change(content):
-        for control in content["control_samples"][20:30]:
-            control.update(throttle_raw_us=0, throttle_period_us=period, throttle_normalized=0.0)
+NO_PULSES = [
+    {"throttle_raw_us": 0, "throttle_period_us": 0, "throttle_normalized": 0.0},
+    {"throttle_raw_us": 0, "throttle_period_us": 2032, "throttle_normalized": 0.0},
+    {"throttle_measured": False, "throttle_raw_us": None, "throttle_period_us": None, "throttle_normalized": None},
+]
 
-    edit(record(tmp_path), change)
+
+@pytest.mark.parametrize("lost", NO_PULSES, ids=["no period", "no pulse", "flagged"])
+def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, lost):
+    edit(record(tmp_path), lambda content: [row.update(lost) for row in content["control_samples"][20:30]] and None)
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"throttle_zero_period": 10, "frame_without_measurement": 8, "frame_without_state": 1}
+    kind = "throttle_no_pulse" if "throttle_measured" in lost else "throttle_zero_period"
+    assert kinds(recordings) == {kind: 10, "frame_without_measurement": 8, "frame_without_state": 1}
     assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
     before = [s for s in recordings.samples if s.time_s < 0.7]
     assert before[-1].is_pad.tolist() == [False] + [True] * (CHUNK - 1)  # the hole ends the chunks before it
 
 
-def test_a_channel_that_is_flagged_is_missing(tmp_path):
-    flagged = EpisodeWriter(tmp_path / "episode_20260101_120000", About("x"), resolution=(32, 18), flags=True)
-    with flagged as writer:
-        for i in range(40):
-            t_s, lost = 1000 + 0.033 * i, 10 <= i < 20
-            pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
-            throttle = (None, None) if lost else (pulses.throttle_us, 1016)
-            writer.control(t_s, 33 * i, pulses.steering_us, throttle[0], 21316, throttle[1], mode="human")
-            writer.frame(t_s, FRAME)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"throttle_no_pulse": 10, "frame_without_measurement": 8, "frame_without_state": 1}
-    assert len(recordings.samples) == 31
-    assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009  # the drive's least throttle, no 0
+def single_readings_are_lost(content):
+    controls = content["control_samples"]
+    controls[20].update(steering_period_us=42632, steering_normalized=0.0)  # two periods at once
+    for control in controls[5:35:3]:
+        control.update(NO_PULSES[0])
 
 
-def test_single_lost_readings_cost_no_frame(tmp_path):
-    def change(content):
-        controls = content["control_samples"]
-        controls[20].update(steering_period_us=42632, steering_normalized=0.0)  # two periods at once
-        for control in controls[5:35:3]:
-            control.update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
+def an_action_is_not_its_pulses(content):
+    content["control_samples"][20]["steering_normalized"] = 0.99
 
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"throttle_zero_period": 10, "steering_odd_period": 1}
-    assert len(recordings.samples) == 40
+
+def two_frames_lack_controls(content):
+    del content["control_samples"][20:24]  # 165 ms: two frames in it are more than 50 ms from both ends
+
+
+def two_frames_are_there_twice(content):
+    frames = content["frame_samples"]
+    frames[10]["frame_id"], frames[20]["timestamp"] = frames[9]["frame_id"], frames[19]["timestamp"]
+
+
+@pytest.mark.parametrize(
+    ("change", "found", "samples"),
+    [
+        (single_readings_are_lost, {"throttle_zero_period": 10, "steering_odd_period": 1}, 40),
+        (an_action_is_not_its_pulses, {"steering_disagrees_with_pulse": 1}, 40),
+        (two_frames_lack_controls, {"frame_without_control": 2, "frame_without_state": 1}, 37),
+        (two_frames_are_there_twice, {"duplicate_frame_id": 1, "duplicate_frame_time": 1}, 38),
+    ],
+)
+def test_a_fault_costs_its_own_frames_only(tmp_path, change, found, samples):
+    recordings = changed(tmp_path, change)
+    assert kinds(recordings) == found and len(recordings.samples) == samples
     assert min(s.chunk[:, 1].min() for s in recordings.samples) > 0.009
+    assert "frame_without_control" not in found or len(load(tmp_path, sync_s=0.1).samples) == 40
+
+
+@pytest.mark.parametrize(("gone", "samples"), [(slice(20, 30), 29), (slice(1, -1), 1)], ids=["a hole", "two frames"])
+def test_a_hole_in_time_ends_chunks_and_states(tmp_path, gone, samples):
+    edit(record(tmp_path), lambda content: content["frame_samples"].__delitem__(gone))
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"hole_in_time": 1, "frame_without_state": 1}
+    assert len(recordings.samples) == samples
+    assert recordings.samples[min(samples - 1, 19)].is_pad.sum() == CHUNK - 1
 
 
 @pytest.mark.parametrize("wraps", [False, True], ids=["later", "over the wrap"])
@@ -285,11 +306,10 @@ def test_faults_of_a_csv_are_counted_and_another_table_is_refused(tmp_path):
         load(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["", '{"control_samples": {}, "frame_samples": 1}', "\udcff"])
-def test_a_folder_without_json_and_csvs_is_skipped(tmp_path, text):
+def test_a_folder_without_json_and_csvs_is_skipped(tmp_path):
     record(tmp_path, "episode_20260101_000000")
     folder = record(tmp_path, "episode_20260102_000000")
-    (folder / "episode_data.json").write_bytes(text.encode(errors="surrogateescape"))
+    (folder / "episode_data.json").write_bytes(b"\xff")
     (folder / "control_data.csv").unlink()
     recordings = load(tmp_path)
     assert [e.id for e in recordings.episodes] == ["episode_20260101_000000"]
@@ -312,24 +332,14 @@ def test_not_finite_and_wrong_types_are_counted_and_skipped(tmp_path):
         frames[15]["image_path"] = 15
         frames[20]["frame_id"] = "x"
         frames[25]["timestamp"] = 10**400
+        frames[30]["image_path"] = ""
         frames += [None, {}]
 
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    odd = {"throttle_out_of_range": 1, "unsorted_control_times": 2}
-    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 6} | odd
-    assert len(recordings.samples) == 36
+    recordings = changed(tmp_path, change)
+    odd = {"unsorted_control_times": 2}
+    assert kinds(recordings) == {"not_finite": 4, "wrong_type": 7, "throttle_out_of_range": 1} | odd
+    assert len(recordings.samples) == 35
     assert all(np.isfinite(s.chunk).all() and np.isfinite(s.state).all() for s in recordings.samples)
-
-
-def test_a_value_that_its_pulse_denies_is_counted(tmp_path):
-    def change(content):
-        content["control_samples"][20]["steering_normalized"] = 0.99
-
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"steering_disagrees_with_pulse": 1}
-    assert recordings.faults_by_kind() == {"taken as recorded": {"steering_disagrees_with_pulse": 1}}
 
 
 OLD = {"steering": (7, 2.42), "throttle": (0, 70)}
@@ -393,19 +403,21 @@ def test_the_few_readings_of_one_channel_are_recomputed_where_the_other_channels
     assert recordings.faults_by_kind().keys() == {"recomputed from the pulses"}
 
 
-@pytest.mark.parametrize("reason", ["no_formula 1 times", "no_overlap 1 times", "broken_jpeg 40 times"])
-def test_the_reason_why_nothing_is_usable_comes_first(tmp_path, reason):
+@pytest.mark.parametrize(
+    ("reason", "table", "column", "factor"),
+    [
+        ("no_formula 1 times", "control_samples", "steering_raw_us", 1e-3),
+        ("no_overlap 1 times", "frame_samples", "timestamp", 2),
+    ],
+)
+def test_the_reason_why_nothing_is_usable_comes_first(tmp_path, reason, table, column, factor):
     """What was recomputed, repaired or absent was counted and quoted as the reason; pulses in ms gave full left."""
 
     def change(content):
-        for row in content["control_samples"]:
-            row["steering_raw_us"] /= 1000 if reason.startswith("no_formula") else 1
-        for row in content["frame_samples"]:
-            row["timestamp"] += 3600 if reason.startswith("no_overlap") else 0
+        for row in content[table]:
+            row[column] *= factor
 
-    folder = edit(edit(record(tmp_path), rewritten(OLD)), change)
-    for picture in (folder / "frames").iterdir() if reason.startswith("broken") else []:
-        picture.write_bytes(b"\x89PNG")
+    edit(edit(record(tmp_path), rewritten(OLD)), change)
     with pytest.raises(EpisodeError, match=rf"\({reason}"):
         load(tmp_path)
 
@@ -454,47 +466,9 @@ def test_one_wrong_time_is_no_clock_that_was_set(tmp_path, row, wrong_s):
         content["frame_samples"][row]["timestamp"] += wrong_s
         content["control_samples"][row]["system_timestamp"] += wrong_s
 
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
+    recordings = changed(tmp_path, change)
     assert not {kind for kind in kinds(recordings) if kind.startswith("clock_set_back")}
     assert len(recordings.samples) > 20
-
-
-def test_sync_window(tmp_path):
-    def change(content):
-        del content["control_samples"][20:24]  # a hole of 165 ms: two frames in it are more than 50 ms from both ends
-
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"frame_without_control": 2, "frame_without_state": 1}
-    assert len(recordings.samples) == 37
-    assert len(load(tmp_path, sync_s=0.1).samples) == 40
-
-
-@pytest.mark.parametrize(
-    ("gone", "samples"), [(slice(20, 30), 29), (slice(1, -1), 1)], ids=["a hole", "but two frames"]
-)
-def test_a_hole_in_time_ends_chunks_and_states(tmp_path, gone, samples):
-    def change(content):
-        del content["frame_samples"][gone]
-
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"hole_in_time": 1, "frame_without_state": 1}
-    assert len(recordings.samples) == samples
-    assert recordings.samples[min(samples - 1, 19)].is_pad.sum() == CHUNK - 1
-
-
-def test_duplicates(tmp_path):
-    def change(content):
-        frames = content["frame_samples"]
-        frames[10]["frame_id"] = frames[9]["frame_id"]
-        frames[20]["timestamp"] = frames[19]["timestamp"]
-
-    edit(record(tmp_path), change)
-    recordings = load(tmp_path)
-    assert kinds(recordings) == {"duplicate_frame_id": 1, "duplicate_frame_time": 1}
-    assert len(recordings.samples) == 38
 
 
 def test_paths_that_leave_the_folder(tmp_path):
@@ -522,57 +496,6 @@ def test_no_recordings_is_one_sentence(tmp_path, make):
         with pytest.raises(EpisodeError) as e:
             load(tmp_path / "episodes", **options)
         assert "\n" not in str(e.value)
-
-
-# ---- wild input ------------------------------------------------------------------------------------------
-
-ODD = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(),
-    st.floats(),
-    st.text(max_size=8),
-    st.sampled_from(["frames/frame_000001.jpg", "frames/frame_000002.jpg", "../x.jpg", "nan", "1e999", "/", "."]),
-    st.lists(st.integers(), max_size=2),
-    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
-)
-FIELD = st.sampled_from([*CONTROL_FIELDS, *FRAME_FIELDS, ""])
-
-
-def check_sane(root):
-    """Check that a folder is either refused in one line, or loaded as samples that can be trained on."""
-    try:
-        recordings = load(root)
-    except EpisodeError as e:
-        assert "\n" not in str(e)
-        return
-    json.dumps(recordings.summary(), allow_nan=False)
-    for sample in recordings.samples:
-        assert np.isfinite(sample.chunk).all() and np.isfinite(sample.state).all() and math.isfinite(sample.time_s)
-        assert (np.abs(sample.chunk) <= 1).all() and (sample.chunk[:, 1] >= 0).all() and not sample.is_pad[0]
-        assert sample.frame_bgr().shape == (18, 32, 3)
-
-
-@pytest.fixture(scope="module")
-def wild_folder(tmp_path_factory):
-    return record(tmp_path_factory.mktemp("wild"), frames=2)
-
-
-@pytest.mark.slow
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-@given(changes=st.lists(st.tuples(st.sampled_from(["control", "frame"]), st.integers(0, 7), FIELD, ODD), max_size=12))
-def test_wild_json(wild_folder, changes):
-    whole = (wild_folder / "episode_data.json").read_bytes()
-
-    def change(content):
-        for table, number, field, value in changes:
-            rows = content[f"{table}_samples"]
-            row = rows[number % len(rows)]
-            rows[number % len(rows)] = row | {field: value} if field and isinstance(row, dict) else value
-
-    edit(wild_folder, change)
-    check_sane(wild_folder.parent)
-    (wild_folder / "episode_data.json").write_bytes(whole)
 
 
 # ---- splitting and choosing ------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """LeRobotDatasets, made by LeRobot's own writer: every number and pixel as its own items have them, or one sentence."""
 
 import functools
-import io
 import json
 import os
 import re
@@ -16,18 +15,17 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from PIL import Image
 from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
 
 from rover_lib.cli import main
-from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
+from rover_lib.onboard.errors import CheckpointError, EpisodeError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import CAMERA, Layout, Source, camera_names
+from rover_lib.workshop.recordings.samples import Layout, Source
 from rover_lib.workshop.run.session import load
 
 CHUNK, FPS, SIZE = 8, 20, (72, 128)
@@ -89,7 +87,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
-        (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
+        (features(action=TWO | {"names": {"steering": 1, "throttle": 0}}), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
         (features(), "has no meta/tasks.parquet"),
         (features(**{"observation.images.x/../../../outside": info()["features"]["action"]}), "plain features"),
@@ -101,13 +99,9 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
     assert says in refused(written(tmp_path, content))
 
 
-def test_a_folder_of_datasets_and_one_without_its_info_are_told_apart(tmp_path):
+def test_a_folder_of_datasets_is_recognised(tmp_path):
     written(tmp_path / "a", info())
-    with pytest.raises(RoverError, match="LeRobotDataset"):
-        load_recordings(tmp_path)
-    (tmp_path / "a/meta/info.json").unlink()
-    (tmp_path / "a/data").mkdir()
-    assert "a LeRobotDataset without meta/info.json" in refused(tmp_path / "a")
+    assert "give one LeRobotDataset" in refused(tmp_path)
 
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
@@ -115,17 +109,6 @@ def test_a_camera_that_is_not_there_is_refused(tmp_path):
     assert "once each" in refused(Source.of(tmp_path, camera="front,front"))
     root = written(tmp_path, features(**{"observation.front": info()["features"]["observation.images.front"]}))
     assert "has 2 cameras" in refused(root), "none hides another"
-    assert "has no camera 'front'" in refused(Source.of(root, camera="front"))
-    assert "has no meta/tasks.parquet" in refused(Source.of(root, camera="observation.front"))
-
-
-@pytest.mark.parametrize(
-    "keys", [("observation.images.image", "observation.image"), ("observation.images.front", "observation.left", "top")]
-)
-def test_cameras_keep_their_names_in_a_policy_that_we_write(keys):
-    """As write_lerobot calls them: else its own dataset has no such camera."""
-    names = list(camera_names(keys))
-    assert list(camera_names(f"{CAMERA}{name}" for name in names)) == names
 
 
 def test_our_own_recordings_say_their_names_themselves(tmp_path):
@@ -217,7 +200,7 @@ def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
     swapped = straight.chunk[:, ::-1]
     other = shutil.copytree(datasets(), tmp_path / "other")
     content = json.loads((other / "meta/info.json").read_text())
-    for names in ({"motors": SWAPPED}, {"steering": 1, "throttle": 0}, None):
+    for names in ({"motors": SWAPPED}, None):
         for key in ("action", "observation.state"):
             content["features"][key]["names"] = names
         content["features"][CAM]["shape"] = [3, *SIZE]  # colours first
@@ -247,22 +230,11 @@ def column(name, value=..., row=0):
         at, values = read.column_names.index(name), read.column(name).to_pylist()
         if value is ...:
             return parquet.write_table(read.drop_columns([name]), path)
-        values[row] = value(values[row]) if callable(value) else value
+        values[row] = value
         read = read.set_column(at, name, pyarrow.array(values, type=read.schema.field(name).type))
         parquet.write_table(read, path)
 
     return change
-
-
-def smaller(picture):
-    packed = io.BytesIO()
-    Image.open(io.BytesIO(picture["bytes"])).resize((64, 36)).save(packed, "PNG")
-    return picture | {"bytes": packed.getvalue()}
-
-
-def repaint(path):
-    """Makes the second frame's picture smaller."""
-    column(CAM, smaller, row=1)(path)
 
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
@@ -292,18 +264,15 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
 
 
 @pytest.mark.slow
-def test_a_picture_of_another_kind_or_size_or_without_its_bytes_is_a_sentence(copied, tmp_path, monkeypatch):
+def test_a_picture_of_another_kind_starts_no_program(copied, tmp_path, monkeypatch):
     root = copied()
-    repaint(root / DATA)
     (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
     (tmp_path / "gs").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     for value in (None, {"bytes": POSTSCRIPT, "path": "x.eps"}):
         column(CAM, value)(root / DATA)
-        samples = load_recordings(root, CHUNK).samples
-        for sample, says in ((samples[0], "cannot be decoded"), (samples[1], "another shape")):
-            with pytest.raises(EpisodeError, match=says):
-                sample.frame_bgr()
+        with pytest.raises(EpisodeError, match="cannot be decoded"):
+            load_recordings(root, CHUNK).samples[0].frame_bgr()
     assert not (tmp_path / "started").exists()
 
 
@@ -417,13 +386,3 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
     with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):
         twice.recorded_as(Layout())  # our own
-
-
-@pytest.mark.slow
-def test_other_names_are_kept_until_the_user_says_that_it_is_a_car(datasets, trained):
-    wheels = ("left", "right")
-    root = datasets(actions=wheels, states=wheels)
-    assert load(trained, root).checkpoint.config.action_names == wheels
-    said = load(trained, Source.of(root, "throttle,steering"))
-    assert said.checkpoint.config.action_names == said.checkpoint.config.state_names == CAR
-    assert said.recordings.layout.state_order == said.recordings.layout.action_order == (1, 0)

@@ -11,8 +11,8 @@ from recorded import record_drives
 from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.formula import OLD
 from rover_lib.workshop.run.units import in_todays_units
 
 PWM = PwmCalibration()

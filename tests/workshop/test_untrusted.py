@@ -1,0 +1,184 @@
+"""Files of strangers: a sentence at once, never a program, a wait, a full memory, or a file beside theirs."""
+
+import os
+import resource
+import signal
+from pathlib import Path
+
+import av
+import cv2
+import hostile
+import numpy as np
+import pyarrow
+import pytest
+import torch
+from pyarrow import parquet
+from rover_lib.onboard.recording.outcome import label
+
+from rover_exchange.tub import read_tub
+from rover_lib.onboard.car.car import Car, read_car
+from rover_lib.onboard.drive.flight_log import read_log
+from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.int8.observe import Calibration
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.untrusted import check_encoded, check_inside, check_table, check_video, limited_memory
+
+SIZE = (54, 96)
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 54\nshowpage\n"
+PICTURE = cv2.imencode(".png", hostile.scene(size=SIZE[::-1]))[1].tobytes()
+ICON = b"\0\0\1\0\1\0\0\0\0\0\1\0\x20\0" + len(PICTURE).to_bytes(4, "little") + b"\x16\0\0\0" + PICTURE
+
+
+@pytest.mark.parametrize("encoded", [POSTSCRIPT, ICON, b"", None], ids=["PostScript", "ICO", "nothing", "a path"])
+def test_only_png_and_jpeg_are_decoded(encoded):
+    with pytest.raises(EpisodeError, match="neither PNG nor JPEG"):
+        check_encoded("x", {"bytes": encoded, "path": "/dev/zero"}, SIZE)
+
+
+def test_a_picture_has_the_size_that_the_dataset_says():
+    for picture in (PICTURE, hostile.jpeg(hostile.scene(size=SIZE[::-1]))):
+        check_encoded("x", {"bytes": picture}, SIZE)
+    for claimed in (hostile.claims(hostile.WHOLE, 640, 54), hostile.claims(hostile.WHOLE, 65_000, 65_000)):
+        with pytest.raises(EpisodeError):
+            check_encoded("x", {"bytes": claimed}, SIZE)
+
+
+def video(path, codec, size, packets=()):
+    """An MP4 of one frame, or of these packets."""
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream(codec, rate=20)
+        stream.height, stream.width = size
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.zeros((*size, 3), np.uint8))
+        made = packets or [*stream.encode(frame), *stream.encode()]
+        for packet in made:
+            if isinstance(packet, bytes):
+                packet = av.Packet(packet)
+                packet.stream, packet.pts, packet.dts = stream, 0, 0
+            container.mux(packet)
+    return path
+
+
+def test_a_video_is_an_mp4_of_its_cameras_size(tmp_path):
+    check_video(video(tmp_path / "right.mp4", "libx264", SIZE), SIZE)
+    larger = video(tmp_path / "larger.mp4", "libx264", (540, 960))
+    bomb = video(tmp_path / "bomb.mp4", "mjpeg", SIZE, [hostile.grey(16_000)])
+    playlist = tmp_path / "playlist.mp4"
+    playlist.write_text("#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n")
+    for path in (larger, bomb, playlist):
+        with pytest.raises(EpisodeError, match=path.name):
+            check_video(path, SIZE)
+
+
+def test_a_table_has_no_more_rows_than_its_bytes_can_hold(tmp_path):
+    path, rows = tmp_path / "bomb.parquet", 10_000_000
+    parquet.write_table(pyarrow.table({"index": np.zeros(rows, np.int64)}), path)
+    with pytest.raises(EpisodeError, match="its footer says 10000000 rows"):
+        check_table(path)
+    parquet.write_table(pyarrow.table({"index": np.arange(1000)}), path)
+    assert check_table(path) == ["index"]
+
+
+def test_memory_is_limited_within_and_as_before_afterwards():
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with pytest.raises(MemoryError), limited_memory():
+        np.ones(600_000_000, np.uint8)
+    with limited_memory(300_000_000):
+        np.ones(600_000_000, np.uint8)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+def test_only_files_in_the_folder_or_in_the_hubs_cache_are_read(tmp_path):
+    root, blobs = tmp_path / "snapshots/0123", tmp_path / "blobs"
+    for folder in (root, blobs, tmp_path / "other"):
+        folder.mkdir(parents=True)
+        (folder / "file").touch()
+    (root / "in_hub").symlink_to(blobs / "file")
+    (root / "folder").symlink_to(blobs)
+    (root / "elsewhere").symlink_to(tmp_path / "other/file")
+    for name in ("file", "in_hub"):
+        check_inside(root, root / name)
+    for name in ("folder", "elsewhere", "x/../../../other/file"):
+        with pytest.raises(EpisodeError, match="leads out"):
+            check_inside(root, root / name)
+
+
+MOST_S, MOST_BYTES = 10, 500_000_000
+READERS = {
+    "run.json": lambda path: read_stage(path, "run"),
+    "car.yml": read_car,
+    "flight.log": read_log,
+    "episode_data.json": lambda path: load_recordings(path.parent, 8),
+    "./episode_data.json": lambda path: label([path.parent], "hit"),
+    "best_model.pth": load_checkpoint,
+    "calibration.pt": Calibration.load,
+    "manifest.json": lambda path: read_tub(path.parent, Car()),
+}
+
+
+def without_end(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(1 << 40)
+
+
+THINGS = {"a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a terabyte": without_end}
+
+
+def outcome_of(read, path: Path) -> str:
+    """What a reader says of a file, read in a child: its sentence, or what it did instead."""
+    out, into = os.pipe()
+    if not (child := os.fork()):
+        said = "nothing"
+        try:
+            signal.alarm(MOST_S)
+            torch.set_num_threads(1)  # a fork has none of the threads that OpenMP began before, and would wait
+            now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (now + MOST_BYTES,) * 2)
+            said = f"returned {str(read(path))[:100]}"
+        except RoverError as error:
+            said = f"said {error}"
+        except BaseException as error:
+            said = f"raised {type(error).__name__}"
+        finally:
+            os.write(into, said.encode()[:4000])
+            os._exit(0)
+    os.close(into)
+    with os.fdopen(out) as file:
+        said = file.read()
+    os.waitpid(child, 0)
+    return said or f"went on for {MOST_S} s"
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_sentence_at_once(tmp_path, name):
+    for thing, make in THINGS.items():
+        path = tmp_path / thing / name
+        path.parent.mkdir(parents=True)
+        make(path)
+        said = outcome_of(READERS[name], path)
+        assert said.startswith("said "), f"{thing} as {name}: {said}"
+
+
+def test_a_car_that_refers_to_itself_many_times(tmp_path):
+    lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12))]
+    (tmp_path / "car.yml").write_text("\n".join([*lines, "steering: *a11"]))
+    assert outcome_of(read_car, tmp_path / "car.yml").startswith("said ")
+
+
+SMALL_VALUES = {
+    "episode_data.json": b"[" + b'{"":0},' * 4_000_000 + b"0]",
+    "control_data.csv": b"a,b,c,d\n" + b"1\n" * 10_000_000,
+    "manifest.json": b'{"paths": [' + b"0," * 4_000_000 + b"0]}",
+    "catalog_0.catalog": b"1\n" * 4_000_000,
+}
+
+
+@pytest.mark.parametrize("name", SMALL_VALUES)
+def test_what_takes_many_times_its_size(tmp_path, name):
+    (tmp_path / "manifest.json").write_text('{"paths": ["catalog_0.catalog"]}')
+    (tmp_path / "episode_data.json").touch()
+    (tmp_path / name).write_bytes(SMALL_VALUES[name])
+    read = load_recordings if name.startswith(("episode", "control")) else lambda path: read_tub(path, Car())
+    assert outcome_of(read, tmp_path).startswith("said ")
