@@ -163,7 +163,7 @@ class View:
         pins = head.get("pins")
         pins = pins if pins and None not in pins else None
         plan = head.pop("plan", None)
-        ribbon: list[tuple[float, ...]] = []
+        ribbon: list[tuple[float, float, float, float]] = []
         if plan and "size" in head:
             (width, height), rate_hz = head["size"], plan["rate_hz"]
             now = max(0, round((head["sent_s"] - plan["captured_s"]) * rate_hz))
