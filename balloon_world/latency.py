@@ -18,7 +18,6 @@ from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
-ENSEMBLE = 0.01  # LeRobot's coefficient
 JUDGED_MS = 150.0
 How = tuple[float, int, Settings]  # latency in ms, pushes, settings of the loop
 
@@ -34,9 +33,9 @@ def measure_latencies(
 ) -> dict[str, Any]:
     """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
 
-    It drives at each of latencies_ms with and without compensation; at each of pushed_latencies_ms the same way, with
-    `pushes` pushes in each world; and at the first latency with LeRobot's temporal ensembling. A drive.json that was
-    made of the same policy and parameters is read, not made again.
+    It drives at each of latencies_ms with and without compensation, and at each of pushed_latencies_ms the same way,
+    with `pushes` pushes in each world. A drive.json that was made of the same policy and parameters is read, not made
+    again.
     Raises TrainingError if there is no policy, no world or no latency.
     """
     run_dir, p = Path(run_dir), params()
@@ -47,7 +46,7 @@ def measure_latencies(
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     limit = p["gates"]["hits_lost_at_150_ms"]
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
-    given |= {"pushed_latencies_ms": pushed_latencies_ms, "hits_lost_at_150_ms": limit}
+    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit": limit}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     if there := find_stage(path, "drive", params=given, inputs=inputs):
         return there
@@ -56,13 +55,8 @@ def measure_latencies(
         hows.append((ms, count, replace(settings, compensate=True)))
         if ms:  # a plan that takes no time leaves nothing to compensate
             hows.append((ms, count, replace(settings, compensate=False)))
-    hows.append((latencies_ms[0], 0, replace(settings, ensemble=ENSEMBLE)))
-    first: dict[int, list[Driven]] = {}  # for each number of pushes, the drives at its first latency, compensated
-    rows = []
-    for how, driven in zip(hows, _drive_all(artifact, hows, worlds, progress), strict=True):
-        base = first.setdefault(how[1], driven)
-        aside_cm = [1e2 * beside_path(d, b) for d, b in zip(driven, base, strict=True)]
-        rows.append(_row(how, driven) | {f"aside_p{q}_cm": float(np.percentile(aside_cm, q)) for q in (50, 90)})
+    drives = _drive_all(artifact, hows, worlds, progress)
+    rows = [_row(how, driven) for how, driven in zip(hows, drives, strict=True)]
     metrics = {"rows": rows, "gates": gates(rows, limit)}
     return write_stage(path, "drive", params=given, metrics=metrics, inputs=inputs)
 
@@ -80,30 +74,23 @@ def _drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progr
 
 
 def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
-    """Return a row of drive.json, less how far the car was beside its path."""
+    """Return a row of drive.json."""
     latency_ms, pushes, settings = how
     row: dict[str, Any] = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
-    row |= {"compensate": settings.compensate, "ensemble": settings.ensemble}
+    row["compensate"] = settings.compensate
     outcomes = [d.outcome for d in driven]
-    row |= count_hits(dict(enumerate(outcomes)), "hits_wilson")
+    row |= count_hits(outcomes)
     del row["missed"]
     row |= {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
     ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
         row[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
-    times_s = [d.duration_s for d in driven if d.outcome == "hit"]
-    return row | {"time_to_hit_p50_s": float(np.median(times_s)) if times_s else None}
-
-
-def beside_path(drive: Driven, other: Driven) -> float:
-    """Return how far a drive's path is from another one's at most, in metres. Times do not matter, only places."""
-    a, b = drive.trajectory, other.trajectory
-    return float(np.hypot(a.x_m[:, None] - b.x_m, a.y_m[:, None] - b.y_m).min(1).max())
+    return row
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:
     """Judge how many hits are lost at 150 ms, compensated, compared with 0 ms. rows: of drive.json."""
-    hits = {r["latency_ms"]: r["hits"] for r in rows if r["compensate"] and not r["pushes"] and r["ensemble"] is None}
+    hits = {r["latency_ms"]: r["hits"] for r in rows if r["compensate"] and not r["pushes"]}
     lost = hits[0.0] - hits[JUDGED_MS] if {0.0, JUDGED_MS} <= set(hits) else None
     return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
 
@@ -114,7 +101,6 @@ def table(content: Mapping[str, Any]) -> Table:
     for r in content["metrics"]["rows"]:
         how = [f"{r['pushes']} pushes"] if r["pushes"] else ["left alone"]
         how += [] if r["compensate"] else ["not compensated"]
-        how += ["ensembling"] if r["ensemble"] is not None else []
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
         hits = f"{r['hits']} of {r['trials']}"
         rows.append((", ".join(how), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))

@@ -154,7 +154,7 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
     ("happens", "error"),
     [
         (lambda board, feed: board._enter("M", "h"), DriveFault),
-        (lambda board, feed: feed.freeze(), DriveFault),
+        (lambda board, feed: feed.show(jpegs()[0]), DriveFault),
         (lambda board, feed: feed.close(), (DriveFault, CameraError)),
     ],
     ids=["takeover", "frozen", "unplugged"],
@@ -182,7 +182,7 @@ def test_a_picture_by_which_nobody_may_drive_arms_nothing(bench, when):
             rover._captured_s -= 5
             assert rover.send_action(GO) == named(0.0, 0.0)
         elif when == "none":
-            on.feed.pause()
+            on.feed.show()
             with pytest.raises(CameraError):
                 for _ in range(3):
                     rover.get_observation()
