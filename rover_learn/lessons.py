@@ -167,7 +167,7 @@ class Lessons:
     @torch.inference_mode()
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
         """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
-        policy, blocks, grid = None, self.blocks, self.maps.shape[1:]
+        policy, blocks, grid = None, self.blocks, (self.maps.shape[1], self.maps.shape[2])
         parts = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
         for block in saved.steps("teacher", len(blocks), rng, **parts):
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
