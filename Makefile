@@ -70,9 +70,10 @@ demo: $(READY)
 	@echo 'see it drive in your browser:   make watch'
 
 demo-more: $(DEMO)
-	$(ROVER) world latency runs/demo
+	$(ROVER) run --only 07 --name demo
 	@rm -rf runs/demo-small
 	$(ROVER) distill runs/demo/best_model.pth runs/demo/episodes --name demo-small --size 96x54 --feedforward 256
+	$(ROVER) run runs/demo-small/best_model.pth runs/demo/episodes --name demo-small -p modes '[static]'
 	$(ROVER) world students runs/demo runs/demo-small --worlds 40
 	$(ROVER) report runs/demo
 

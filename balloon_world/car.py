@@ -21,7 +21,7 @@ import termios
 import threading
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -100,14 +100,13 @@ def jpeg_of(picture: bytes | np.ndarray) -> bytes:
 class CameraFeed:
     """A simulated camera: a thread that writes pictures into a FIFO at a fixed rate.
 
-    path: of the FIFO, which is made if it does not exist. pictures: JPEGs, or frames (h, w, 3) uint8 BGR, shown in
-    turn, then again from the first. written: how many frames so far.
+    path: of the FIFO, which is made if it does not exist. written: how many frames so far.
     """
 
     def __init__(self, path: Path | str, *pictures: bytes | np.ndarray, rate_hz: float = 30.0):
         self.written = 0
         self._pipe, self._period_s = FramePipe(path), 1 / rate_hz
-        self._next, self._closing = -1, threading.Event()
+        self._closing = threading.Event()
         self.show(*pictures)
         self._thread = threading.Thread(target=self._run, name=f"camera feed {path}", daemon=True)
         self._thread.start()
@@ -119,17 +118,11 @@ class CameraFeed:
         self.close()
 
     def show(self, *pictures: bytes | np.ndarray) -> None:
-        """Show these pictures from the next frame on, and end freeze() and pause()."""
+        """Show these pictures in turn from the next frame on: JPEGs, or frames (h, w, 3) uint8 BGR.
+
+        Of one picture, the camera is frozen; of none, it stays plugged in but sends nothing.
+        """
         self._pictures = tuple(jpeg_of(picture) for picture in pictures)
-        self._frozen = self._paused = False
-
-    def freeze(self) -> None:
-        """Repeat the same frame until show()."""
-        self._frozen = True
-
-    def pause(self) -> None:
-        """Write no frames until show(), as a camera that stays plugged in but sends nothing."""
-        self._paused = True
 
     def close(self) -> None:
         """Unplug the camera; a new feed on the same path plugs it in again."""
@@ -141,29 +134,10 @@ class CameraFeed:
         due = time.monotonic()
         while not self._closing.wait(max(0.0, due - time.monotonic())):
             due = max(due + self._period_s, time.monotonic() - self._period_s)
-            pictures, following = self._pictures, self._next + (not self._frozen)
+            pictures = self._pictures
             # Go on to the next picture only once this one was written: a slow reader shall see all of them.
-            if pictures and not self._paused and self._pipe.write(pictures[following % len(pictures)]):
-                self._next = following
+            if pictures and self._pipe.write(pictures[self.written % len(pictures)]):
                 self.written += 1
-
-
-class CarReport(NamedTuple):
-    """What a virtual car has done.
-
-    outcomes: [seed, 'hit', 'left' or 'timeout'] of each world that has ended. late: how many pictures were left out,
-    because this machine was too slow. seed, held, speed_mps: of the present world, whether the car is held, its speed.
-    """
-
-    outcomes: list[list[Any]]
-    late: int
-    seed: int
-    held: bool
-    speed_mps: float
-
-    @property
-    def hits(self) -> int:
-        return sum(outcome == "hit" for _, outcome in self.outcomes)
 
 
 class VirtualCar:
@@ -172,10 +146,10 @@ class VirtualCar:
     camera: the path of a FIFO of MJPEG, for a Camera. port: of its Arduino, for a ServoLink. pid: of the process.
 
     The first world begins when the pins first ask for motion. After each world the car stands in the next one and is
-    held there for hold_s, so that it is let go with a plan for what it sees. The process ends when this one does.
+    held there for HOLD_S, so that it is let go with a plan for what it sees. The process ends when this one does.
     """
 
-    def __init__(self, *, seed: int = 10_000, board: str = STAND_IN, hold_s: float = HOLD_S):
+    def __init__(self, *, seed: int = 10_000, board: str = STAND_IN) -> None:
         """Start the process.
 
         board: 'module:function' that makes the car's Arduino in that process, a context manager with a port and
@@ -184,7 +158,7 @@ class VirtualCar:
         self._folder = Path(tempfile.mkdtemp(prefix="rover-car-"))
         self.camera = str(self._folder / "camera")
         self._talking, self._answers = threading.Lock(), b""
-        options = {"seed": seed, "board": board, "hold_s": hold_s, "folder": str(self._folder), "parent": os.getpid()}
+        options = {"seed": seed, "board": board, "folder": str(self._folder), "parent": os.getpid()}
         command = (sys.executable, "-m", "balloon_world.car", json.dumps(options))
         env = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # where the board's module is
         self._process = Child("the virtual car", *command, error=TrainingError, talks=True, env=env)
@@ -201,16 +175,15 @@ class VirtualCar:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def report(self) -> CarReport:
-        """Ask the process what the car has done, for up to a frame's time. Raises TrainingError if it has ended."""
-        with self._talking:
-            self._process.send_line("report")
-            return CarReport(**self._answer(ANSWER_S))
-
     def summary(self) -> dict[str, Any]:
-        """Return what the report of a drive says about this car: hits, trials and camera_late. Raises as report()."""
-        report = self.report()
-        return {"hits": report.hits, "trials": len(report.outcomes), "camera_late": report.late}
+        """Ask the process for what the car has done, for up to a frame's time: hits, trials and camera_late.
+
+        camera_late: how many pictures were left out, because this machine was too slow. Raises TrainingError if the
+        process has ended.
+        """
+        with self._talking:
+            self._process.send_line("summary")
+            return self._answer(ANSWER_S)
 
     @staticmethod
     def shown(artifact: Path) -> Any:
@@ -240,12 +213,12 @@ class VirtualCar:
 class _Car:
     """A car that the pulses on a board's pins drive through one world after the other."""
 
-    def __init__(self, board: Any, seed: int, hold_s: float):
-        self._board, self._pwm, self._hold_ticks = board, this_car().pwm, round(hold_s * RATE_HZ)
+    def __init__(self, board: Any, seed: int):
+        self._board, self._pwm = board, this_car().pwm
         self._action = dict(zip(("steering", "throttle"), NEUTRAL, strict=True))
         self._held_ticks = math.inf  # until the pins first ask for motion
         self.world = World(seed)
-        self.outcomes: list[list[Any]] = []
+        self.hits = self.trials = 0
 
     def tick(self) -> None:
         """Drive for a frame's time by the newest pulses; the car stands where a reset has ended them."""
@@ -263,12 +236,9 @@ class _Car:
             return
         self.world.step(self._action["steering"], self._action["throttle"])
         if self.world.done:
-            self.outcomes.append([self.world.seed, self.world.outcome])
-            self.world, self._held_ticks = World(self.world.seed + 1), self._hold_ticks
-
-    def report(self, late: int) -> CarReport:
-        speed_mps = self.world.state.speed_mps
-        return CarReport(self.outcomes, late, self.world.seed, self._held_ticks > 0, speed_mps)
+            self.hits += self.world.hit
+            self.trials += 1
+            self.world, self._held_ticks = World(self.world.seed + 1), round(HOLD_S * RATE_HZ)
 
 
 def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
@@ -281,7 +251,7 @@ def _run(car: _Car, pipe: FramePipe, parent: int) -> None:
             if not asked:
                 return
             for _ in range(asked.count(b"\n")):
-                print(json.dumps(car.report(late)._asdict()), flush=True)
+                print(json.dumps({"hits": car.hits, "trials": car.trials, "camera_late": late}), flush=True)
         car.tick()
         if pipe.ready:  # what nobody would see is not drawn
             noise = rng.integers(0, NOISE, (FRAME_HEIGHT, FRAME_WIDTH, 3), np.uint8)
@@ -308,7 +278,7 @@ def main() -> None:
             # This concerns only the present thread: the stand-in's thread and the emulator's process keep their turn.
             os.nice(NICE)
             print(json.dumps({"port": board.port}), flush=True)
-            _run(_Car(board, options["seed"], options["hold_s"]), pipe, options["parent"])
+            _run(_Car(board, options["seed"]), pipe, options["parent"])
     finally:
         shutil.rmtree(options["folder"], ignore_errors=True)  # in case the parent was killed and cannot do it
 

@@ -8,18 +8,18 @@ planner's thread are replaced. Nothing waits, and no result depends on how fast 
 """
 
 import json
-import math
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from balloon_world.trial import Driven, Trajectory, wilson_interval
+from balloon_world.trial import wilson_interval
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.drive.loop import Until, drive
@@ -36,6 +36,18 @@ SEED = 10_000  # of the first world that judges a policy
 K = TypeVar("K")
 V = TypeVar("V")
 Watch = Callable[[Order], bool]
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A drive through a world.
+
+    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by, or 'taken over'. orders: what was
+    commanded at each tick.
+    """
+
+    outcome: str
+    orders: list[Order]
 
 
 class NoLog:
@@ -67,16 +79,16 @@ class TimedCar:
         self._coming: Plan | None = None
         self._think(ROUNDING)
 
-    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> tuple[list[Order], str]:
-        """Drive by the car's own loop until the world ends or `stop` is set; return all orders and the outcome."""
+    def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> Driven:
+        """Drive by the car's own loop until the world ends or `stop` is set."""
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
         try:
             drive(pilot, None, log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep)
         except DriveFault as fault:
             if fault.__cause__:  # the policy failed; without a cause, a plan had become too old
                 raise fault.__cause__ from None
-            return pilot.orders, "stopped"
-        return pilot.orders, self.world.outcome or "taken over"
+            return Driven("stopped", pilot.orders)
+        return Driven(self.world.outcome or "taken over", pilot.orders)
 
     def clock(self) -> float:
         return self._tick / RATE_HZ
@@ -152,8 +164,7 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     if latency_s < 0:
         raise TrainingError("a latency must be at least 0 s", found=latency_s)
     car = TimedCar(world, policy, latency_s)
-    orders, outcome = car.drive(settings, NoLog(), watch)
-    return Driven(outcome, world.state.time_s, Trajectory.of(world), orders)
+    return car.drive(settings, NoLog(), watch)
 
 
 # --- many drives ------------------------------------------------------------------------------------------------------
@@ -219,21 +230,30 @@ def drive_missing(
     return {each: kept[each] for each in asked}
 
 
-def count_hits(outcomes: Mapping[int, str], key: str = "wilson") -> dict[str, Any]:
-    """Return hits, trials, Wilson's 95 % interval and the missed seeds of outcomes by seed."""
-    missed = [seed for seed, outcome in sorted(outcomes.items()) if outcome != "hit"]
+def count_hits(outcomes: Sequence[str], key: str = "hits_wilson") -> dict[str, Any]:
+    """Return hits, trials, Wilson's 95 % interval and the missed seeds of outcomes in the worlds from SEED on."""
+    missed = [seed for seed, outcome in enumerate(outcomes, SEED) if outcome != "hit"]
     hits = len(outcomes) - len(missed)
     low, high = wilson_interval(hits, len(outcomes))
     return {"hits": hits, "trials": len(outcomes), f"{key}_low": low, f"{key}_high": high, "missed": missed}
 
 
-def sign_test(only_one: int, only_other: int) -> float:
-    """Return the exact two-sided sign test's p of worlds that only one of two policies hits (McNemar's exact test)."""
-    n, fewer = only_one + only_other, min(only_one, only_other)
-    return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
+def judge(
+    artifact: Path,
+    worlds: Mapping[str, int],
+    one: Callable[[Policy, str, int], str],
+    path: Path,
+    progress: Progress,
+    name: str,
+) -> dict[str, list[str]]:
+    """Return the outcomes of drives in the worlds from SEED on, for each way to drive. worlds: their number, by way.
 
+    one: drives a policy in that way through the world of a seed. path: keeps what was driven, see `drive_missing`.
+    """
 
-def pair_worlds(missed: Sequence[int], others_missed: Sequence[int]) -> tuple[int, int, float]:
-    """Return how many worlds only the one policy hit, how many only the other, and the sign test's p. missed: seeds."""
-    only, only_other = len({*others_missed} - {*missed}), len({*missed} - {*others_missed})
-    return only, only_other, sign_test(only, only_other)
+    def row(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
+        return {"outcome": one(policy, *asked)}
+
+    asked = [(how, SEED + i) for how, count in worlds.items() for i in range(count)]
+    found = drive_missing(artifact, asked, row, path, progress, f"driving {name}")
+    return {how: [found[how, SEED + i]["outcome"] for i in range(count)] for how, count in worlds.items()}

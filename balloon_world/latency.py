@@ -46,7 +46,7 @@ def measure_latencies(
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     limit = p["gates"]["hits_lost_at_150_ms"]
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
-    given |= {"pushed_latencies_ms": pushed_latencies_ms, "hits_lost_at_150_ms": limit}
+    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit": limit}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     if there := find_stage(path, "drive", params=given, inputs=inputs):
         return there
@@ -79,14 +79,13 @@ def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
     row: dict[str, Any] = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
     row["compensate"] = settings.compensate
     outcomes = [d.outcome for d in driven]
-    row |= count_hits(dict(enumerate(outcomes)), "hits_wilson")
+    row |= count_hits(outcomes)
     del row["missed"]
     row |= {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
     ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
         row[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
-    times_s = [d.duration_s for d in driven if d.outcome == "hit"]
-    return row | {"time_to_hit_p50_s": float(np.median(times_s)) if times_s else None}
+    return row
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:

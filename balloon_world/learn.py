@@ -12,12 +12,12 @@ import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from balloon_world.drives import SEED, append_row, count_hits, drive_in, drive_missing, pair_worlds, read_rows
-from balloon_world.record import WorldEpisode, episode_name
+from balloon_world.drives import SEED, append_row, count_hits, drive_in, drive_missing, judge, read_rows
+from balloon_world.record import BETWEEN_DRIVES, WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
@@ -27,9 +27,10 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
-from rover_lib.onboard.stage import find_stage, plain, sha256_of, write_stage
+from rover_lib.onboard.stage import plain, sha256_of, write_stage
 from rover_lib.workshop.cache import car_in_key, key_of
 from rover_lib.workshop.judge.compare import gate
+from rover_lib.workshop.judge.pairs import sign_test
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import pipeline
@@ -42,7 +43,6 @@ PUSHED, ALONE, DECOY = "pushed", "alone", "decoy"
 FIRST_LEARNED = 2_000_000  # seeds of the worlds to learn in, far from those of recordings and trials
 FIRST_DEMONSTRATED = 3_000_000
 FIRST_DRIVE = datetime(2025, 6, 1, 12, tzinfo=UTC)  # invented, so that a seed's recording always has the same bytes
-BETWEEN_DRIVES = timedelta(seconds=30)
 GATED_WORLDS = 40
 OFF, REACTS_S = 0.25, 0.4  # a share of full steering; when the human takes over
 CHANCE = 0.05  # a difference counts if its sign test's p is below this
@@ -75,7 +75,7 @@ def drive_corrected(policy: Policy, folder: Path, index: int, world: World, expe
     Returns {"outcome", "taken_over_s": None if nobody had to, "human_s": for how long they drove}.
     """
     takes_over = human_beside(world)
-    with WorldEpisode(folder, _start(index), world) as episode:
+    with _anew(folder, index, world) as episode:
 
         def watch(order: Order) -> bool:
             episode.tick(order.steering, order.throttle, driver=POLICY)
@@ -92,7 +92,7 @@ def drive_corrected(policy: Policy, folder: Path, index: int, world: World, expe
 
 def demonstrate(folder: Path, index: int, world: World, most_s: float) -> float:
     """Record a whole drive of the expert, or its first most_s seconds. Returns how many seconds were recorded."""
-    with WorldEpisode(folder, _start(index), world) as episode:
+    with _anew(folder, index, world) as episode:
         while not world.done and world.state.time_s < most_s - HALF_A_TICK_S:
             world.step(*episode.tick(*expert(world), driver=HUMAN))
     return world.state.time_s
@@ -136,25 +136,21 @@ def run_experiment(
     """Run both arms, round by round; write and return learn.json in the run's folder, stage 'learn'.
 
     run_dir: as `make demo` leaves it. out_dir: keeps what is recorded, learned and driven on the way, by experiment;
-    after an end at any moment, the same call goes on from there. A learn.json that was made from the same files and
-    parameters is read, not made again. Raises TrainingError if the run lacks a file.
+    after an end at any moment, the same call goes on from there. Raises TrainingError if the run lacks a file.
     """
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
-    path = run_dir / "learn.json"
     for name in (CHECKPOINT, EPISODES, ARTIFACT):
         if not (run_dir / name).exists():
             raise TrainingError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
     how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
     given = plain(asdict(experiment) | how)
-    if there := find_stage(path, "learn", params=given, inputs=inputs):
-        return there
     learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
     lab = _Lab(experiment, run_dir, out_dir / key_of({"params": learned, "inputs": inputs}), progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
     rows = lab.judge(rounds)
     metrics = {"rounds": rounds, "policies": rows, "gates": gates(rows)}
-    return write_stage(path, "learn", params=given, metrics=metrics, inputs=inputs)
+    return write_stage(run_dir / "learn.json", "learn", params=given, metrics=metrics, inputs=inputs)
 
 
 @dataclass(frozen=True)
@@ -198,7 +194,6 @@ class _Lab:
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
         """Record a round's missing drives with a human beside the track, and return the rows of all."""
         folder, first = self.folder / _name(CORRECTED, number), 1000 * number
-        _remove_unfinished(folder)
 
         def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
             i = asked[1] - FIRST_LEARNED - first
@@ -211,7 +206,6 @@ class _Lab:
     def _demonstrate(self, number: int, left_s: float) -> None:
         """Record left_s seconds of whole drives by the expert; the last drive is cut."""
         folder, first = self.folder / _name(DEMONSTRATED, number), 1000 * number
-        _remove_unfinished(folder)
         done = {row["seed"]: row["human_s"] for row in read_rows(folder / DRIVES_FILE)}
         for i in itertools.count():
             if left_s <= HALF_A_TICK_S:
@@ -226,25 +220,21 @@ class _Lab:
         """Drive every policy through the worlds that judge, as far as missing, and return the rows of learn.json."""
         experiment = self.experiment
 
-        def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-            how, seed = asked
+        def one(policy: Policy, how: str, seed: int) -> str:
             world = World(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
-            return {"outcome": experiment.drive(policy, world)}
+            return experiment.drive(policy, world)
 
         counts = {how: experiment.worlds if how == PUSHED else experiment.other_worlds for how in HOW}
-        asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
         learned = [(arm, number, self._learned(arm, number)) for arm in ARMS for number in range(1, len(rounds) + 1)]
         rows = []
         for arm, number, artifact in [(BEFORE, 0, self.run_dir / ARTIFACT), *learned]:
             name = _name(arm, number) if number else BEFORE
-            file, desc = self.folder / f"{name}.jsonl", f"judging {name}"
-            found = drive_missing(artifact, asked, one, file, self.progress, desc)
+            found = judge(artifact, counts, one, self.folder / f"{name}.jsonl", self.progress, name)
             human_s = float(sum(r["human_s"] for r in rounds[:number]))
             row: dict[str, Any] = {"name": name, "arm": arm, "round": number, "human_s": human_s}
-            for how in HOW:
-                row[how] = count_hits({seed: each["outcome"] for (of, seed), each in found.items() if of == how})
-                missed = row[how]["missed"]
-                row[how]["hits_of_40"] = sum(s not in missed for s in range(SEED, SEED + GATED_WORLDS))
+            for how, outcomes in found.items():
+                hits_of_40 = outcomes[:GATED_WORLDS].count("hit")
+                row[how] = count_hits(outcomes, key="wilson") | {"hits_of_40": hits_of_40}
             rows.append(row)
         return rows
 
@@ -253,17 +243,12 @@ def _name(arm: str, number: int) -> str:
     return f"{arm}-{number}"
 
 
-def _remove_unfinished(folder: Path) -> None:
-    """Remove recordings that a killed process left of drives that are not in the folder's file."""
-    kept = {episode_name(_start(row["seed"] % 1_000_000)) for row in read_rows(folder / DRIVES_FILE)}
-    for path in folder.glob("*") if folder.is_dir() else ():
-        if path.is_dir() and path.name not in kept:
-            shutil.rmtree(path)
-
-
-def _start(index: int) -> datetime:
-    """Return when a drive began, by an invented calendar."""
-    return FIRST_DRIVE + index * BETWEEN_DRIVES
+def _anew(folder: Path, index: int, world: World) -> WorldEpisode:
+    """Return the recording of a drive, and remove what a killed process left of it."""
+    start = FIRST_DRIVE + index * BETWEEN_DRIVES
+    for path in folder.glob(f"*{episode_name(start)}*"):
+        shutil.rmtree(path)
+    return WorldEpisode(folder, start, world)
 
 
 # --- the results ------------------------------------------------------------------------------------------------------
@@ -274,7 +259,8 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     last, other = ([row for row in rows if row["arm"] == arm][-1] for arm in ARMS)
     hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
     lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]
-    _, _, p = pair_worlds(last[PUSHED]["missed"], other[PUSHED]["missed"])
+    missed, others_missed = ({*row[PUSHED]["missed"]} for row in (last, other))
+    p = sign_test(len(others_missed - missed), len(missed - others_missed))
     by_chance = p if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
     least = params()["gates"]["corrected_hits"]
     return [
@@ -293,12 +279,3 @@ def table(content: Mapping[str, Any]) -> Table:
         name = row["name"] if row["arm"] == BEFORE else f"{row['arm']}, round {row['round']}"
         rows.append((name, f"{row['human_s']:.0f}", *hits))
     return Table(("", "human s", *HOW.values()), rows, notes=["hits, with Wilson's 95 % interval"])
-
-
-def rounds_table(content: Mapping[str, Any]) -> Table:
-    """Show what each round cost as a table."""
-    rows = []
-    for r in content["metrics"]["rounds"]:
-        takeovers = f"{r['takeovers']} of {r['drives']}"
-        rows.append((str(r["round"]), takeovers, f"{r['human_s']:.1f}", str(r["missed"])))
-    return Table(("round", "drives with a takeover", "human s", "missed all the same"), rows)

@@ -2,22 +2,21 @@
 
     open_view(..., shown=Simulation("runs/demo/policy_static.pt"))
 
-The car's own loop drives, on a virtual clock, as in `drives`. On a busy machine the simulation's time goes slower, and
-the page says so. A real car would have to be stopped there.
+The car's own loop drives, on a virtual clock, as in `drives`. On a busy machine the simulation's time goes slower; a
+real car would have to be stopped.
 """
 
 import asyncio
 import contextlib
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from balloon_world.drives import NoLog, TimedCar
+from balloon_world.drives import SEED, NoLog, TimedCar
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.drive.plan import Settings
@@ -30,11 +29,9 @@ if TYPE_CHECKING:
 PLAN_S = 0.1  # what a plan takes, in the simulation's time: about what a Pi may need for one of the real car's size
 PICTURE_S = 1 / 15  # between two pictures, by the clock
 HOLD_S = 1.5  # between two worlds
-PACE_S = 2.0  # the pace is that of the last seconds
 # Threads wait for each other by spinning. Beside other busy programs, two needed 400 ms of processor for a plan of the
 # demo's that one computes in 4. The first number is what counts: XNNPACK's pool keeps it for as long as a process runs.
 THREADS = 1
-SLOW = 0.9  # of the clock; the page speaks of a slower pace
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SIDES = {"push left": 1, "push right": -1}  # what the page of a simulation, and no other, can do to the car
 PUSHES = Path(__file__).with_name("push.js").read_bytes()
@@ -48,13 +45,13 @@ class Simulation:
 
     Whoever watches can push the car off its way. A drive with pushes counts for the pushes, not for the policy.
 
-    artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. seed: of the
-    first world. title: the page's; "": the name of the artifact's folder. Raises what load_policy() raises.
+    artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. title: the
+    page's; "": the name of the artifact's folder. Raises what load_policy() raises.
     """
 
     script = PUSHES  # for the page
 
-    def __init__(self, artifact: Path | str, seed: int = 10_000, title: str = ""):
+    def __init__(self, artifact: Path | str, title: str = ""):
         artifact = Path(artifact)
         self._title = title or artifact.parent.name
         suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
@@ -67,7 +64,7 @@ class Simulation:
         self.car = self._policies[self._wanted].car
         self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
         self._pushed = [0, 0]  # pushes that the policy recovered from, and all
-        self._seed = seed
+        self._seed = SEED
         cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
         self._driving: PacedCar | None = None
@@ -121,7 +118,7 @@ class Simulation:
             world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
-            _, outcome = car.drive(settings, car.log)
+            outcome = car.drive(settings, car.log).outcome
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
                 counted, by = (self._pushed, car.pushes) if car.pushes else (self._results[name], 1)
@@ -144,14 +141,9 @@ class Simulation:
 
     def _seen(self, car: "PacedCar") -> tuple[dict[str, Any], bytes]:
         """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
-        world, row, plan = car.world, car.log.row, car.newest()
-        frame, pace, slow = world.render(), car.pace(), ""
-        if pace < SLOW:
-            slow = (
-                f"this machine is busy, or slow for this policy: time in the simulation runs at {pace:.0%} of the clock"
-            )
+        world, row, plan, frame = car.world, car.log.row, car.newest(), car.world.render()
         head: dict[str, Any] = {
-            "phase": "driving", "text": slow, "title": f"{self._title}: {self._wanted}, balloon world",
+            "phase": "driving", "text": "", "title": f"{self._title}: {self._wanted}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
             "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
             "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
@@ -165,7 +157,6 @@ class Simulation:
             "pushed": self._pushed,
             "results": self._results,
             "drives": self._wanted,
-            "pace": round(pace, 2),
             "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
             "balloon": [world.balloon.x_m, world.balloon.y_m],
         }
@@ -178,7 +169,6 @@ class PacedCar(TimedCar):
     def __init__(self, world: World, policy: Any, seen: Callable[["PacedCar"], object]):
         self.log, self._seen, self.pushes = NoLog(), seen, 0
         self._due_s = self._shown_s = time.monotonic()
-        self._times = deque([(self._due_s, 0.0)], maxlen=round(PACE_S * RATE_HZ))
         super().__init__(world, policy, PLAN_S)
 
     def push(self, side: int) -> None:
@@ -195,13 +185,8 @@ class PacedCar(TimedCar):
             time.sleep(self._due_s - now_s)
         else:
             self._due_s = now_s  # what this machine could not do in time is not caught up: time has been slower
-        self._times.append((time.monotonic(), self.clock()))
+        now_s = time.monotonic()
         # every second tick at most: where time is slow already, pictures in between would make it slower still
-        if self._times[-1][0] - self._shown_s >= PICTURE_S and round(self.clock() * RATE_HZ) % 2 == 0:
-            self._shown_s = self._times[-1][0]
+        if now_s - self._shown_s >= PICTURE_S and round(self.clock() * RATE_HZ) % 2 == 0:
+            self._shown_s = now_s
             self._seen(self)
-
-    def pace(self) -> float:
-        """How fast the simulation's time went in the last seconds, against the clock."""
-        (began_s, first_s), (now_s, last_s) = self._times[0], self._times[-1]
-        return min((last_s - first_s) / (now_s - began_s), 1.0) if now_s > began_s and last_s > first_s else 1.0

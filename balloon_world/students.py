@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from balloon_world import drives, trial, world
-from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, everywhere
+from balloon_world.drives import SEED, count_hits, drive_in, everywhere, judge
 from balloon_world.trial import run_trials
 from balloon_world.world import World
 from rover_learn.distill import errors_of
@@ -41,6 +41,7 @@ HELD_OUT_FRAMES = 300
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
 HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
+COUNTS = ("hits", "trials", "hits_wilson_low", "hits_wilson_high", "missed")
 COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
 ESTIMATED = "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates: the teacher is not counted."
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
@@ -107,7 +108,6 @@ def judge_students(
         "students": rows,
         "recommendation": recommendation(rows, p["students"]),
         "limits": p["students"],
-        "latency": "counted" if counted else "estimated",
         "judged_frames": len(samples),
         "held_out_episodes": parts.episodes["held_out"],
         "warnings": not_judged(recordings.action_range()),
@@ -154,22 +154,18 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
 def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress) -> dict[str, Any]:
     """Return a row's hits, left alone and pushed; all None if nobody drove. pushed_ms: None if it is not known."""
     how = params()["drive"]
-    late_ms = {"": None, "pushed_": pushed_ms}
 
-    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-        return {"outcome": drive_once(policy, asked[1], late_ms[asked[0]], Settings.of(how))}
+    def one(policy: Policy, kind: str, seed: int) -> str:
+        return drive_once(policy, seed, pushed_ms if kind else None, Settings.of(how))
 
     driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
     driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms}
     path = cache_root() / f"drives-{key_of(driven_by, world, trial, drives, loop, pilot, plan)}.jsonl"
+    counts = {kind: worlds for kind in HOW if worlds and not (kind and pushed_ms is None)}
+    found = judge(run.artifact, counts, one, path, progress, run.name)
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
-    kinds = [kind for kind in HOW if not (kind and pushed_ms is None)]
-    asked = [(kind, seed) for kind in kinds for seed in range(SEED, SEED + worlds)]
-    found = drive_missing(run.artifact, asked, one, path, progress, f"driving {run.name}")
     for kind in HOW:
-        outcomes = {seed: each["outcome"] for (of, seed), each in found.items() if of == kind}
-        keys = "hits", "trials", "hits_wilson_low", "hits_wilson_high", "missed"
-        counted = count_hits(outcomes, "hits_wilson") if outcomes else dict.fromkeys(keys)
+        counted = count_hits(found[kind]) if kind in found else dict.fromkeys(COUNTS)
         row |= {f"{kind}{name}": value for name, value in counted.items()}
     return row
 
@@ -177,7 +173,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
 def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Settings) -> str:
     """Drive through the world of a seed and return the outcome: left alone, or pushed if plans are late_ms late."""
     if late_ms is None:
-        return run_trials(policy, worlds=1, seed=seed).per_world[0].outcome
+        return "hit" if run_trials(policy, worlds=1, seed=seed).hits else "missed"
     return drive_in(policy, World(seed, PUSHES), late_ms / 1e3, settings).outcome
 
 

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -11,48 +11,8 @@ import numpy as np
 
 from balloon_world.world import World
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.progress import Progress, silent
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A drive as seen from above: (n,) arrays of positions in metres and of commanded actions.
-
-    balloon_xy_m: the balloon's (x, y).
-    """
-
-    x_m: np.ndarray
-    y_m: np.ndarray
-    steering: np.ndarray
-    throttle: np.ndarray
-    balloon_xy_m: tuple[float, float]
-
-    @classmethod
-    def of(cls, world: World) -> "Trajectory":
-        """Return everything that was driven in a world so far."""
-        track = np.array([(s.x_m, s.y_m, s.steering_command, s.throttle_command) for s in world.trajectory])
-        x_m, y_m, steering, throttle = track.T
-        return cls(x_m, y_m, steering, throttle, (world.balloon.x_m, world.balloon.y_m))
-
-
-@dataclass(frozen=True)
-class Driven:
-    """A drive through a world.
-
-    outcome: 'hit', 'left', 'timeout', and for `drives.drive_in` 'stopped' if a plan became too old to drive by, or
-    'taken over'. trajectory: one point per tick. orders: what was commanded at each tick, for `drive_in` alone.
-    """
-
-    outcome: str
-    duration_s: float
-    trajectory: Trajectory
-    orders: Sequence[Order] = ()
-
-    @property
-    def hit(self) -> bool:
-        return self.outcome == "hit"
 
 
 @dataclass(frozen=True)
@@ -62,7 +22,6 @@ class TrialReport:
     hits: int
     trials: int
     wilson: tuple[float, float]
-    per_world: list[Driven]
 
 
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -91,13 +50,12 @@ def run_trials(
     if worlds < 1 or not 1 <= replan_every <= policy.chunk:
         what = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
         raise TrainingError(what, found=f"{worlds} and {replan_every}")
-    results: list[Driven] = []
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
+    hits = 0
     for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
-        results.append(_drive(policy, World(world_seed, left=left), replan_every))
-    hits = sum(r.hit for r in results)
-    return TrialReport(hits, worlds, wilson_interval(hits, worlds), results)
+        hits += _hits(policy, World(world_seed, left=left), replan_every)
+    return TrialReport(hits, worlds, wilson_interval(hits, worlds))
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
@@ -107,7 +65,7 @@ def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any)
         return {name: trial.result() for name, trial in running.items()}
 
 
-def _drive(policy: Any, world: World, replan_every: int) -> Driven:
+def _hits(policy: Any, world: World, replan_every: int) -> bool:
     state: np.ndarray = np.zeros(2, np.float32)
     while not world.done:
         chunk = np.asarray(policy.predict_chunk(world.render(), state))
@@ -119,4 +77,4 @@ def _drive(policy: Any, world: World, replan_every: int) -> Driven:
             state = np.array([steering, throttle], np.float32)
             if world.done:
                 break
-    return Driven(str(world.outcome), world.state.time_s, Trajectory.of(world))
+    return world.hit

@@ -1,7 +1,5 @@
 """The commands that teach policies. `rover` has them by entry points of pyproject.toml."""
 
-import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rover_lib.cli.prepare import CHECKPOINT, EPISODES, size_option, with_source
-from rover_lib.onboard.cli import AS_JSON, FILE
-from rover_lib.onboard.kinds import Number, Output
+from rover_lib.onboard.cli import FILE
+from rover_lib.onboard.kinds import Output
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
@@ -18,30 +16,21 @@ if TYPE_CHECKING:
 
 
 def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a training whose recipe is a section of params.yml. It gets its numbers as `given`."""
-
-    @functools.wraps(command)
-    def called(samples: int | None, steps: int | None, seed: int | None, **options: Any) -> None:
-        return command(given={"samples": samples, "steps": steps, "seed": seed}, **options)
-
+    """Add the options of a training whose recipe is a section of params.yml."""
     for option in (
-        AS_JSON,
         click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]"),
-        click.option("--seed", type=click.IntRange(min=0), help="[default: params.yml]"),
         click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml]."),
-        click.option("--samples", type=click.IntRange(min=1), help="Frames to learn from [default: params.yml]."),
         click.option("--runs-dir", type=FILE, default="runs", show_default=True),
         click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/."),
     ):
-        called = option(called)
-    return called
+        command = option(command)
+    return command
 
 
-def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json: bool) -> None:
+def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
     from rover_lib.onboard.stage import read_stage
 
-    content = read_stage(folder / f"{stage}.json", stage)
-    click.echo(json.dumps(content, indent=2) if as_json else f"{summary(content)}\ndone: {folder}")
+    click.echo(f"{summary(read_stage(folder / f'{stage}.json', stage))}\ndone: {folder}")
 
 
 @click.command(short_help="Teach a smaller policy.")
@@ -58,45 +47,29 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str], as_json:
 @of_a_recipe
 @with_source
 def distill(
-    checkpoint: Path,
-    episodes: "Source",
-    size: tuple[int, int] | None,
-    given: dict[str, Any],
-    as_json: bool,
-    **options: Any,
+    checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, steps: int | None, **options: Any
 ) -> None:
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
-    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot, policy_static.pt to drive with, and
-    distill.json in the run's folder. Run it again to resume.
+    Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and distill.json in the run's folder. Run it
+    again to resume.
     """
-    from rover_learn.distill import DistillRecipe, phases_of, summary
+    from rover_learn.distill import DistillRecipe, summary
     from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
-    shape = StudentShape(height, width, **parts)
-    recipe = DistillRecipe.of(phases=phases_of(shape), **given)
-    folder = teach(checkpoint, episodes, shape=shape, recipe=recipe, progress=terminal_bar(), **options)
-    show_stage(folder, "distill", summary, as_json)
+    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(steps=steps)}
+    folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
+    show_stage(folder, "distill", summary)
 
 
 @click.command(short_help="Train a policy further, from takeovers.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
-@click.option(
-    "--weight", type=Number(min=0, min_open=True), help="Weight of a frame of a correction [default: params.yml]."
-)
 @of_a_recipe
-def finetune(
-    checkpoint: Path,
-    episodes: tuple[Path, ...],
-    weight: float | None,
-    given: dict[str, Any],
-    as_json: bool,
-    **options: Any,
-) -> None:
+def finetune(checkpoint: Path, episodes: tuple[Path, ...], steps: int | None, **options: Any) -> None:
     """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
@@ -107,9 +80,9 @@ def finetune(
     from rover_learn.finetune import FinetuneRecipe
     from rover_learn.finetune import finetune as learn_on
 
-    recipe = FinetuneRecipe.of(correction_weight=weight, **given)
+    recipe = FinetuneRecipe.of(steps=steps)
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
-    show_stage(folder, "finetune", summary, as_json)
+    show_stage(folder, "finetune", summary)
 
 
 @click.command(short_help="Make many runs from one sheet.")
@@ -161,9 +134,5 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
     """
     from rover_learn.train import train as train_policy
 
-    try:
-        click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
-    except KeyboardInterrupt:
-        click.echo("\nrover: stopped; run it again to resume", err=True)
-        raise click.exceptions.Exit(130) from None
+    click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
     click.echo(f"next: rover run {output} {episodes.path} --name mine")

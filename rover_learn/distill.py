@@ -5,7 +5,7 @@
 The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
 sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
 plans, and a little what was recorded. Channels that it is to do without go after the first phase (see `channels`).
-The run's folder gets best_model.pth, pretrained_model/, policy_static.pt and distill.json.
+The run's folder gets best_model.pth, pretrained_model/ and distill.json; `rover run` makes its artifacts.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -24,20 +24,12 @@ from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Pool, plans_of
 from rover_learn.phases import Learned, LessonRecipe, Work, cache_for, free_folder
 from rover_learn.student import StudentShape, gmac, initial_weights, student_config
 from rover_learn.training import Resumable
-from rover_lib.onboard.columns import align
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import find_written
-from rover_lib.workshop.int8.export import export
-from rover_lib.workshop.int8.observe import calibrate
-from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source, pick_evenly
-from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.session import Opened, load, training_device
 
 NOBODY_DROVE = "Judged on recordings alone: nobody drove."
@@ -60,12 +52,6 @@ class DistillRecipe(LessonRecipe):
     to_teacher: float
     to_recorded: float
     unit_frames: int
-
-
-def phases_of(shape: StudentShape) -> list[str]:
-    """The phases in which a student of that shape learns: at its teacher's picture size its backbone sees already."""
-    resized = (shape.height, shape.width) != (None, None)
-    return [*(["backbone"] if resized else []), "transformer", "together"]
 
 
 def distill(
@@ -93,14 +79,9 @@ def distill(
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     if share is None and config == replace(teacher.config, vae_layers=0):
         raise TrainingError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
-    work: dict[str, Any] = {
-        "origin": teacher,
-        "config": config,
-        "recipe": recipe,
-        "device": where,
-        "progress": progress,
-    }
-    return Distillation(opened=opened, share=share, **work).make(folder)
+    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress, "opened": opened, "share": share}
+    action_range = opened.recordings.action_range()
+    return Distillation(origin=teacher, config=config, action_range=action_range, **given).make(folder)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,9 +92,6 @@ class Distillation(Work):
 
     opened: Opened
     share: float | None
-
-    def action_range(self) -> dict[str, Range]:
-        return self.opened.recordings.action_range()
 
     def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """plans: (B, C, A), the student's. Mean absolute errors to the teacher's and to what was recorded, weighted."""
@@ -171,13 +149,13 @@ class Distillation(Work):
         seeing = replace(self.origin, weights=self.origin.weights | backbone)
         weights = initial_weights(seeing, self.config, inputs)
         if self.share is not None:
-            pictures = self.progress(lessons.each_once(), desc="channels", total=lessons.blocks)
+            pictures = self.progress(lessons.each_once(), desc="channels", total=len(lessons.blocks))
             shown = (torch.from_numpy(block) for block in pictures)
             weights = without_channels(weights, self.config, self.share, shown, self.rng("channels"))
         return weights
 
     def leave(self, new: Path, name: str, learned: Learned) -> None:
-        """Judge the student, and write its files, its artifact and distill.json."""
+        """Judge the student, and write its files and distill.json."""
         teacher, parts, recordings = self.origin, self.opened.parts, self.opened.recordings
         held_out, choosing = (pick_evenly(each, self.recipe.judged_frames) for each in (parts.held_out, parts.choosing))
         of_teacher = "teacher", teacher.config, teacher.weights, None
@@ -188,37 +166,15 @@ class Distillation(Work):
             row |= {"decoder_layers": config.decoder_layers, "feedforward": config.feedforward}
             row |= {"backbone_channels": share, "gmac": gmac(config, weights)}
             every.append(plans_of(policy, held_out, self.progress))
-            students.append(row | errors_of(every[-1], every[0], held_out, self.action_range()))
+            students.append(row | errors_of(every[-1], every[0], held_out, self.action_range))
         chosen, driven = plans_of(policy, choosing, self.progress), ~np.stack([s.is_pad for s in choosing])
         loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
         hashes = self.write_policy(new, name, learned.weights, loss, recordings.root.name)
-        self._quantize(new)
-        metrics: dict[str, Any] = {
-            "students": students,
-            "losses": learned.losses,
-            "files_sha256": hashes,
-            "note": NOBODY_DROVE,
-        }
+        metrics: dict[str, Any] = {"students": students, "losses": learned.losses, "files_sha256": hashes}
         metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
-        metrics["warnings"] = not_judged(self.action_range())
-        write_stage(
-            new / "distill.json",
-            "distill",
-            params=self.described,
-            metrics=metrics,
-            inputs={teacher.path.name: teacher.sha256} | recordings.hashes(),
-        )
-
-    def _quantize(self, new: Path) -> None:
-        """Make policy_static.pt, with the observer that a run of the student would choose."""
-        student, how = load_checkpoint(find_written(new)), pipeline.Recipe.of(params())
-        samples, _ = how.choose(self.opened.parts.calibration)
-        calibration = calibrate(student, samples, smooth=how.scheme.smooth, progress=self.progress)
-        chooser = pipeline.prepare_chooser(student, self.opened, calibration)
-        scheme, _ = chooser.observer(how.scheme, how.observers, self.progress)
-        checked = pick_evenly(self.opened.parts.choosing, pipeline.CHOOSING_FRAMES)
-        policy = quantize(student, scheme, calibration)
-        export(policy, student, new / "policy_static.pt", checked, calibration)
+        metrics |= {"note": NOBODY_DROVE, "warnings": not_judged(self.action_range)}
+        inputs = {teacher.path.name: teacher.sha256} | recordings.hashes()
+        write_stage(new / "distill.json", "distill", params=self.described, metrics=metrics, inputs=inputs)
 
 
 def errors_of(
@@ -236,16 +192,14 @@ def errors_of(
 
 
 def summary(content: Mapping[str, Any]) -> str:
-    """distill.json as people read it."""
+    """Return distill.json as people read it."""
     metrics = content["metrics"]
     actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in metrics["students"][0] if "teacher_" in key]
-    lines = [["", "picture", "decoder", "GMAC", "to the teacher", "to the recordings"]]
+    lines = [f"errors on held-out episodes, % of the recorded range ({' / '.join(actions)})"]
     for row in metrics["students"]:
         share = f", {row['backbone_channels']:.0%} of channels" if row["backbone_channels"] else ""
-        shape = f"{row['width']}x{row['height']}", f"{row['decoder_layers']} x {row['feedforward']}{share}"
-        errors = []
-        for to in ("teacher", "recorded"):
-            errors.append(" / ".join(format_pct(row[f"{to}_{action}_pct"]).strip() for action in actions))
-        lines.append([row["name"], *shape, f"{row['gmac']:.2f}", *errors])
-    title = f"errors on held-out episodes, % of the recorded range ({' / '.join(actions)})"
-    return "\n".join([title, *align(lines), metrics["note"]])
+        shape = f"{row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}{share}"
+        to = [[format_pct(row[f"{to}_{a}_pct"]).strip() for a in actions] for to in ("teacher", "recorded")]
+        errors = f"{' / '.join(to[0])} to the teacher, {' / '.join(to[1])} to the recordings"
+        lines.append(f"{row['name']}: {shape}, {row['gmac']:.2f} GMAC: {errors}")
+    return "\n".join([*lines, metrics["note"]])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from rover_learn.acceptance import NEW, OLD, Judged, verdict
+from rover_learn.acceptance import NEW, OLD, verdict
 from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Pool, plans_of
 from rover_learn.phases import Learned, LessonRecipe, Work, cache_for, free_folder
 from rover_learn.student import refuse_no_car
@@ -77,7 +77,9 @@ def finetune(
     recipe = recipe or FinetuneRecipe.of()
     parent, read = _open(checkpoint, [Source.of(each) for each in episodes], progress)
     material = _part_episodes(read, recipe)
-    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress}
+    ranges = [r.action_range() for r in read]
+    both = {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
+    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress, "action_range": both}
     return Finetuning(origin=parent, config=parent.config, material=material, **given).make(folder)
 
 
@@ -119,9 +121,6 @@ def _open(
     checkpoint: Path | str, sources: Sequence[Source], progress: Progress
 ) -> tuple[Checkpoint, tuple[Recordings, ...]]:
     """Read the checkpoint and the recordings, and check that they belong together."""
-    if str(checkpoint).endswith((".pt", ".onnx.zip")):
-        remedy = "give the checkpoint that it was made of: best_model.pth, or LeRobot's pretrained_model folder"
-        raise TrainingError(f"{checkpoint}: is an artifact, whose weights cannot be trained", remedy=remedy)
     parent = load_checkpoint(checkpoint)
     refuse_no_car(parent)
     places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
@@ -204,11 +203,6 @@ class Finetuning(Work):
 
     material: _Material
 
-    def action_range(self) -> dict[str, tuple[float, float]]:
-        """Return the smallest and largest value of each action in all recordings."""
-        ranges = [r.action_range() for r in self.material.recordings]
-        return {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
-
     def learn(self) -> Learned:
         """Train both phases. What the policy sees in each of the recordings stays cached for its next training."""
         recipe, parent = self.recipe, self.origin
@@ -237,34 +231,34 @@ class Finetuning(Work):
         counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
         return (to_parent + to_recorded) / (counted * len(units))
 
-    def judge(self, weights: dict[str, Tensor]) -> list[Judged]:
-        """Judge each held-out episode with the policy as it was before and after."""
-        action_range, held_out = self.action_range(), self.material.held_out
-        policies = [BatchedPolicy(self.config, each).to(self.device) for each in (self.origin.weights, weights)]
-        judged = []
+    def judge(self, weights: dict[str, Tensor]) -> list[dict[str, Any]]:
+        """Judge each held-out episode with the policy as it was before and after: finetune.json's rows."""
+        held_out, rows = self.material.held_out, []
+        policies = {"before": self.origin.weights, "after": weights}
+        asked = {when: BatchedPolicy(self.config, each).to(self.device) for when, each in policies.items()}
         for name, kind, every in self.progress(held_out, desc="judging", total=len(held_out)):
             samples = pick_evenly(every, self.recipe.judged_frames)
             driven, actions = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
-            errors = []
-            for policy in policies:
+            row: dict[str, Any] = {"episode": name, "kind": kind, "frames": len(samples)}
+            for when, policy in asked.items():
                 off = np.abs(plans_of(policy, samples).astype(np.float64) - actions)[driven].mean(0)
-                named = zip(action_range.items(), off, strict=True)
-                errors.append({action: pct_of_range(error, ends) for (action, ends), error in named})
-            judged.append(Judged(name, kind, len(samples), *errors))
-        return judged
+                for error, (action, ends) in zip(off, self.action_range.items(), strict=True):
+                    row[f"{when}_{action}_pct"] = pct_of_range(error, ends)
+            rows.append(row)
+        return rows
 
     def leave(self, new: Path, name: str, learned: Learned) -> None:
         """Judge the policy, and write its files and finetune.json."""
-        material, judged = self.material, self.judge(learned.weights)
-        errors = [e for each in judged if each.kind == OLD for e in each.after.values() if e is not None]
+        material, rows = self.material, self.judge(learned.weights)
+        old = [(key, row[key]) for row in rows if row["kind"] == OLD for key in row]
+        errors = [error for key, error in old if key.startswith("after_") and error is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
         hashes = self.write_policy(new, name, learned.weights, loss, material.recordings[-1].root.name)
         counts = dict.fromkeys(KINDS, 0) | {"not_imitated": material.left_out}
         for kind, samples in material.taught:
             counts[kind] += len(samples)
         metrics = {"learned_from": counts, "losses": learned.losses, "files_sha256": hashes}
-        metrics |= {"held_out": [each.row() for each in judged], "verdict": verdict(judged)}
-        metrics["warnings"] = not_judged(self.action_range())
+        metrics |= {"held_out": rows, "verdict": verdict(rows), "warnings": not_judged(self.action_range)}
         inputs = {self.origin.path.name: self.origin.sha256}
         for r in material.recordings:
             inputs |= {f"{r.root.name}/{file}": digest for file, digest in r.hashes().items()}

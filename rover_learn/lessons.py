@@ -10,7 +10,7 @@ states in motion are replaced by another sample's.
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -33,7 +33,6 @@ BLOCK = 8  # a policy plans on this many samples at once
 VIEWS = PLAIN, MIRRORED = 0, 1
 MIRROR = np.array([-1, 1], np.float32)  # a mirrored view multiplies steering and throttle by this
 LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # a picture is multiplied by the first as a whole, by the second per colour
-SMALLEST_RANGE = 0.02  # at least, for an action that hardly changes: errors are divided by the range
 FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
 
 
@@ -72,14 +71,10 @@ class BatchedPolicy(nn.Module):
                     delattr(norm, name)
                     norm.register_parameter(name, nn.Parameter(value))
 
-    def named_weights(self) -> dict[str, Tensor]:
-        """Return the weights being trained, by LeRobot's names without the leading `model.`."""
-        of_model, of_backbone = (m.state_dict(keep_vars=True) for m in (self.model, self.backbone))
-        return {**of_model, **{f"backbone.{name}": value for name, value in of_backbone.items()}}
-
     def weights(self) -> dict[str, Tensor]:
-        """Return a copy of `named_weights` on the CPU, each with its own memory."""
-        return {name: value.detach().cpu().clone() for name, value in self.named_weights().items()}
+        """Return a copy of the weights, on the CPU, by LeRobot's names without the leading `model.`."""
+        backbone = {f"backbone.{name}": value for name, value in self.backbone.state_dict().items()}
+        return {name: value.cpu().clone() for name, value in {**self.model.state_dict(), **backbone}.items()}
 
     def features(self, frames: Tensor) -> Tensor:
         """Return the feature maps, (B, D, h, w), of frames, (B, height, width, 3) uint8 RGB."""
@@ -109,18 +104,6 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
         plans.append(policy(frames.to(device), states.to(device)).cpu().numpy())
     limits = action_limits(policy.config.action_names, car_of(samples))
     return np.concatenate(plans).clip(*limits)
-
-
-def judged_ranges(action_range: Mapping[str, tuple[float, float]]) -> np.ndarray:
-    """Return each action's recorded range, (A,) float32, at least SMALLEST_RANGE. Errors are divided by it."""
-    ends = np.array(list(action_range.values()), np.float32)
-    return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
-
-
-def in_another_light(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the frames, (B, height, width, 3) uint8, each made lighter or darker, and tinted."""
-    gain = rng.uniform(*LIGHT, (len(frames), 1, 1, 1)) * rng.uniform(*COLOUR, (len(frames), 1, 1, 3))
-    return np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +150,9 @@ class Lessons:
         return replace(self, tokens=RowFile(folder / "tokens", self.tokens.shape, np.float16))
 
     @property
-    def blocks(self) -> int:
-        """The number of blocks of BLOCK samples."""
-        return -(-len(self) // BLOCK)
-
-    def _rows(self, block: int) -> np.ndarray:
-        return np.arange(block * BLOCK, min((block + 1) * BLOCK, len(self)))
+    def blocks(self) -> list[np.ndarray]:
+        """The numbers of all samples, in blocks of BLOCK, on which a policy plans at once."""
+        return [np.arange(first, min(first + BLOCK, len(self))) for first in range(0, len(self), BLOCK)]
 
     def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
@@ -181,18 +161,17 @@ class Lessons:
 
     def each_once(self) -> Iterator[np.ndarray]:
         """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
-        for block in range(self.blocks):
-            rows = self._rows(block)
+        for rows in self.blocks:
             yield self.pictures(rows, rows % len(VIEWS))
 
     @torch.inference_mode()
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
         """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
-        policy: BatchedPolicy | None = None
-        blocks = saved.steps("teacher", self.blocks, rng, frames=self.frames, maps=self.maps, plans=self.plans)
-        for block in blocks:
+        policy, blocks, grid = None, self.blocks, (self.maps.shape[1], self.maps.shape[2])
+        parts = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
+        for block in saved.steps("teacher", len(blocks), rng, **parts):
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
-            rows, grid = self._rows(block), (self.maps.shape[1], self.maps.shape[2])
+            rows = blocks[block]
             pictures = [self.data.samples[i].frame_bgr() for i in rows]
             self.frames.append(np.stack([prepare_frame(p, *self.data.size) for p in pictures]))
             (size,) = teacher.config.image_sizes
@@ -204,8 +183,9 @@ class Lessons:
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
         """Compute the student's own feature maps of every sample in both views, as far as they are missing."""
-        for block in saved.steps("tokens", self.blocks, rng, tokens=self.tokens):
-            frames = _in_both_views(self.frames[self._rows(block)], student.image_scale.device)
+        blocks = self.blocks
+        for block in saved.steps("tokens", len(blocks), rng, tokens=self.tokens):
+            frames = _in_both_views(self.frames[blocks[block]], student.image_scale.device)
             self.tokens.append(student.features(frames).half().cpu())
 
 
@@ -249,9 +229,11 @@ class Batch:
         return self._join(p.by_view(getattr(p.lessons, what)) for p in self.parts).float()
 
     def pictures(self) -> Tensor:
-        """The pictures in another light, (B, height, width, 3) uint8 RGB."""
+        """The pictures, each made lighter or darker, and tinted: (B, height, width, 3) uint8 RGB."""
         frames = np.concatenate([p.lessons.pictures(p.rows, p.views) for p in self.parts])
-        return torch.from_numpy(in_another_light(frames, self.rng)).to(self.device)
+        gain = self.rng.uniform(*LIGHT, (len(frames), 1, 1, 1)) * self.rng.uniform(*COLOUR, (len(frames), 1, 1, 3))
+        frames = np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
+        return torch.from_numpy(frames).to(self.device)
 
     def states(self) -> Tensor:
         """The states, (B, 2), with which the teacher planned; of new recordings, with a random share of the steering.

@@ -4,7 +4,7 @@ import functools
 import shutil
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_learn.lessons import Batch, BatchedPolicy, Pool, judged_ranges
+from rover_learn.lessons import Batch, BatchedPolicy, Pool
 from rover_learn.student import gmac
 from rover_learn.training import Phase, Resumable, threads
 from rover_lib.onboard.checked import Rule, broken_rule, number, whole
@@ -27,6 +27,7 @@ from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import write_both
+from rover_lib.workshop.judge.recorded_range import Range
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run.run_folder import run_folder
@@ -35,6 +36,7 @@ from rover_lib.workshop.run.session import SMALL_GMAC
 MOST = {"to_parent": 1.0, "held_out_share": 0.999}
 MAY_BE_ZERO = ("seed", "transformer_warmup")
 LEAST_RATE, LARGE = 1e-9, 10**9
+SMALLEST_RANGE = 0.02  # for an action that hardly changes, as errors are divided by the range
 VERSIONS = ("torch", "lerobot", "torchvision", "numpy")
 
 
@@ -70,17 +72,16 @@ class Recipe:
             raise TrainingError(f"params.yml: {where}: {name} must be {words}", found=found)
         return cls(**values)
 
-    def of_steps(self, steps: int, phases: Collection[str] | None = None) -> Self:
-        """Return the same recipe with that many steps in all, at least one in each of these phases, none in others.
+    def of_steps(self, steps: int) -> Self:
+        """Return the same recipe with that many steps in all, at least one in each phase that has any.
 
-        phases: None means all that have steps. Raises TrainingError for less than one step.
+        Raises TrainingError for less than one step.
         """
         if steps < 1:
             raise TrainingError("training needs at least 1 step", found=steps)
-        planned = {f"{name}_steps": getattr(self, f"{name}_steps") for name in phases or self.PHASES}
-        counts = {f"{name}_steps": 0 for name in self.PHASES}
-        for name, count in planned.items():
-            counts[name] = max(1, round(steps * count / sum(planned.values()))) if count else 0
+        planned = {f"{name}_steps": getattr(self, f"{name}_steps") for name in self.PHASES}
+        total = sum(planned.values())
+        counts = {name: max(1, round(steps * count / total)) if count else 0 for name, count in planned.items()}
         return replace(self, **counts)
 
 
@@ -99,11 +100,11 @@ class LessonRecipe(Recipe):
     seed: int
 
     @classmethod
-    def of(cls, *, steps: int | None = None, phases: Collection[str] | None = None, **given: Any) -> Self:
+    def of(cls, *, steps: int | None = None, **given: Any) -> Self:
         """Take the recipe of params.yml, with each given value that is not None instead. Raises TrainingError."""
         values = params()[cls.SECTION] | {name: value for name, value in given.items() if value is not None}
         recipe = cls.read(cls.SECTION, values)
-        return recipe if steps is None else recipe.of_steps(steps, phases)
+        return recipe if steps is None else recipe.of_steps(steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +127,8 @@ class Work(ABC):
     config: ActConfig  # of the policy that is made
     recipe: Any  # of the training's own kind of LessonRecipe
     device: torch.device
+    action_range: dict[str, Range]  # the recorded one
     progress: Progress
-
-    @abstractmethod
-    def action_range(self) -> dict[str, tuple[float, float]]:
-        """Return the smallest and largest recorded value of each action."""
 
     @abstractmethod
     def learn(self) -> Learned:
@@ -151,8 +149,9 @@ class Work(ABC):
 
     @functools.cached_property
     def ranges(self) -> np.ndarray:
-        """(A,) float32: each action's recorded range, in which errors are counted."""
-        return judged_ranges(self.action_range())
+        """(A,) float32: each action's recorded range, at least SMALLEST_RANGE, in which errors are counted."""
+        ends = np.array(list(self.action_range.values()), np.float32)
+        return np.maximum(ends[:, 1] - ends[:, 0], SMALLEST_RANGE)
 
     @functools.cached_property
     def units(self) -> Tensor:

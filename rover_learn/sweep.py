@@ -63,35 +63,23 @@ def read_sheet(path: Path | str) -> list[Job]:
     content = read_params(path)
     checkpoints, episodes = _as_list(content.get("checkpoints")), content.get("episodes")
     students = _as_list(content.get("students")) or [{}]
-    varied = {key: content.get(key) or {} for key in ("notebooks", "params")}
-    paths, mappings = (*checkpoints, episodes), (*students, *varied.values())
-    if not checkpoints or not all(isinstance(p, str) for p in paths) or not all(isinstance(m, dict) for m in mappings):
+    varied = [content.get(key) or {} for key in ("notebooks", "params")]
+    texts, mappings = (*checkpoints, episodes), (*students, *varied)
+    if not checkpoints or not all(isinstance(p, str) for p in texts) or not all(isinstance(m, dict) for m in mappings):
         raise ParamsError(f"{path}: not a sheet of a sweep", remedy="docs/sweep.md has one to begin with")
     # A misspelt name would not act: runs that differ only in its value would be the same run.
-    if unknown := [*sorted(set(content) - set(KEYS)), *sorted(set(varied["params"]) - set(_places(params())))]:
+    places = {f"{section}.{name}" for section, values in params().items() for name in values}
+    if unknown := [*sorted(set(content) - set(KEYS)), *sorted(set(varied[1]) - places)]:
         raise ParamsError(f"{path}: unknown name", found=unknown[0], remedy="params.yml has the places of its values")
-    jobs = []
-    for checkpoint, student in itertools.product(checkpoints, students):
-        for of_notebooks, of_params in itertools.product(*(_combinations(values) for values in varied.values())):
-            inputs = str(Path(checkpoint).resolve()), str(Path(str(episodes)).resolve())
-            jobs.append(Job(*inputs, student, of_notebooks, of_params))
-    names = [job.name for job in jobs]
-    if twice := sorted(name for name in names if names.count(name) > 1):
-        raise ParamsError(f"{path}: the same run twice", found=twice[0])
-    return jobs
+    jobs = {}
+    for checkpoint, *how in itertools.product(checkpoints, students, *map(_combinations, varied)):
+        job = Job(str(Path(checkpoint).resolve()), str(Path(str(episodes)).resolve()), *how)
+        jobs[job.name] = job  # the same run given twice is made once
+    return list(jobs.values())
 
 
 def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
-
-
-def _places(values: Any, before: str = "") -> Iterator[str]:
-    """Yield the places of all values, such as calibration.seed."""
-    if not isinstance(values, dict):
-        yield before
-        return
-    for key, value in values.items():
-        yield from _places(value, f"{before}.{key}".lstrip("."))
 
 
 def _combinations(values: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -126,11 +114,8 @@ def _settings_of(job: Job) -> Iterator[None]:
 
     values: dict[str, Any] = {}
     for place, value in job.params.items():
-        *sections, last = place.split(".")
-        section = values
-        for name in sections:
-            section = section.setdefault(name, {})
-        section[last] = value
+        section, name = place.split(".")
+        values.setdefault(section, {})[name] = value
     with tempfile.NamedTemporaryFile("w", suffix=".yml") as file:
         yaml.safe_dump(values, file)
         file.flush()

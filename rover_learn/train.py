@@ -229,8 +229,9 @@ def _train(
     data, judges = Frames.of(samples, first.image_sizes[0]), Frames.of(judging, size.image_sizes[0])
     if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
         data.read_all(saved.progress)
-    spread = loop.recorded_spread(data)
-    with loop.seed_inside(seed):
+    spread = np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)  # of each action, (2,): errors count in it
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
+        torch.manual_seed(seed)
         policy = lerobot_act(size)
         # Start with plans near the mean action: those of an untrained head are wild.
         with torch.no_grad():

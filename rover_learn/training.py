@@ -247,14 +247,6 @@ class Resumable:
 
 
 @contextmanager
-def seed_inside(seed: int) -> Iterator[None]:
-    """Seed torch's random numbers inside the block, and restore their state afterwards."""
-    with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
-        torch.manual_seed(seed)
-        yield
-
-
-@contextmanager
 def threads(count: int) -> Iterator[None]:
     """Let torch compute with this number of threads inside the block."""
     before = torch.get_num_threads()
@@ -290,11 +282,6 @@ def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.
         swap = (rng.random(len(rows)) < SWAPPED_STATES) & (states[:, 1] >= STANDING_THROTTLE)
         states[swap] = data.states[rng.choice(moving, swap.sum())]
     return states
-
-
-def recorded_spread(data: Frames) -> np.ndarray:
-    """Return each action's standard deviation, (2,) float32, at least 0.001: the unit in which errors count."""
-    return np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)
 
 
 def error_of(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:

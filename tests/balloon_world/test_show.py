@@ -1,8 +1,5 @@
 """The balloon world in a view: a slow machine slows its time and changes nothing else; a page's requests."""
 
-import os
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -56,7 +53,6 @@ def test_a_slow_machine_slows_time_and_changes_nothing_else(simulation, monkeypa
     slow_one._policies["INT8"].seconds = 0.15  # for a plan, which the simulation needs ten times a second
     slow = drive(slow_one)
     assert fast[-1]["world"]["path"] == slow[-1]["world"]["path"] and len(fast[-1]["world"]["path"]) > 10
-    assert "time in the simulation runs at" in slow[-1]["text"] and slow[-1]["world"]["pace"] < 0.9
     assert simulation._results == slow_one._results and sum(r[1] for r in simulation._results.values()) == 1
 
 
@@ -88,17 +84,3 @@ def test_whoever_watches_pushes_the_car(simulation):
     pushed = seen[-1]["world"]
     assert pushed["path"] != alone["path"] and pushed["results"] == alone["results"]
     assert pushed["pushed"][1] == 3 and pushed["pushed"][0] in (0, 3)
-
-
-@pytest.mark.slow
-def test_no_thread_waits_for_another_by_spinning(demo_run):
-    """Neither XNNPACK's nor OpenCV's: beside busy processes they take the time that a plan needs."""
-    program = f"""
-import os
-from balloon_world.show import Simulation
-Simulation({str(demo_run / "policy_static.pt")!r}).run(lambda head, picture: None, 1)
-print(os.listdir("/proc/self/task") == [str(os.getpid())])
-"""
-    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}  # numpy's, which sleep when nobody multiplies
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=alone)
-    assert done.stdout == "True\n", done.stderr

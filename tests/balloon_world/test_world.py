@@ -1,5 +1,3 @@
-import hashlib
-
 import numpy as np
 import pytest
 
@@ -16,17 +14,13 @@ def drive(world):
     return np.array(actions)
 
 
-def frame_hash(world):
-    return hashlib.sha256(world.render().tobytes()).hexdigest()
-
-
 def test_the_same_seed_gives_the_same_drive_and_frames():
     worlds = [World(7, 2), World(7, 2)]
-    assert frame_hash(worlds[0]) == frame_hash(worlds[1]) != frame_hash(World(8, 2))
     for world in worlds:
         drive(world)
     assert worlds[0].trajectory == worlds[1].trajectory != World(7).trajectory
-    assert frame_hash(worlds[0]) == frame_hash(worlds[1])
+    first, again, other = (world.render() for world in (*worlds, World(8, 2)))
+    assert (first == again).all() and (first != other).any()
 
 
 def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
@@ -39,7 +33,6 @@ def test_decoys_are_red_things_beside_the_way_and_change_nothing_else():
         for decoy in (first, second):
             assert decoy.kind in ("box", "cone") and decoy.colour[2] > 1.5 * max(decoy.colour[:2])
             assert abs(np.arctan2(decoy.y_m, decoy.x_m) - bearing) >= DECOY_ASIDE_RAD - 1e-9
-    assert World(5, decoys=1).distractors == World(5, decoys=1).distractors
 
 
 def test_the_balloon_is_red_where_it_should_be():

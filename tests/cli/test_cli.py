@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard.cli import show
-from rover_lib.onboard.stage import atomic_path, read_stage, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage
 
 
 def rover(*args):
@@ -44,20 +44,6 @@ def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     assert content["metrics"]["headline"] in rover("report", folder).output
     for listed in (rover("inspect", folder.parent, "--json"), rover("inspect", "--json")):
         assert json.loads(listed.output)["runs"] == {"mine": content["metrics"]["headline"]}
-
-
-def test_a_drive_that_does_not_end_costs_nothing_of_the_last_one(tmp_path, monkeypatch):
-    file = tmp_path / "drive.json"
-    write_stage(file, "drive", params={}, metrics={"of": "before"})
-
-    def execute(*args, **given):
-        assert not file.exists()  # so that it is measured again
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("rover_lib.workshop.run.run.execute", execute)
-    assert rover("world", "latency", tmp_path).exit_code == 1
-    assert read_stage(file, "drive")["metrics"] == {"of": "before"}
-    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatch):
@@ -106,10 +92,7 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_inspects_recordings_and_drives_a_trial(tmp_path, artifacts):
+def test_inspects_recordings(tmp_path):
     result = rover("world", "record", tmp_path / "episodes", "--count", 2, "--seed", 5)
     assert result.exit_code == 0, result.output
     assert json.loads(rover("inspect", tmp_path / "episodes", "--json").output)["recordings"]["episodes"] == 2
-    result = rover("world", "trial", artifacts["static"], "--worlds", 1, "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.output)["trials"] == 1

@@ -176,7 +176,7 @@ def test_a_picture_by_which_nobody_may_drive_arms_nothing(bench, when):
             rover._captured_s -= 5
             assert rover.send_action(GO) == named(0.0, 0.0)
         elif when == "none":
-            on.feed.pause()
+            on.feed.show()
             with pytest.raises(CameraError):
                 for _ in range(3):
                     rover.get_observation()

@@ -47,17 +47,18 @@ def test_units_that_do_nothing_are_the_ones_to_go(tiny, inputs):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"height": 144}, {"decoder_layers": 3}, {"feedforward": 0}, {"backbone_channels": 0}]
+    ("wrong", "error"),
+    [
+        ({"height": 144}, TrainingError),
+        ({"decoder_layers": 3}, TrainingError),
+        ({"feedforward": 0}, TrainingError),
+        ({"backbone_channels": 0}, TrainingError),
+        ({"height": 72, "width": 72}, CheckpointError),  # another aspect ratio
+    ],
 )
-def test_a_student_is_no_larger_than_its_teacher(tiny, wrong):
-    with pytest.raises(TrainingError):
+def test_a_student_is_no_larger_than_its_teacher_and_sees_as_it_does(tiny, wrong, error):
+    with pytest.raises(error):
         student_config(tiny, StudentShape(**wrong))
-
-
-@pytest.mark.parametrize(("height", "width"), [(72, 72), (18, 32)])  # another aspect ratio; less than 32 pixels
-def test_a_picture_that_the_policy_cannot_see_is_refused(tiny, height, width):
-    with pytest.raises(CheckpointError):
-        student_config(tiny, StudentShape(height, width))
 
 
 def test_an_arm_teaches_no_car_and_channels_of_a_bottleneck_stay(tiny):

@@ -40,6 +40,7 @@ def test_every_combination_is_a_run_and_keeps_its_name_while_the_sheet_grows(she
     jobs = read_sheet(sheet(params={"calibration.seed": [0, 1, 2], "quantization.scheme": ["symmetric", "affine"]}))
     assert len(jobs) == len({job.name for job in jobs}) == 2 * 3 * 2
     assert jobs[0].name.startswith("best_model-samples100-seed0-schemesymmetric-")
+    assert len(read_sheet(sheet(notebooks={"samples": [100, 100]}))) == 3
     few = {job.name for job in read_sheet(sheet())}
     assert few < {job.name for job in read_sheet(sheet(notebooks={"samples": [100, 200, 300]}))}
     (tmp_path / "best_model.pth").write_text("another policy")
@@ -53,7 +54,6 @@ def test_every_combination_is_a_run_and_keeps_its_name_while_the_sheet_grows(she
         {"episodes": ["a", "b"]},
         {"checkpoint": "a.pth"},
         {"notebooks": [1]},
-        {"notebooks": {"samples": [100, 100]}},
         {"params": {"calibration.sed": [0, 1, 2]}},
     ],
 )

@@ -19,13 +19,6 @@ pytestmark = pytest.mark.slow
 CHECKPOINT_KEYS = [
     "epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config",
 ]  # fmt: skip
-CONFIG_KEYS = {
-    "image_width", "image_height", "n_obs_steps", "chunk_size", "n_action_steps", "hidden_size", "n_encoder_layers",
-    "n_decoder_layers", "n_heads", "feedforward_dim", "dropout", "kl_weight", "vision_encoder", "pretrained_backbone",
-    "learning_rate", "weight_decay", "betas", "grad_clip", "num_epochs", "batch_size", "train_split", "data_dir",
-    "output_dir", "device", "seed", "log_freq", "save_freq", "num_workers",
-}  # fmt: skip
-
 
 # The full size's phases on a handful of small frames: trained at a quarter of the pixels, and carried to its own.
 CARRIED = "train: {small: {backbone_steps: 2, transformer_steps: 3, together_steps: 2, carry_steps: 2, batch: 4, "
@@ -49,7 +42,7 @@ def trained(drives, tmp_path_factory, set_params):
 
 def test_the_checkpoint_is_the_trainers(trained):
     checkpoint = torch.load(trained, weights_only=False)
-    assert list(checkpoint) == CHECKPOINT_KEYS and set(checkpoint["config"]) == CONFIG_KEYS
+    assert list(checkpoint) == CHECKPOINT_KEYS
     assert type(checkpoint["best_val_loss"]) is np.float64 and 0 < checkpoint["best_val_loss"] < 10
     config = checkpoint["config"]
     assert (config["image_height"], config["image_width"], config["chunk_size"]) == (72, 128, 32)

@@ -9,9 +9,8 @@ import torch
 from torch import nn
 
 from rover_learn import training
-from rover_learn.training import Best, Frames, Phase, Resumable, RowFile, seed_inside
-from rover_lib.onboard.errors import EpisodeError, TrainingError
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_learn.training import Best, Phase, Resumable, RowFile
+from rover_lib.onboard.errors import TrainingError
 
 STEPS = 6
 
@@ -27,7 +26,8 @@ def train(folder: Path, kill_at: int = -1, **options) -> tuple[list[float], torc
     """
     rng = np.random.default_rng(0)
     made = 0
-    with seed_inside(0), Resumable(folder, **{"every_s": 0.0, **options}) as saved:
+    torch.manual_seed(0)
+    with Resumable(folder, **{"every_s": 0.0, **options}) as saved:
         model = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.5), nn.Linear(8, 1))
         rows = RowFile(folder / "rows", (3,))
         for _ in saved.steps("features", STEPS, rng, rows=rows):
@@ -89,14 +89,6 @@ def test_a_damaged_file_is_named(tmp_path, name, left, says):
         train(tmp_path)
 
 
-def test_a_file_of_rows_gives_what_was_appended(tmp_path):
-    given = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float16)
-    rows, chosen = RowFile(tmp_path / "rows", (2, 3), np.float16), np.array([4, 0, 4])
-    rows.append(given[:3])
-    rows.append(torch.from_numpy(given[3:]))
-    assert len(rows) == 5 and rows[chosen].dtype == np.float16 and (rows[chosen] == given[chosen]).all()
-
-
 def learn(folder, steps, loss, best=None):
     """A phase of a network of one weight, which it returns."""
     model, rng = nn.Linear(1, 1), np.random.default_rng(0)
@@ -121,28 +113,3 @@ def test_the_best_weights_are_kept_and_what_learns_by_heart_stops(tmp_path, monk
 
     kept = learn(tmp_path, 20, lambda y: y.square().sum(), best)
     assert len(weights) == 2 + training.PATIENCE and kept == weights[1] != weights[-1]
-
-
-def samples_of(folder: Path, count: int) -> tuple[Sample, ...]:
-    import simplejpeg
-
-    rng = np.random.default_rng(0)
-    samples = []
-    for i in range(count):
-        path = folder / f"{i}.jpg"
-        path.write_bytes(simplejpeg.encode_jpeg(rng.integers(0, 255, (36, 64, 3), np.uint8), colorspace="BGR"))
-        state, chunk = rng.random(2).astype(np.float32), rng.random((4, 2)).astype(np.float32)
-        samples.append(Sample("an episode", path, 0.0, state, chunk, np.zeros(4, bool), len(samples)))
-    return tuple(samples)
-
-
-def test_frames_read_when_asked_for_are_those_in_memory_and_one_that_is_gone_is_named(tmp_path):
-    frames, rows = Frames.of(samples_of(tmp_path, 5), (18, 32)), np.array([3, 0])
-    read = frames.pictures(rows)
-    assert read.shape == (2, 18, 32, 3)
-    (tmp_path / "1.jpg").unlink()
-    with pytest.raises(EpisodeError, match=r"1\.jpg: cannot be read"):
-        frames.read_all()
-    held = Frames.of(tuple(frames.samples[i] for i in (0, 2, 3)), (18, 32))
-    held.read_all()
-    assert (held.pictures(np.array([2, 0])) == read).all()

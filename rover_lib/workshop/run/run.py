@@ -34,7 +34,7 @@ from rover_lib.workshop.run.run_folder import run_folder
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
-# Notebooks for a finished run, which `make count` and `rover world latency`, `students` and `learn` execute.
+# Notebooks for a finished run, which `make count`, `rover run --only 07`, `rover world students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
 OWN_FILES = ("calibration*.pt", "policy_*.pt", f"policy_*{ONNX_SUFFIX}")
 # Parameters of notebooks whose defaults are in params.yml, with their places there.

@@ -13,7 +13,6 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.checkpoint.contents import check_limits
-from rover_lib.workshop.hub import is_hub_id
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
@@ -46,7 +45,7 @@ def load(
     source = Source.of(episodes)
     theirs = policy.config.cameras
     if policy.format == "lerobot" and source.cameras in ((), theirs):  # a trainer's file does not name its camera
-        source = replace(source, cameras=theirs if is_hub_id(source.path) or is_dataset(source.path) else ())
+        source = replace(source, cameras=theirs if is_dataset(source.path) else ())
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration)
