@@ -174,7 +174,7 @@ def _features(shape: tuple[int, ...], by_policy: bool) -> dict[str, Any]:
     """Return the dataset's columns, as LeRobot's own commands declare them."""
     picture = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": list(ACTION_NAMES)}
-    features = {f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers}
+    features: dict[str, Any] = {f"{CAMERA}{NAME}": picture, STATE: numbers, ACTION: numbers}
     if by_policy:
         features[INTERVENTION] = {"dtype": "bool", "shape": (1,), "names": None}
     return features
