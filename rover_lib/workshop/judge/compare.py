@@ -258,8 +258,7 @@ def metrics(
         modes[mode] = found | report.summary(mode) | {"size_ratio": fp32["size_mb"] / found["size_mb"]}
         modes[mode]["pairs"] = None
         if trials and mode in trials:  # the same worlds as FP32, in the same order
-            hits = ([drive.hit for drive in trials[each].per_world] for each in ("fp32", mode))
-            modes[mode]["pairs"] = compare_pairs(*hits)
+            modes[mode]["pairs"] = compare_pairs(trials["fp32"].hit, trials[mode].hit)
     worst = []
     for w in (w for mode in report.chunks for w in report.worst(mode)):
         at = {"episode": getattr(w.sample, "episode", None), "frame": getattr(w.sample, "frame_name", None)}

@@ -159,11 +159,8 @@ def policies(tmp_path):
 
 
 def test_metrics_say_sizes_hits_and_pairs(report, policies):
-    drives = [SimpleNamespace(hit=True)] * 39
     trials = {
-        mode: SimpleNamespace(
-            hits=39 + last, trials=40, wilson=(0.8, 1.0), per_world=[*drives, SimpleNamespace(hit=last)]
-        )
+        mode: SimpleNamespace(hits=39 + last, trials=40, wilson=(0.8, 1.0), hit=(*[True] * 39, last))
         for mode, last in (("fp32", True), ("static", False))
     }
     found = compare.metrics(report, policies, trials)
