@@ -17,7 +17,7 @@ from rover_lib.workshop.progress import Progress, silent
 
 @dataclass(frozen=True)
 class TrialReport:
-    """How a policy drove. wilson: 95 % interval of the share of hits. hit: in each world, in the order of their seeds."""
+    """How a policy drove. wilson: 95 % interval of the share of hits. hit: in each world, by its seed."""
 
     hits: int
     trials: int
