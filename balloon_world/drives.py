@@ -8,6 +8,7 @@ planner's thread are replaced. Nothing waits, and no result depends on how fast 
 """
 
 import json
+import math
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,9 +20,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from balloon_world.trial import wilson_interval
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
@@ -257,3 +258,71 @@ def judge(
     asked = [(how, SEED + i) for how, count in worlds.items() for i in range(count)]
     found = drive_missing(artifact, asked, row, path, progress, f"driving {name}")
     return {how: [found[how, SEED + i]["outcome"] for i in range(count)] for how, count in worlds.items()}
+
+
+# --- trials, with plans that take no time -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TrialReport:
+    """How a policy drove. wilson: 95 % interval of the share of hits."""
+
+    hits: int
+    trials: int
+    wilson: tuple[float, float]
+
+
+def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
+    """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z)."""
+    share = hits / trials
+    centre = share + z * z / (2 * trials)
+    half = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    scale = 1 + z * z / trials
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)
+
+
+def run_trials(
+    policy: Any,
+    worlds: int = 40,
+    seed: int = 10_000,
+    replan_every: int = 8,
+    progress: Progress = silent,
+) -> TrialReport:
+    """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
+
+    policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`. replan_every: how many actions of
+    each chunk are driven before the policy sees the next frame; its state is the action commanded before, neutral at
+    the start.
+    Raises TrainingError for parameters outside their ranges, and plans of a wrong shape or that are not finite.
+    """
+    if worlds < 1 or not 1 <= replan_every <= policy.chunk:
+        what = f"trials need at least 1 world, and replan_every from 1 to {policy.chunk}"
+        raise TrainingError(what, found=f"{worlds} and {replan_every}")
+    car = getattr(policy, "car", None)
+    left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
+    hits = 0
+    for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
+        hits += _hits_in(policy, World(world_seed, left=left), replan_every)
+    return TrialReport(hits, worlds, wilson_interval(hits, worlds))
+
+
+def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
+    """Do `run_trials` for several policies at once, on a thread for each core, with the same results."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {name: pool.submit(run_trials, policy, worlds, **options) for name, policy in policies.items()}
+        return {name: trial.result() for name, trial in running.items()}
+
+
+def _hits_in(policy: Any, world: World, replan_every: int) -> bool:
+    state: np.ndarray = np.zeros(2, np.float32)
+    while not world.done:
+        chunk = np.asarray(policy.predict_chunk(world.render(), state))
+        if chunk.ndim != 2 or chunk.shape[0] < replan_every or chunk.shape[1] != 2 or not np.isfinite(chunk).all():
+            found = f"{chunk.shape} in world {world.seed}"
+            raise TrainingError("the policy must plan finite (steps, 2) actions", found=found)
+        for steering, throttle in chunk[:replan_every]:
+            world.step(float(np.clip(steering, -1, 1)), float(np.clip(throttle, 0, 1)))
+            state = np.array([steering, throttle], np.float32)
+            if world.done:
+                break
+    return world.hit

@@ -13,7 +13,7 @@ from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import find_stage, write_stage
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
@@ -34,12 +34,10 @@ def measure_latencies(
     """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
 
     It drives at each of latencies_ms with and without compensation, and at each of pushed_latencies_ms the same way,
-    with `pushes` pushes in each world. A drive.json that was made of the same policy and parameters is read, not made
-    again.
+    with `pushes` pushes in each world.
     Raises TrainingError if there is no policy, no world or no latency.
     """
-    run_dir, p = Path(run_dir), params()
-    artifact, path = run_dir / f"policy_{GATED}.pt", run_dir / "drive.json"
+    p, artifact = params(), Path(run_dir) / f"policy_{GATED}.pt"
     if not artifact.is_file():
         raise TrainingError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
     if not latencies_ms or worlds < 1:
@@ -48,8 +46,6 @@ def measure_latencies(
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
     given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit": limit}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
-    if there := find_stage(path, "drive", params=given, inputs=inputs):
-        return there
     settings, hows = Settings.of(p["drive"]), list[How]()
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
         hows.append((ms, count, replace(settings, compensate=True)))
@@ -58,7 +54,7 @@ def measure_latencies(
     drives = _drive_all(artifact, hows, worlds, progress)
     rows = [_row(how, driven) for how, driven in zip(hows, drives, strict=True)]
     metrics = {"rows": rows, "gates": gates(rows, limit)}
-    return write_stage(path, "drive", params=given, metrics=metrics, inputs=inputs)
+    return write_stage(artifact.with_name("drive.json"), "drive", params=given, metrics=metrics, inputs=inputs)
 
 
 def _drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progress) -> list[list[Driven]]:

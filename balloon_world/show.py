@@ -115,7 +115,7 @@ class Simulation:
             name = self._wanted
             if name not in self._policies:
                 self._policies[name] = load_policy(self._paths[name], threads=THREADS)
-            world = World(self._seed, left=self.car.left)  # as in `trial`: older recordings turned left
+            world = World(self._seed, left=self.car.left)  # as in run_trials: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
             outcome = car.drive(settings, car.log).outcome

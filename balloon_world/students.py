@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from balloon_world import drives, trial, world
-from balloon_world.drives import SEED, count_hits, drive_in, everywhere, judge
-from balloon_world.trial import run_trials
+from balloon_world import drives, world
+from balloon_world.drives import SEED, count_hits, drive_in, everywhere, judge, run_trials
 from balloon_world.world import World
-from rover_learn.distill import errors_of
+from rover_learn.distill import errors_of, shape_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.drive import loop, pilot, plan
@@ -36,8 +35,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Sample, Source, pick_evenly
 
-WORLDS, PUSHES = 200, 4
-HELD_OUT_FRAMES = 300
+PUSHES = 4
 TEACHER = "teacher"
 ARTIFACT = f"policy_{GATED}.pt"
 HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
@@ -79,8 +77,8 @@ def judge_students(
     students: Sequence[Path | str],
     *,
     episodes: Path | str | None = None,
-    worlds: int = WORLDS,
-    held_out_frames: int = HELD_OUT_FRAMES,
+    worlds: int = 200,
+    held_out_frames: int = 300,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Compare a teacher's run with its students' runs; write and return students.json in the teacher's folder.
@@ -160,7 +158,7 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
 
     driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
     driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms}
-    path = cache_root() / f"drives-{key_of(driven_by, world, trial, drives, loop, pilot, plan)}.jsonl"
+    path = cache_root() / f"drives-{key_of(driven_by, world, drives, loop, pilot, plan)}.jsonl"
     counts = {kind: worlds for kind in HOW if worlds and not (kind and pushed_ms is None)}
     found = judge(run.artifact, counts, one, path, progress, run.name)
     row: dict[str, Any] = {"pushed_latency_ms": pushed_ms if worlds else None}
@@ -228,12 +226,6 @@ def table(metrics: Mapping[str, Any]) -> Table:
     chosen = f"recommended by the limits of params.yml: {metrics['recommendation']['name']}"
     notes = (chosen, what, *metrics["notes"], *metrics["warnings"])
     return Table((*header, "to the teacher, %", "to the recordings, %"), rows, notes=notes)
-
-
-def shape_of(row: Mapping[str, Any]) -> str:
-    layers = f"{row['decoder_layers']} decoder layer{'s' if row['decoder_layers'] != 1 else ''}"
-    share = f", {row['backbone_channels']:.0%} of the channels" if row.get("backbone_channels") else ""
-    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}"
 
 
 def _hits(row: Mapping[str, Any], kind: str) -> str:

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from rover_learn.lessons import BatchedPolicy
-from rover_learn.refit import grams_of, refit_layer
+from rover_learn.student import grams_of, refit_layer
 from rover_lib.workshop.act import ActConfig, Weights, norm_gain
 from rover_lib.workshop.act_config import backbone_blocks
 

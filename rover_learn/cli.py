@@ -76,8 +76,7 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], steps: int | None, **
     imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
     folder, and says on which held-out episodes it came closer to the human. Run it again to resume.
     """
-    from rover_learn.acceptance import summary
-    from rover_learn.finetune import FinetuneRecipe
+    from rover_learn.finetune import FinetuneRecipe, summary
     from rover_learn.finetune import finetune as learn_on
 
     recipe = FinetuneRecipe.of(steps=steps)

@@ -32,7 +32,6 @@ from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source, pick_evenly
 from rover_lib.workshop.run.session import Opened, load, training_device
 
-NOBODY_DROVE = "Judged on recordings alone: nobody drove."
 SLOWER = 10  # the last phase's rate is this much smaller
 
 
@@ -172,7 +171,7 @@ class Distillation(Work):
         hashes = self.write_policy(new, name, learned.weights, loss, recordings.root.name)
         metrics: dict[str, Any] = {"students": students, "losses": learned.losses, "files_sha256": hashes}
         metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
-        metrics |= {"note": NOBODY_DROVE, "warnings": not_judged(self.action_range)}
+        metrics |= {"note": "Judged on recordings alone: nobody drove.", "warnings": not_judged(self.action_range)}
         inputs = {teacher.path.name: teacher.sha256} | recordings.hashes()
         write_stage(new / "distill.json", "distill", params=self.described, metrics=metrics, inputs=inputs)
 
@@ -191,15 +190,20 @@ def errors_of(
     return errors
 
 
+def shape_of(row: Mapping[str, Any]) -> str:
+    """Return a student's shape, or its teacher's, in words. row: of distill.json or students.json."""
+    layers = f"{row['decoder_layers']} decoder layer{'s' if row['decoder_layers'] != 1 else ''}"
+    share = f", {row['backbone_channels']:.0%} of the channels" if row.get("backbone_channels") else ""
+    return f"{row['width']}x{row['height']}, {layers} of {row['feedforward']}{share}"
+
+
 def summary(content: Mapping[str, Any]) -> str:
     """Return distill.json as people read it."""
     metrics = content["metrics"]
     actions = [key.removeprefix("teacher_").removesuffix("_pct") for key in metrics["students"][0] if "teacher_" in key]
     lines = [f"errors on held-out episodes, % of the recorded range ({' / '.join(actions)})"]
     for row in metrics["students"]:
-        share = f", {row['backbone_channels']:.0%} of channels" if row["backbone_channels"] else ""
-        shape = f"{row['width']}x{row['height']}, {row['decoder_layers']} x {row['feedforward']}{share}"
         to = [[format_pct(row[f"{to}_{a}_pct"]).strip() for a in actions] for to in ("teacher", "recorded")]
         errors = f"{' / '.join(to[0])} to the teacher, {' / '.join(to[1])} to the recordings"
-        lines.append(f"{row['name']}: {shape}, {row['gmac']:.2f} GMAC: {errors}")
+        lines.append(f"{row['name']}: {shape_of(row)}, {row['gmac']:.2f} GMAC: {errors}")
     return "\n".join([*lines, metrics["note"]])

@@ -28,9 +28,6 @@ def test_every_page_is_one_click_from_readme():
 SOURCES = [*ROOT.glob("rover_*/**/*.py"), *ROOT.glob("balloon_world/**/*.py"), *ROOT.glob("lerobot_robot_rover/*.py")]
 PLAYS = [*ROOT.glob("ansible/**/*.yml"), *ROOT.glob("ansible/**/*.j2")]
 PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python3? -m [\w.]+"
-PARSED_ELSEWHERE = r"lerobot-[a-z-]+|python3 compile\.py hailo8|look/bin/pip|rover/bin/pip|python3 -m venv"
-OF_SYSTEM = r"ssh|scp|sudo|cp|hf|dask|pip|\.|\$EDITOR"
-NO_COMMAND = r"\S+[:/](?: |$)|\S+\.\w+ |\w+ = |from "  # a line of YAML, a file in a tree, Python
 
 
 def texts(path: Path) -> Iterator[str]:
@@ -89,18 +86,14 @@ def refusal_of_playbook(words: list[str]) -> str:
 
 
 def test_every_block_of_code_is_parsed():
-    """A line is a command that the test below parses, or another knows; a block in a fence is Python or YAML."""
-    known = re.compile(rf"(?:\S*bin/)?(?:{PROGRAM}|{PARSED_ELSEWHERE}|{OF_SYSTEM})(?: |$)|{NO_COMMAND}")
+    """A block in a fence is Python, whose imports exist, or YAML."""
     for page in PAGES:
-        text = page.read_text().replace("\\\n", " ")
-        for language, block in re.findall(r"^```(\w+)\n(.*?)^```", text, re.M | re.S):
+        for language, block in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text(), re.M | re.S):
             if language == "yaml":
                 assert yaml.safe_load(block), page
             for node in ast.walk(ast.parse(block)) if language == "python" else ():
                 for name in node.names if isinstance(node, ast.ImportFrom) else ():
                     assert hasattr(import_module(node.module), name.name) or find_spec(f"{node.module}.{name.name}")
-        for line in re.findall(r"^    +(\S.*)$", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S), re.M):
-            assert known.match(line), (page, line)
 
 
 @pytest.mark.slow

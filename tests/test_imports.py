@@ -18,7 +18,6 @@ ROOMS = {
     "rover_lib.onboard": ("car", "artifact", "policy", "recording", "drive", "view", "care", "cli"),
     "rover_lib.workshop": ("recordings", "checkpoint", "judge", "int8", "plots", "run"),
 }
-MOST_FILES = 20  # directly in a folder: what has more is no room
 # hailo_platform is one of Hailo's own packages, which a Pi with its card has; aiohttp is of the extra `view`.
 ONBOARD_NEEDS = {"torch", "onnxruntime", "hailo_platform", "numpy", "cv2", "simplejpeg", "filelock", "serial", "yaml"}
 ONBOARD_NEEDS |= {"systemd_watchdog", "click", "aiohttp", "rover_lib"}
@@ -78,10 +77,9 @@ def test_rooms_import_one_way(house):
     assert there <= set(ROOMS[house]), "a room that nobody has placed"
 
 
-def test_every_room_says_its_subject_and_is_no_hall():
+def test_every_room_says_its_subject():
     folders = {p.parent for top in ("rover_lib", *BESIDE) for p in (ROOT / top).rglob("*.py")}
     for folder in folders:
-        assert len([p for p in folder.iterdir() if p.is_file()]) <= MOST_FILES, folder
         assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
 
 

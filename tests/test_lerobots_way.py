@@ -28,17 +28,6 @@ def rover(*words):
     return result.output
 
 
-def lerobot_train(dataset, out, *options, cache):
-    """Run LeRobot's own command offline, in a process of its own. Returns the folder of the last checkpoint."""
-    offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
-    words = ["--policy.device=cpu", "--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0"]
-    words += ["--dataset.repo_id=local/mine", f"--dataset.root={dataset}", "--dataset.video_backend=pyav"]
-    command = [BIN / "lerobot-train", *words, f"--output_dir={out}", *options]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **offline})
-    assert done.returncode == 0, done.stderr[-2000:]
-    return out / "checkpoints/last"
-
-
 @pytest.mark.slow
 @needs.real_time
 def test_from_recordings_to_a_drive(tmp_path, monkeypatch):
@@ -49,8 +38,14 @@ def test_from_recordings_to_a_drive(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     rover("world", "record", recorded, "--count", 3)
     rover("export-dataset", recorded, dataset, "--size", "64x36")
-    new = ("--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY)
-    last = lerobot_train(dataset, tmp_path / "train", *new, "--steps=2", "--save_freq=2", "--batch_size=2", cache=cache)
+    offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
+    words = ["--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY, "--policy.device=cpu"]
+    words += ["--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0", "--dataset.repo_id=local/mine"]
+    words += [f"--dataset.root={dataset}", "--dataset.video_backend=pyav", f"--output_dir={tmp_path / 'train'}"]
+    words += ["--steps=2", "--save_freq=2", "--batch_size=2"]
+    done = subprocess.run([BIN / "lerobot-train", *words], capture_output=True, text=True, env=os.environ | offline)
+    assert done.returncode == 0, done.stderr[-2000:]
+    last = tmp_path / "train" / "checkpoints" / "last"
     words = json.loads(rover("inspect", tmp_path / "train", "--json"))["checkpoint"]
     assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
     artifact = tmp_path / "policy_static.pt"

@@ -95,10 +95,6 @@ def start(work, *args):
         os._exit(code)
 
 
-def ended(child):
-    return os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT | os.WNOHANG)
-
-
 # ---- recording
 
 
@@ -143,7 +139,13 @@ def check_kept(folder, cut_s):
     assert cut_s - oldest_s < LAST_S
 
 
-def cut_a_recording(disk, count, logged):
+TEN = pytest.param(10, False, marks=pytest.mark.slow)
+THIRTY = [pytest.param(30, logged, marks=pytest.mark.release) for logged in (False, True)]
+
+
+@pytest.mark.parametrize(("count", "logged"), [TEN, *THIRTY])
+@real_time
+def test_a_power_cut_costs_a_recording_its_last_second(disk, count, logged):
     durations = disk.with_name("syncs")
     durations.touch()
     child = start(record, None, disk, logged)
@@ -164,16 +166,6 @@ def cut_a_recording(disk, count, logged):
         os.waitpid(child, 0)
         shutil.rmtree(disk / f".{NAME}.part", ignore_errors=True)
         durations.unlink()
-
-
-TEN = pytest.param(10, False, marks=pytest.mark.slow)
-THIRTY = [pytest.param(30, logged, marks=pytest.mark.release) for logged in (False, True)]
-
-
-@pytest.mark.parametrize(("count", "logged"), [TEN, *THIRTY])
-@real_time
-def test_a_power_cut_costs_a_recording_its_last_second(disk, count, logged):
-    cut_a_recording(disk, count, logged)
 
 
 # ---- all else that is written
@@ -244,7 +236,7 @@ def test_what_a_power_cut_leaves_is_whole_or_not_there(inputs, disk, work, monke
         name, found = f"again_{number}", []
         shutil.rmtree(disk / "cache", ignore_errors=True)
         child = start(work, inputs, disk / name)
-        while not ended(child):
+        while not os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT | os.WNOHANG):
             time.sleep(rng.uniform(0, min(2 * whole_s / 30, 3)))
             cuts += 1
             with after_a_power_cut(disk, child) as copy:

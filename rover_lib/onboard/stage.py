@@ -18,7 +18,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from io import BufferedReader, BufferedWriter
@@ -199,12 +199,3 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
         what = f"{path}: not schema {SCHEMA} of stage '{stage or 'any'}' with {', '.join(PARTS)}"
         raise RoverError(what, found=sorted(found), remedy="run the stage again")
     return found
-
-
-def find_stage(path: Path | str, stage: str, *, params: Mapping[str, Any], inputs: Mapping[str, str]) -> Any:
-    """Read a stage's result if it is there and was made with these parameters, of these inputs; None otherwise."""
-    with contextlib.suppress(RoverError):
-        there = read_stage(path, stage)
-        if (there["params"], there["inputs"]) == (plain(params), plain(inputs)):
-            return there
-    return None

@@ -11,7 +11,7 @@ from policies import memory_samples
 
 from rover_learn.channels import _leave_out, without_channels
 from rover_learn.lessons import BatchedPolicy
-from rover_learn.refit import Gram
+from rover_learn.student import Gram
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
