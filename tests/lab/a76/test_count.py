@@ -168,7 +168,7 @@ def core(users_cache) -> Core:
 def again(thin) -> SimpleNamespace:
     """What `opened` would give: held-out frames from memory."""
     recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
-    parts = SimpleNamespace(held_out=memory_samples(12, seed=1), calibration=tuple(memory_samples(16)))
+    parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
     return SimpleNamespace(checkpoint=thin[0], parts=parts, recordings=recordings)
 
 
