@@ -9,7 +9,6 @@ from typing import Any
 import click
 
 from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
-from rover_lib.onboard.kinds import Number
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.progress import terminal_bar
 
@@ -31,16 +30,14 @@ def _end(ctx: click.Context, wrong: Sequence[object]) -> None:
 
 @main.command()
 @drive_options
-@click.option("--latency-ms", type=Number(min=0), default=0, help="Time that a plan takes, at least.")
-@click.option("--seed", type=click.IntRange(min=0), default=10_000, show_default=True, help="Of the first world.")
 @click.pass_context
-def drive(ctx: click.Context, latency_ms: float, seed: int, **options: Any) -> None:
+def drive(ctx: click.Context, **options: Any) -> None:
     """Do what `rover drive --world` does, with the real firmware on an emulated Arduino."""
     from balloon_world.car import VirtualCar
     from lab.arduino.emulator import BOARD, build
 
     build()  # in this process, where its errors are seen
-    ctx.exit(run_drive(car=partial(VirtualCar, seed=seed, board=BOARD), latency_ms=latency_ms, **options))
+    ctx.exit(run_drive(car=partial(VirtualCar, board=BOARD), **options))
 
 
 @main.command()

@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
@@ -53,9 +53,3 @@ def fetch_packages(folder: Path, packages: Sequence[str]) -> list[Path]:
     download = ["install", "--yes", "--download-only", "--no-install-recommends", *packages]
     run(*apt, *download, error=RoverError, remedy=NO_DEBIAN)
     return sorted((folder / "archives").glob("*.deb"))
-
-
-def unpack_packages(packages: Iterable[Path], folder: Path) -> None:
-    """Unpack the files of .deb packages into a folder without installing them. Raises RoverError."""
-    for package in packages:
-        run("dpkg", "--extract", package, folder, error=RoverError, remedy=NO_DEBIAN)

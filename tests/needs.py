@@ -28,7 +28,7 @@ qemu = pytest.mark.skipif(bool(QEMU_MISSING), reason=f"needs the Debian packages
 # Some tests compile the firmware's source for this machine.
 gcc = pytest.mark.skipif(not shutil.which("gcc"), reason="needs the Debian packages gcc libc6-dev")
 
-SIMAVR_MISSING = emulator.missing_packages()
+SIMAVR_MISSING = missing_packages(emulator.NEEDS)
 simavr = pytest.mark.skipif(bool(SIMAVR_MISSING), reason=f"needs the Debian packages {' '.join(SIMAVR_MISSING)}")
 
 ATTEMPTS = 5

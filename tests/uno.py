@@ -1,9 +1,7 @@
 """An emulated Arduino for tests: simavr runs the firmware as it is flashed, and pulses are measured on its pins."""
 
-import atexit
 import ctypes
 import functools
-import shutil
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,21 +19,12 @@ PIN = {"steering": 0, "throttle": 1}
 EEPROM_BYTES = len(arduino.eeprom_of(car.Car()))
 
 
-@functools.cache
-def _folder() -> Path:
-    folder = tempfile.mkdtemp(prefix="rover-uno-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
-
-def firmware(human: str = "receiver") -> Path:
-    """Return the compiled sketch, an ELF file."""
-    return arduino.build(human).firmware
+FOLDER = tempfile.TemporaryDirectory(prefix="rover-uno-")  # removed when this process ends
 
 
 def compiled(name: str, *arguments: object) -> Path:
     """Compile `arguments` with gcc, unless that was done before, and return the path. Warnings are errors."""
-    path = _folder() / name
+    path = Path(FOLDER.name, name)
     if not path.exists():
         arduino.compile_c(*arduino.CC, "-I", REPOSITORY / "firmware/rover", "-o", path, *arguments)
     return path
@@ -85,8 +74,9 @@ class Uno:
     def __init__(self, eeprom: bytes | None = None, human: str = "receiver"):
         """eeprom: its first bytes; None: of a board that has kept the default car. human: as the firmware is built."""
         self._c = _library()
-        self._uno = self._c.uno_new(str(firmware(human)).encode())
-        assert self._uno, f"simavr cannot load {firmware()}"
+        firmware = arduino.build(human).firmware
+        self._uno = self._c.uno_new(str(firmware).encode())
+        assert self._uno, f"simavr cannot load {firmware}"
         kept = arduino.eeprom_of(car.Car()) if eeprom is None else eeprom
         self._c.uno_eeprom(self._uno, ctypes.create_string_buffer(kept, len(kept) or 1), len(kept), True)
         self.events: list[SimpleNamespace] = []

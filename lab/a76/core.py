@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.debian import fetch_packages, install_packages, missing_packages, unpack_packages
+from lab.debian import fetch_packages, install_packages, missing_packages
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cache_folder, key_of
@@ -96,7 +96,8 @@ def build_plugin() -> Path:
 
 def _make_userland(root: Path) -> None:
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
-        unpack_packages(fetch_packages(Path(scratch), GUEST_PACKAGES), root)
+        for package in fetch_packages(Path(scratch), GUEST_PACKAGES):
+            run("dpkg", "--extract", package, root, error=RoverError)
     fetch_wheels(root / SITE, "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()

@@ -57,13 +57,6 @@ class Counted(NamedTuple):
     chunks: np.ndarray
 
 
-def write_observations(path: Path, samples: Sequence[Any]) -> Path:
-    """Write what a policy of one camera shall see, as guest/inferences.predict_all reads it."""
-    frames: dict[str, Any] = {f"frame_{i:04d}": sample.frame_bgr() for i, sample in enumerate(samples)}
-    np.savez(path, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
-    return path
-
-
 def count_artifact(
     core: Core,
     artifact: Path,
@@ -79,8 +72,9 @@ def count_artifact(
     they are repeated. Raises RoverError if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
-        folder = Path(scratch)
-        observations = write_observations(folder / "observations.npz", samples)
+        folder, observations = Path(scratch), Path(scratch) / "observations.npz"  # which guest/inferences.py explains
+        frames: dict[str, Any] = {f"frame_{i:04d}": sample.frame_bgr() for i, sample in enumerate(samples)}
+        np.savez(observations, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
         given = [artifact.resolve(), observations, folder, counted, *guest.arguments]
         done = emulate_script(core, guest.script, given, folder, guest.packages, f"memory={STEADY}")
         return Counted(_row(done, folder, counted, manifest), np.load(folder / "chunks.npy"))
@@ -89,7 +83,7 @@ def count_artifact(
 def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) -> dict[str, Any]:
     """Return an artifact's part of arm.json; _g are 10**9 instructions. The floor is SDOT alone, for every mode."""
     kernels = by_kernel(done.sections[STEADY], GuestFunctions((folder / "maps").read_text()))
-    kernels_g = {name: instructions / 1e9 for name, (instructions, _) in kernels.items()}
+    kernels_g = {name: instructions / 1e9 for name, instructions in kernels.items()}
     inferences_g = [done.total(i) / 1e9 for i in range(1, counted + 1)]
     counts: dict[str, float] = {"instructions": done.total(STEADY), "sdot": done.total(STEADY, "sdot")}
     counts |= {"simd": done.total(STEADY, "simd"), "cycles": done.cycles(STEADY)}
@@ -108,7 +102,6 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
         "image_height": manifest["cameras"][0]["height"],
         "image_width": manifest["cameras"][0]["width"],
         "instructions_by_kernel": kernels_g,
-        "sdot_by_kernel": {name: sdot / 1e9 for name, (_, sdot) in kernels.items()},
         "peak_memory_mb": done.peak_mb["predict"],
         "peak_memory_loading_mb": done.peak_mb["load"],
         "threads": versions["threads"],

@@ -127,18 +127,17 @@ def quantize_with(
     return artifact, versions
 
 
-def count_peers(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
+def count_peers(run_dir: Path | str, *, progress: Progress = silent) -> dict[str, Any]:
     """Count the peers of a run's static artifact, add them to its arm.json and return the content of that.
 
     metrics.peers has rows like those of metrics.artifacts, with `file_mb` and `made_with`, the versions of their tools.
     A peer's chunks come from the emulated Pi, the reference from this machine. What the engines make is kept in
-    run_dir/peers. frames: how many held-out frames judge. Raises RoverError if arm.json is missing, or if a peer cannot
-    be had or run.
+    run_dir/peers. Raises RoverError if arm.json is missing, or if a peer cannot be had or run.
     """
     run_dir = Path(run_dir)
     content, reference = read_stage(run_dir / "arm.json", "arm"), run_dir / f"{REFERENCE}.pt"
     again, manifest = open_run(run_dir), read_manifest(reference)
-    samples = pick_evenly(again.parts.held_out, frames)
+    samples = pick_evenly(again.parts.held_out, FRAMES)
     core = prepare()
     given = read_stage(run_dir / "calibrate.json", "calibrate")["params"]
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])

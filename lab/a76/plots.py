@@ -6,16 +6,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from lab.a76.report import LABEL
 from rover_lib.workshop.plots import style
-from rover_lib.workshop.plots.counting import whole_size
-
-TITLE = "counted on an emulated Cortex-A76"
-GROUP_COLOURS = (style.BLUE, style.SKY, *style.OTHERS[1:], style.MIST, style.GREY)  # the first two: INT8 products
 
 
 def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     """Draw instructions against the floor, and beside them the error on the same core. metrics: those of arm.json."""
-    rows = whole_size(metrics)
+    ours = {stem.removeprefix("policy_"): found for stem, found in metrics["artifacts"].items()}
+    counted = (ours | metrics.get("peers", {})).items()
+    rows = dict(sorted(counted, key=lambda item: -item[1]["instructions_g"]))
     fig, axes = style.new_figure(1, 2, height_in=1.7 + 0.4 * len(rows), sharey=True, width_ratios=(1.5, 1))
     (left, right), y = axes[0], np.arange(len(rows))
     total, simd = (np.array([m[key] for m in rows.values()]) for key in ("instructions_g", "simd_g"))
@@ -27,7 +26,7 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     left.set_yticks(y, [style.NAMES.get(n, n) for n in rows])
     left.invert_yaxis()
     left.set_xlabel("instructions of one inference (10^9)")
-    left.set_title(TITLE, fontsize=11)
+    left.set_title(LABEL, fontsize=11)
     first = next(iter(metrics["artifacts"].values()))
     keys = style.judged_keys(right, {k: v for k, v in first.items() if "workstation" not in k})
     height = 0.8 / max(len(keys), 1)
@@ -43,21 +42,4 @@ def draw_counts(metrics: Mapping[str, Any]) -> Figure:
     right.set_title(f"computed on it, {over} frames", fontsize=11)
     style.legend(left, loc="lower right")
     style.legend(right, loc="upper right")
-    return fig
-
-
-def draw_counts_by_kernel(groups: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draw what the instructions do. groups: {artifact or peer: {group: 10**9 instructions}}, all in the same order."""
-    fig, axes = style.new_figure(1, height_in=1.8 + 0.36 * len(groups))
-    ax, y, left = axes[0, 0], np.arange(len(groups)), np.zeros(len(groups))
-    for colour, group in zip(GROUP_COLOURS, next(iter(groups.values())), strict=True):
-        width = np.array([by_group[group] for by_group in groups.values()])
-        ax.barh(y, width, left=left, color=colour, label=group)
-        left += width
-    style.bar_values(ax, y, left, "{:.3g}")
-    ax.set_yticks(y, [style.NAMES.get(n, n) for n in groups])
-    ax.invert_yaxis()
-    ax.set_title(TITLE, fontsize=11)
-    ax.set_xlabel("instructions of one inference (10^9)")
-    style.legend_below(fig, ax, 4)
     return fig

@@ -1,4 +1,4 @@
-"""Judge and show what was counted: gates, groups of kernels, and a table."""
+"""Judge and show what was counted: gates, and a table."""
 
 import re
 from collections.abc import Mapping
@@ -14,22 +14,6 @@ STATIC, STATIC_ONNX = "policy_static", "policy_static.onnx"
 
 # The gates of instructions are for one policy: one whose multiply-accumulates differ by less than this share.
 SAME_POLICY = 0.01
-# What kernels do, by patterns of their names; the first pattern that matches decides.
-INT8_SDOT, INT8_OTHER, REST = "INT8 products: SDOT", "INT8 products: all else", "rest"
-GROUPS = (
-    (
-        INT8_OTHER,
-        r"with SDOT|xnn_q\w*(gemm|conv)|neondot|q8(gemm|conv)|Mlas\w*(GemmQuant|Gemm[SU]8|QGemm|Qgemm|ConvSym|ConvDw)",
-    ),
-    ("float products", r"sgemm_(kernel|nn|nt|tn|tt)|sgemv|arm_gemm|xnn_f32\w*(gemm|conv)|Mlas\w*Gemm"),
-    ("softmax and exp", r"exp(f|_|\d|minus|on)|[Ss]oftmax|attention"),
-    ("LayerNorm", r"[Ll]ayer_?[Nn]orm|RowwiseMoments"),
-    ("to and from INT8", r"[Qq]uantize|lrintf|vcvt"),
-    ("the frame (OpenCV)", r"^\[cv2"),
-    ("copies", r"[Cc]opy|mem(set|move)|im2col|unfold|[Tt]ranspose|indirection|(?<![Nn])[Pp]ack(?!ag)|^\[libc"),
-    ("element-wise", r"VectorizedLoop|vectorized_loop|max_?pool|v(add|mul|clamp|max)|(add|mul|relu|clamp)\w*_kernel"),
-)
-
 # Kernels that divide their work over the threads, by name or library. One thread executes the rest.
 DIVIDED = re.compile(r"xnn|pthreadpool|sgemm|[Ss]leef|flash_attention|qmaxpool|onnxruntime|Mlas")
 
@@ -84,18 +68,6 @@ def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float |
     """Return the largest ratio of the artifact's errors to these; None if no action is judged."""
     judged = [(artifact[key], error) for key, error in errors.items() if error is not None]
     return worst(mine / error if error else float("inf") for mine, error in judged)
-
-
-def group_kernels(counts: dict[str, Any]) -> dict[str, float]:
-    """Group the instructions of an artifact or a peer by what they do, in 10**9, in a fixed order."""
-    groups = dict.fromkeys((INT8_SDOT, *(name for name, _ in GROUPS), REST), 0.0)
-    sdot = counts.get("sdot_by_kernel", {})
-    for kernel, instructions_g in counts["instructions_by_kernel"].items():
-        group = next((name for name, pattern in GROUPS if re.search(pattern, kernel)), REST)
-        products_g = sdot.get(kernel, 0.0) if group == INT8_OTHER else 0.0
-        groups[INT8_SDOT] += products_g
-        groups[group] += instructions_g - products_g
-    return groups
 
 
 def table(content: dict[str, Any]) -> str:

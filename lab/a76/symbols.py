@@ -71,28 +71,21 @@ class GuestFunctions:
         return file.function_at(address - self._lowest[path] + file.base)
 
 
-def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, tuple[int, int]]:
-    """Sum up the executed (instructions, SDOT) by function: demangled names, the most instructions first.
+def by_kernel(blocks: np.ndarray, functions: Any, at_most: int = KERNELS) -> dict[str, int]:
+    """Sum up the executed instructions by function: demangled names, the most instructions first.
 
     All functions after the first `at_most` are summed up as "other". blocks: an array of core.BLOCK. functions: names
-    by address. For a library that was stripped of names, blocks with an SDOT are listed apart from the rest.
+    by address.
     """
     instructions: Counter[str] = Counter()
-    sdots: Counter[str] = Counter()
-    for address, entered, count, _, sdot, _ in blocks.tolist():
-        name = functions[address]
-        if name.startswith("[") and sdot:
-            name = f"{name} loops with SDOT"
-        instructions[name] += entered * count
-        sdots[name] += entered * sdot
+    for address, entered, count, *_ in blocks.tolist():
+        instructions[functions[address]] += entered * count
     mangled = [name for name, _ in instructions.most_common()]
     plain = run("c++filt", "--no-params", error=RoverError, input="\n".join(mangled)).splitlines()
-    merged: dict[str, tuple[int, int]] = {}
+    merged: Counter[str] = Counter()
     for i, (name, demangled) in enumerate(zip(mangled, plain, strict=True)):
-        short = _short(demangled) if i < at_most else "other"
-        before = merged.get(short, (0, 0))
-        merged[short] = before[0] + instructions[name], before[1] + sdots[name]
-    return merged
+        merged[_short(demangled) if i < at_most else "other"] += instructions[name]
+    return dict(merged)
 
 
 def _short(name: str) -> str:

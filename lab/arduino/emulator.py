@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from balloon_world.child_process import Child
 from balloon_world.simulated_arduino import BOOT_S, REST_US, PinEvent
-from lab import debian
+from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.cache import cache_folder, key_of
@@ -50,20 +50,14 @@ class Built(NamedTuple):
     program: Path
 
 
-def missing_packages() -> list[str]:
-    """Return the Debian packages that the emulated Arduino needs and this machine lacks."""
-    return debian.missing_packages(NEEDS)
-
-
 @functools.cache
 def build(human: str = "receiver") -> Built:
     """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
 
-    human: as in `make -C firmware HUMAN=gamepad`. Raises RoverError if Debian packages are missing.
+    human: as in `make -C firmware HUMAN=gamepad`. Missing Debian packages are installed if this runs as root; else
+    raises RoverError.
     """
-    if missing := " ".join(missing_packages()):
-        remedy = f"sudo apt-get install --no-install-recommends {missing}"
-        raise RoverError("the emulated Arduino needs Debian packages that are not here", remedy=remedy)
+    install_packages(missing_packages(NEEDS), "the emulated Arduino")
     sources = [EMULATOR, FIRMWARE / "Makefile", *sorted(p for p in (FIRMWARE / "rover").glob("*") if p.is_file())]
 
     def make(folder: Path) -> None:

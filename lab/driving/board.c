@@ -196,5 +196,4 @@ int board_line(bool hello, char *text) {
     return length;
 }
 
-void board_sequence(uint32_t sequence) { vehicle.sequence = sequence; }
 bool board_may_keep() { return vehicle_may_keep(&vehicle); }

@@ -25,18 +25,17 @@ class NativeArduino:
     default. gamepad: the firmware is built with HUMAN=gamepad, and a host sends the sticks, every 20 ms.
     """
 
-    def __init__(self, now_ms: int = 0, sequence: int = 0, car: Car | None = None, gamepad: bool = False):
+    def __init__(self, now_ms: int = 0, car: Car | None = None, gamepad: bool = False):
         self.gamepad = gamepad
         self.car = car or Car()
         self.sticks: list[float] = [self.car.numbers[2], self.car.numbers[6]]
         self.misread = 0, 0
-        self.sequence = sequence
+        self.sequence = 0
         self.heard_ms: int | None = None
         self.asked_ms: int | None = None
         self.periods_us = self.car.numbers[0], self.car.numbers[4]
         self._ms = now_ms
         self.start(Car())
-        self._board.c.board_sequence(ctypes.c_uint32(sequence))
         if self.car.numbers != DEFAULT_NUMBERS:
             assert self.command("C", *self.car.numbers) == "k"
 

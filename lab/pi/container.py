@@ -54,8 +54,8 @@ class Container:
 
     def __enter__(self) -> "Container":
         with contextlib.ExitStack() as stack:
-            made = debian_image()
-            self.key, self.machine = made.key, f"rover-pi-{secrets.token_hex(4)}"
+            system = debian_image()
+            self.key, self.machine = system / "key", f"rover-pi-{secrets.token_hex(4)}"
             # Not in /tmp, which may be in memory: torch alone takes half a gigabyte.
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=".pi-", dir=cache_root()))
             self._own = Path(folder)
@@ -64,7 +64,7 @@ class Container:
             for name in ("upper", "work", "root", "bench"):
                 (self._own / name).mkdir(mode=0o755)
             # redirect_dir allows to rename a folder of a lower layer, as on any disk.
-            layers = f"lowerdir={made.root},upperdir={folder}/upper,workdir={folder}/work,redirect_dir=on"
+            layers = f"lowerdir={system}/root,upperdir={folder}/upper,workdir={folder}/work,redirect_dir=on"
             remedy = f"put ROVER_CACHE on a plain disk if {cache_root()} cannot hold a layered file system"
             run("mount", "-t", "overlay", self.machine, "-o", layers, self.root, error=RoverError, remedy=remedy)
             stack.callback(lambda: subprocess.run(["umount", "--lazy", self.root], capture_output=True))

@@ -1,7 +1,7 @@
 """Build Debian arm64 for the emulated Pis, like a freshly flashed Raspberry Pi OS Lite. It is built once, then cached.
 
     with emulation():
-        debian_image().root      # /etc, /usr, ... of the Pi, owned by root; never written to
+        debian_image() / "root"      # /etc, /usr, ... of the Pi, owned by root; never written to
 
 The packages are those of this machine's own Debian (12 or 13). dpkg unpacks them natively; only their configuration is
 emulated. The image has nothing that provision.yml must install.
@@ -12,7 +12,6 @@ import platform
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
 
 from lab.debian import fetch_packages
 from lab.pi.emulation import in_cgroup
@@ -40,25 +39,16 @@ useradd --create-home --shell /bin/bash --groups {GROUPS} {USER}
 STAND_INS = {"usr/sbin/policy-rc.d": "exit 101", "usr/local/sbin/update-ca-certificates": "exit 0"}
 
 
-class DebianImage(NamedTuple):
-    """The Pi's system. root: its file system. key: the private ssh key of USER, who may use sudo without a password."""
+def debian_image() -> Path:
+    """Return the folder of the Pi's system, from the cache or made now, within emulation(), in two minutes.
 
-    root: Path
-    key: Path
-
-
-def debian_image() -> DebianImage:
-    """Return the Pi's file system and the key to it, from the cache or made now, within emulation(), in two minutes."""
-    recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": _codename()}
-    folder = cache_folder("pi-system", key_of(recipe), _make)
-    return DebianImage(folder / "root", folder / "key")
-
-
-def _codename() -> str:
+    root: its file system. key: the private ssh key of USER, who may use sudo without a password. Raises RoverError.
+    """
     about = platform.freedesktop_os_release()
     if about["ID"] != "debian":
         raise RoverError("the emulated Pi needs the apt sources of a Debian 12 or 13", found=about["PRETTY_NAME"])
-    return about["VERSION_CODENAME"]
+    recipe = {"made": [PACKAGES, CONFIGURE, RECIPE], "debian": about["VERSION_CODENAME"]}
+    return cache_folder("pi-system", key_of(recipe), _make)
 
 
 def _make(folder: Path) -> None:

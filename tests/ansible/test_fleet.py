@@ -120,20 +120,6 @@ def test_deployed_to_all_and_told_by_status(fleet, artifacts):
 
 
 @pytest.mark.release
-def test_a_rover_that_is_broken_stops_the_rest_and_the_next_deployment_heals(fleet, artifacts):
-    one_by_one = {"rover_batches": [1, 1, 1]}
-    (fleet.folder / "second").mkdir()
-    (fleet.folder / "second" / "models").write_text("a disk that is broken")
-    done = fleet.deploy(artifacts["static"], **one_by_one)
-    assert done.returncode != 0 and "second: failed: " in done.stdout, done.stdout
-    assert "third: untouched: second failed before" in done.stdout, done.stdout
-    assert fleet.releases("canary").status()["healthy"] and not (fleet.folder / "third").exists()
-    (fleet.folder / "second" / "models").unlink()
-    assert fleet.deploy(artifacts["static"], **one_by_one).returncode == 0
-    assert all(fleet.releases(n).status()["healthy"] for n in NAMES)
-
-
-@pytest.mark.release
 def test_the_model_before_stays_when_the_canary_fails_drives_or_does_not_get_ready(fleet, artifacts):
     fleet.give(artifacts["static"], *NAMES)
     old = {content_hash(artifacts["static"])}

@@ -224,18 +224,6 @@ def test_no_unit_lets_root_load_an_artifact_and_no_playbook_runs_one_itself(unit
     assert "current/policy.pt" not in tasks and "--sandboxed, verify]" in tasks
 
 
-def test_the_check_has_the_sandbox_of_the_drive_and_no_more(units):
-    """What passes its parity vectors in one must not fail in the other."""
-    drive, check = (
-        {line for line in (units / name).read_text().splitlines() if re.match(r"[A-Z]\w+=", line)}
-        for name in (DRIVE, CHECK)
-    )
-    sandbox = set(re.findall(r"^[A-Z]\w+=.*$", (ROLE / "templates" / "sandbox.j2").read_text(), re.M))
-    shared = {line for line in sandbox if "{" not in line and not line.startswith(("RestrictAddress", "IPAddress"))}
-    assert shared <= drive and shared <= check
-    assert {"PrivateNetwork=yes", "RestrictAddressFamilies=AF_UNIX", "User=rover"} <= drive & check
-
-
 def test_the_units_say_what_the_command_line_takes(units):
     drive, check, view = (command((units / name).read_text()) for name in (DRIVE, CHECK, VIEW))
     for words in (drive, view):

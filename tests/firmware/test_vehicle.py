@@ -239,7 +239,7 @@ def test_one_pause_is_no_reason_to_stop(armed, phase_ms):
     assert armed.status.state is State.AUTONOMOUS
 
 
-# ---- near the wraps of clock and sequence
+# ---- near the wrap of the clock
 
 
 def test_nothing_happens_when_the_clock_wraps():
@@ -250,11 +250,3 @@ def test_nothing_happens_when_the_clock_wraps():
     assert set(throttles(board.drive(1456, 150, 1200)[20:])) == {150}
     assert board.status.uptime_ms < 3000 and board.status.state is State.AUTONOMOUS
     assert moved_after_ms(board.run(400)) <= 150 and board.status.reason == "t"
-
-
-def test_a_sequence_that_wraps_is_new():
-    board = NativeArduino(sequence=(1 << 32) - 5)
-    board.run(120)
-    assert {board.command("N") for _ in range(10)} == {"i"}
-    assert board.status.sequence == 5
-    assert board.command("N", sequence=(1 << 32) - 5) == "o"

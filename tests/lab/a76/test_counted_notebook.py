@@ -17,7 +17,7 @@ def test_counts_are_drawn(tmp_path):
     text = shown(runs.execute("06_arm", tmp_path))
     assert report.LABEL in text
     assert "teacher at 320x180" in text  # the computed times
-    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {"06_counted", "06_by_kernel"}
+    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == {"06_counted"}
 
 
 def test_nothing_counted_is_a_sentence(tmp_path):

@@ -3,16 +3,14 @@
 Who may arm, which lines are commands, and what noise does are the state machine's alone: tests/firmware has that.
 """
 
-import json
 import random
 
 import needs
 import pytest
-from recorded import real_episode
 from uno import CUT, EDGE_US, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
+from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 
 pytestmark = [pytest.mark.emulated, needs.simavr]
 NEUTRAL_US = 1456, 120
@@ -43,35 +41,6 @@ def test_neutral_before_anything_else(board):
         assert pulses(events, pin)[0].at_us < 1000
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
     assert board.lines[0] == f"<H 4 4.2.0 {board.boot} 0 p {Car().id}"
-
-
-def test_recorded_pulses_come_out_as_they_went_in(board):
-    """What a transmitter sent, through the receiver's pins, and as actions through the host, within a timer step."""
-    pwm = PwmCalibration()
-    controls = json.loads((real_episode() / "episode_data.json").read_text())["control_samples"][60:260:8]
-    moving = []
-    board.transmitter(*REST)
-    board.run_ms(100)
-    for control in controls:
-        steering_us, throttle_us = control["steering_raw_us"], control["throttle_raw_us"]
-        periods_us = control["steering_period_us"], control["throttle_period_us"]
-        actions = pwm.actions_from_pulses(steering_us, throttle_us, *periods_us)
-        if None in actions:
-            continue
-        board.transmitter(steering_us, throttle_us)
-        board.run_ms(50)
-        on_pins(board.run_ms(25), steering_us, throttle_us, within_us=STEP_US)
-        assert abs(board.status.receiver_steering_us - steering_us) <= ARDUINO_STEP_US
-        if actions.throttle > 0:
-            moving.append((steering_us, throttle_us, pwm.pulses(*actions)))
-    board.transmitter(*REST)
-    board.run_ms(60)
-    arm(board)
-    for steering_us, throttle_us, sent in moving:
-        board.drive(sent.steering_us, sent.throttle_us, 60)
-        events = board.drive(sent.steering_us, sent.throttle_us, 25)
-        on_pins(events, steering_us, throttle_us, within_us=2 * ARDUINO_STEP_US)
-    assert len(moving) >= 5
 
 
 def test_a_line_full_of_rubbish_keeps_no_command_out(armed):

@@ -2,39 +2,13 @@
 
 from dataclasses import replace
 from itertools import groupby
+from unittest.mock import MagicMock
 
 import needs
 
 from lab.driving.virtual import LIVE, LOST, World
 from lab.driving.virtual_host import Process
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
-
-
-class Rows:
-    """In the place of a Recorder."""
-
-    failure = path = takeover = None
-
-    def __init__(self, world):
-        self.drivers, self._world, self._written = [], world, None
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        pass
-
-    def control(self, *row, **columns):
-        self.drivers.append(columns["driver"])
-        if columns["driver"] != POLICY:
-            self._written = self._written or len(self._world.written)
-
-    def note(self, takeover):
-        self.takeover = takeover
-        assert self._written == len(self._world.written), "something was sent to a car that is the human's"
-
-    def close(self, fault):
-        assert fault is None
 
 
 def sticks(steering_us, throttle_us, receiver=LIVE):
@@ -57,9 +31,13 @@ def test_a_human_who_takes_over_is_recorded_and_then_the_service_waits_for_anoth
     for at_ms, change in happens:
         world.at(at_ms, lambda change=change: (change(world.hand), world.handle()))
     process = Process(world, service=True)
-    written = Rows(world)
+    recorder, sent = MagicMock(failure=None, path=None, takeover=None), set()
+    recorder.__enter__.return_value = recorder
+    recorder.__exit__.return_value = None
+    recorder.control.side_effect = lambda *row, driver, **_: sent.add(len(world.written)) if driver != POLICY else None
+    recorder.note.side_effect = lambda takeover: sent.add(len(world.written))
     process.session.options = replace(process.session.options, record="nowhere")
-    process.session.make_recorder = lambda folder, room: written
+    process.session.make_recorder = lambda folder, room: recorder
     world.sleep(2.8)
     for at_ms in (3600, 6000, 14_500):  # the second while the human drives
         world.at(at_ms, process.ask)
@@ -68,6 +46,9 @@ def test_a_human_who_takes_over_is_recorded_and_then_the_service_waits_for_anoth
     world.close()
     assert [words for _, _, words in world.seen.drives] == ["the human took over with the transmitter", "told to stop"]
     assert len(world.seen.starts) == 1
-    assert [driver for driver, _ in groupby(written.drivers)] == [POLICY, HUMAN, NOBODY, HUMAN, POLICY]
-    assert "at rest" in written.takeover["ended"]
+    drivers = [call.kwargs["driver"] for call in recorder.control.call_args_list]
+    assert [driver for driver, _ in groupby(drivers)] == [POLICY, HUMAN, NOBODY, HUMAN, POLICY]
+    assert len(sent) == 1, "something was sent to a car that is the human's"
+    assert "at rest" in recorder.note.call_args.kwargs["takeover"]["ended"]
+    assert all(call.args == (None,) for call in recorder.close.call_args_list)
     assert process._operators._rounds > 4 * 30  # the watchdog is fed while the human is recorded

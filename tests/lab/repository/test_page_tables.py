@@ -6,7 +6,6 @@ import pytest
 
 from lab.repository import page_tables as tables
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.run.run import AFTERWARDS, NAMES, NOTEBOOKS, parameters_in
 
 
 def test_pages_say_what_results_and_notebooks_say():
@@ -23,9 +22,3 @@ def test_a_number_that_was_typed_is_written_over_and_a_missing_table_is_told(tmp
     readme.write_text(right.replace("<!-- table demo", "<!-- table dem"))
     with pytest.raises(RoverError, match="each table once"):
         tables.changed_pages(tmp_path)
-
-
-def test_each_parameter_of_each_notebook_has_a_comment():
-    """It is where papermill and the page say that the parameter's meaning stands."""
-    for name in NAMES + AFTERWARDS:
-        assert all(len(why) > 10 for *_, why in parameters_in(NOTEBOOKS / f"{name}.ipynb")), name
