@@ -29,12 +29,10 @@ from rover_lib.workshop.judge.verdict import headline, verdict
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
-CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 AGAIN = "'rover run' of its checkpoint makes it again"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
-    "02_odd_frames": "Frames that the policy answers far more strongly than the others",
     "03_sensitivity": "How much of the error each block causes",
 }
 
@@ -137,23 +135,6 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def _worth(judged: Mapping[str, Any]) -> list[str]:
     return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
-
-
-def write_card(run_dir: Path | str) -> Path:
-    """Write README.md, a model card for the Hub, into a run's folder; return its path.
-
-    Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
-    """
-    folder = Path(run_dir)
-    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
-    path = folder / "README.md"
-    if path.exists() and CARD not in path.read_text(errors="replace"):
-        raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
-    header, *rows = columns(judged)
-    recordings = load["recordings"]
-    values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
-    path.write_text(_pages(escaped=False).get_template("card.md").render(values))
-    return path
 
 
 def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
