@@ -142,24 +142,16 @@ def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
     judged, env = content["metrics"], content["env"]
     header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
     drawn = {words: folder / "figures" / f"{figure}.png" for figure, words in FIGURES.items()}
-    return (
-        _pages(escaped=True)
-        .get_template(PAGE)
-        .render(
-            {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
-            kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
-            worth=_worth(judged),
-            figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
-            files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
-            made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
-        )
-    )
-
-
-def _pages(*, escaped: bool) -> Environment:
-    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=escaped)
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
     pages.filters["words"] = _to_html
-    return pages
+    return pages.get_template(PAGE).render(
+        {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
+        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
+        worth=_worth(judged),
+        figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
+        files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
+        made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+    )
 
 
 def _to_html(line: str) -> Markup:  # what is between backticks as code
