@@ -116,7 +116,7 @@ def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults:
 
 def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faults) -> tuple[Sample, ...]:
     """begins: whether the run begins its session, so that the car stood before it."""
-    images = tub / "images"
+    images, home = tub / "images", tub.resolve()
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
@@ -124,7 +124,7 @@ def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faul
     actions = np.stack([-car.left * np.array([r.angle for r in run]), throttle], 1).astype(np.float32)
     samples = []
     for k, record in enumerate(run):
-        if not check_picture(tub, images / record.picture, record.picture, tub, faults) or (k == 0 and not begins):
+        if not check_picture(home, images / record.picture, record.picture, tub, faults) or (k == 0 and not begins):
             continue
         after = min(k + 1, len(run) - 1)
         samples.append(

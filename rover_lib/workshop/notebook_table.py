@@ -11,14 +11,13 @@ from rover_lib.onboard.columns import align
 class Table:
     """Rows of text below a header, all of one length; numbers of the second column on stand to the right.
 
-    caption: a line above. notes: lines below. shades: CSS colours of the last cells, a row each; None for none.
+    caption: a line above. notes: lines below.
     """
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
     notes: Sequence[str] = ()
-    shades: Sequence[str | None] = ()
 
     def __str__(self) -> str:
         caption = [self.caption] if self.caption else []
@@ -27,17 +26,14 @@ class Table:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        shades = self.shades or (None,) * len(self.rows)
-        body = "\n".join(_line(row, "td", shade) for row, shade in zip(self.rows, shades, strict=True))
+        body = "\n".join(_line(row, "td") for row in self.rows)
         caption = f"<p><b>{escape(self.caption)}</b></p>\n" if self.caption else ""
         notes = "".join(f"\n<p>{escape(note)}</p>" for note in self.notes)
         head = f"<thead>{_line(self.header, 'th')}</thead>"
         return f"{caption}<table>\n{head}\n<tbody>\n{body}\n</tbody>\n</table>{notes}"
 
 
-def _line(cells: Sequence[str], tag: str, shade: str | None = None) -> str:
+def _line(cells: Sequence[str], tag: str) -> str:
     styles = ["text-align: left", *["text-align: right"] * (len(cells) - 1)]
-    if shade:
-        styles[-1] += f"; background: {shade}"
     told = (f'<{tag} style="{style}">{escape(cell)}</{tag}>' for cell, style in zip(cells, styles, strict=True))
     return f"<tr>{''.join(told)}</tr>"

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 RARELY: dict[str, Any] = {"delay": 20.0, "mininterval": 20.0}  # seconds: how a bar moves in a log
-LOG_VARIABLE = "ROVER_PROGRESS_LOG"  # the file into which the run's messages go, if that is no terminal
 TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal where a run was started: the notebooks draw their bars there
 
 T = TypeVar("T")
@@ -29,13 +28,10 @@ def terminal_bar() -> Progress:
 
 
 def notebook_bar() -> Progress:
-    """A bar in the terminal where `rover run` was started, in its log, or in JupyterLab; else none."""
+    """A bar in the terminal where `rover run` was started, or in JupyterLab; else none."""
     from tqdm import tqdm
     from tqdm.auto import tqdm as widget
 
-    if name := os.environ.get(LOG_VARIABLE):
-        with suppress(OSError):
-            return partial(tqdm, file=Path(name).open("a"), leave=False, **RARELY)
     if name := os.environ.get(TTY_VARIABLE):
         with suppress(OSError):  # open as long as the kernel lives
             return partial(tqdm, file=Path(name).open("w"), leave=False)

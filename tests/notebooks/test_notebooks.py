@@ -1,8 +1,6 @@
 """The notebooks as runs, and with each of their parameters turned."""
 
 import json
-import re
-from pathlib import Path
 
 import nbformat
 import pytest
@@ -173,20 +171,3 @@ def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     assert (found["frames"], found["fp32"]["trials"], set(found["modes"])) == (4, 1, {"static", "mixed"})
     assert timed["params"]["threads"] == 1 and timed["metrics"]["artifacts"]["static"]["n"] == 3
     assert run_report.write(turned)["metrics"]["modes"]
-
-
-def test_the_batch_of_the_docs_runs(demo_run, tmp_path, monkeypatch, capsys):
-    """As it stands in docs/notebooks.md, up to executing: `turned` executes the same notebooks in such a copy."""
-    text = (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text()
-    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
-
-    def execute(name, folder, **given):
-        assert given.keys() <= parameters_of(NOTEBOOKS / f"{name}.ipynb")
-        return folder / f"{name}.ipynb"
-
-    monkeypatch.setattr(runs, "execute", execute)
-    Path(tmp_path / "runs").mkdir()
-    (tmp_path / "runs" / "demo").symlink_to(demo_run)
-    monkeypatch.chdir(tmp_path)
-    exec(code, {})
-    assert len(re.findall(r"^\{.*\} \d+\.\d\d \d+\.\d\d % off$", capsys.readouterr().out, re.M)) == 3

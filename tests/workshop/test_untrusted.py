@@ -13,7 +13,6 @@ import pyarrow
 import pytest
 import torch
 from pyarrow import parquet
-from rover_lib.onboard.recording.outcome import label
 
 from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
@@ -111,7 +110,6 @@ READERS = {
     "car.yml": read_car,
     "flight.log": read_log,
     "episode_data.json": lambda path: load_recordings(path.parent, 8),
-    "./episode_data.json": lambda path: label([path.parent], "hit"),
     "best_model.pth": load_checkpoint,
     "calibration.pt": Calibration.load,
     "manifest.json": lambda path: read_tub(path.parent, Car()),

@@ -147,9 +147,7 @@ class Calibration:
         """Read what save() wrote. Raises ArtifactError if the file is missing or not a calibration."""
         try:
             with open_plain(path, OSError("not a plain file")) as file:
-                content = torch.load(file, weights_only=True)
-            content.pop("ranges", None)  # of earlier versions
-            return cls(**content)
+                return cls(**torch.load(file, weights_only=True))
         except FileNotFoundError:
             raise ArtifactError(f"{path}: not found", remedy="run notebook 02_calibrate first") from None
         except Exception:  # torch wraps what it meets in many types

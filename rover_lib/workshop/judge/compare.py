@@ -45,7 +45,6 @@ class WorstFrame:
 
     mode: str
     action: str
-    index: int
     error_pct: float
     sample: Any
     reference: np.ndarray
@@ -138,7 +137,7 @@ class Fidelity:
         for i in np.argsort(-per_frame.max(1), kind="stable")[:count]:
             action = self.action_names[list(units)[int(per_frame[i].argmax())]]
             plans = self.reference[i], self.chunks[mode][i]
-            found.append(WorstFrame(mode, action, int(i), float(per_frame[i].max()), self.samples[i], *plans))
+            found.append(WorstFrame(mode, action, float(per_frame[i].max()), self.samples[i], *plans))
         return found
 
 

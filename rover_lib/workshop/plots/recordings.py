@@ -1,18 +1,14 @@
-"""Notebooks 01 and 02: the recordings, and what calibration saw in them."""
+"""Notebook 01: the recordings."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
-from rover_lib.workshop.act import block_of
-from rover_lib.workshop.int8 import frames
-from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.plots import style
 from rover_lib.workshop.plots.style import new_figure
-from rover_lib.workshop.recordings.episodes import Episode, Sample
+from rover_lib.workshop.recordings.episodes import Episode
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 
 
@@ -41,20 +37,4 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
     ax.set_xlabel("time in the episode (s)")
     label = episode.label or "no label"
     fig.suptitle(f"{episode.id}: {label}, {len(samples)} samples of {episode.frames} frames", fontsize=11)
-    return fig
-
-
-def odd_frames(calibration: Calibration, samples: Sequence[Sample], count: int = 4) -> Figure:
-    """Draw the oddest of the frames that calibrated, each with the block that answers it most, and how many times more.
-
-    samples: those that calibrated, in their order.
-    """
-    times = frames.oddness(calibration.frames)
-    places, table = list(times), torch.stack(list(times.values()))
-    oddest = table.amax(0).argsort(descending=True, stable=True)[:count].tolist()
-    fig, axes = style.figure_of(len(oddest), count, 2.2)
-    for ax, i in zip(axes, oddest, strict=True):
-        block, most = block_of(places[int(table[:, i].argmax())]), float(table[:, i].max())
-        where = f"{samples[i].episode.removeprefix('episode_')}, frame {samples[i].row}"
-        style.show_picture(ax, samples[i], f"{where}\n{block}: {most:.3g} times")
     return fig

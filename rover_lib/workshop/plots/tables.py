@@ -7,7 +7,6 @@ from rover_lib.workshop.judge.verdict import gate_in_words
 from rover_lib.workshop.notebook_table import Table
 
 KEPT = {True: "kept", False: "MISSED", None: "not measured"}
-SHADES = {True: "#009E7333", False: "#D55E0044", None: "#88888833"}  # translucent: readable on a dark page too
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -20,8 +19,7 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
     caption += f", {missed} missed" if missed else ""
     caption += f", {unknown} not measured" if unknown else ""
     cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
-    shades = tuple(SHADES[row["passed"]] for row in rows)
-    return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption, shades=shades)
+    return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption)
 
 
 def _shown(value: Any) -> str:

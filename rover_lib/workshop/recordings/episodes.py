@@ -223,6 +223,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
+    home = folder.resolve()
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
@@ -238,7 +239,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        frames.append(_Frame(int(number), time_s, picture, check_picture(folder, picture, name, path, faults)))
+        frames.append(_Frame(int(number), time_s, picture, check_picture(home, picture, name, path, faults)))
     sizes = Counter(f.size for f in frames if f.size and any(f.size))
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
     for i, frame in enumerate(frames):
@@ -257,13 +258,13 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
     return kept
 
 
-def check_picture(folder: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
+def check_picture(home: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
     """Return a listed picture's (height, width), (0, 0) where it says them late; None unless it is there and whole.
 
-    Only its two ends are read.
+    home: the episode's folder, resolved. Only the picture's two ends are read.
     """
     try:
-        if Path(name).is_absolute() or not picture.resolve().is_relative_to(folder.resolve()):
+        if Path(name).is_absolute() or not picture.resolve().is_relative_to(home):
             faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
             return None
         if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever

@@ -3,12 +3,10 @@
 What its numbers mean is read from the names of its features, or said by the user, and never guessed.
 """
 
-import shlex
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -173,7 +171,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not str(version).startswith("v3"):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
         if str(version).startswith("v2.1"):
-            remedy = f"convert it once by LeRobot's own `{_conversion(root.resolve())}`"
+            remedy = "convert it once by LeRobot's own convert_dataset_v21_to_v30"
         raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v3 is read", remedy=remedy)
     features, fps = info.get("features"), info.get("fps")
     try:
@@ -186,16 +184,6 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not right or not is_number(fps, 0, 1000) or not fps:
         raise _broken(f"{path}: lacks frames per second, or plain features with a dtype and a shape", quote(fps))
     return info
-
-
-def _conversion(root: Path) -> str:
-    """Return LeRobot's command that converts a dataset of v2.1 to v3 in place, and publishes nothing."""
-    new = find_spec("lerobot") and find_spec("lerobot.scripts.convert_dataset_v21_to_v30")
-    module = "lerobot.scripts" if new else "lerobot.datasets.v30"
-    # 0.4 takes the folder around it, and joins the two
-    name, folder = (f"local/{root.name}", root) if new else (root.name, root.parent)
-    words = ["python", "-m", f"{module}.convert_dataset_v21_to_v30", f"--repo-id={name}", f"--root={folder}"]
-    return shlex.join([*words, "--push-to-hub=false"])
 
 
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, Any]]:

@@ -29,7 +29,7 @@ from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.progress import LOG_VARIABLE, TTY_VARIABLE, Progress, silent
+from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
 from rover_lib.workshop.run.run_folder import run_folder
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
@@ -171,9 +171,9 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
     from nbclient.exceptions import DeadKernelError
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
-    places = {TTY_VARIABLE: "", LOG_VARIABLE: ""} | (_place_of(sys.stderr) if bars else {})
+    place = {TTY_VARIABLE: _terminal_of(sys.stderr) if bars else ""}
     how = {"cwd": str(folder), "progress_bar": False, "kernel_name": "python3", "kernel_manager_class": ThisPython}
-    with set_environment({**places, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
+    with set_environment({**place, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
@@ -212,14 +212,11 @@ def set_environment(values: dict[str, str]) -> Iterator[None]:
         os.environ.update(before)
 
 
-def _place_of(stream: Any) -> dict[str, str]:
-    """Where a kernel writes its progress: the stream's terminal, or the file that it is; none if it is neither."""
+def _terminal_of(stream: Any) -> str:
+    """The terminal that a stream writes to, where a kernel shows its progress; empty if it is none."""
     with suppress(AttributeError, OSError, ValueError):
-        number = stream.fileno()
-        if os.isatty(number):
-            return {TTY_VARIABLE: os.ttyname(number)}
-        return {LOG_VARIABLE: f"/proc/{os.getpid()}/fd/{number}"}
-    return {}
+        return os.ttyname(stream.fileno())
+    return ""
 
 
 def _sentence(error: Any) -> str:

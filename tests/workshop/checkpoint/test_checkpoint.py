@@ -344,14 +344,6 @@ def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_p
     check_is(checkpoint, policy, inner, outer)
 
 
-def test_two_cameras_keep_their_names_and_sizes(tmp_path):
-    cameras = {"observation.image": (32, 64), "observation.images.image": (64, 32)}
-    lerobot_policy(**TINY, cameras=cameras).save_pretrained(tmp_path / "two")
-    edit(tmp_path / "two/config.json", lambda c: c.update(normalization_mapping=RAW))
-    config = load_checkpoint(tmp_path / "two").config
-    assert dict(zip(config.cameras, config.image_sizes, strict=True)) == cameras
-
-
 def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
     policy = lerobot_policy(**TINY, states=0)
     policy.save_pretrained(tmp_path / "policy")

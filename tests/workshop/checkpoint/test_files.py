@@ -14,7 +14,6 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_can_hold, write_lerobot, write_trainer
-from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.recordings.samples import Layout
 
 SETTINGS = {
@@ -102,15 +101,3 @@ def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_pat
     (tmp_path / "origin.json").write_text('{"rate_hz": NaN}')
     with pytest.raises(CheckpointError, match="rate_hz must be a number from 5 to 120, found nan"):
         load_checkpoint(tmp_path)
-
-
-@pytest.mark.slow
-def test_other_statistics_beside_the_same_weights_are_another_policy(config, weights, tmp_path):
-    made = {}
-    for name, throttle in (("as it was", 0.02), ("again", 0.02), ("corrected", 0.03)):
-        norms = {"action_unnorm": Affine((0.4, throttle), (0.1, 0.05))}
-        write_lerobot(tmp_path / name, replace(config, **norms), weights, ORIGIN)
-        made[name] = load_checkpoint(tmp_path / name)
-    was, again, corrected = made.values()
-    assert was.sha256 == corrected.sha256 and was.identity == again.identity != corrected.identity
-    assert calibrate(was, memory_samples(2)).checkpoint == was.identity

@@ -61,7 +61,7 @@ def report():
 
 def test_errors_by_hand(report):
     first, second = report.worst("static", 5)
-    assert (first.index, second.index, first.action) == (0, 1, "throttle")
+    assert first.sample is report.samples[0] and second.sample is report.samples[1] and first.action == "throttle"
     assert first.error_pct == pytest.approx(1.0, rel=1e-4)
     found = report.summary("static")
     assert found["steering_mae_pct"] == pytest.approx(0.008 / 6 / 0.8 * 100, rel=1e-4)

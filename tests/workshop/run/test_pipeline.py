@@ -9,12 +9,10 @@ from policies import memory_samples
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
-from rover_lib.workshop.int8.observe import calibrate
-from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
-from rover_lib.workshop.run.pipeline import Recipe, export_onnx, export_policies, make_artifact, write_quantize
+from rover_lib.workshop.run.pipeline import Recipe, export_onnx, write_quantize
 from rover_lib.workshop.run.session import Opened
 
 
@@ -31,19 +29,6 @@ def test_the_schemes_of_a_run():
     modes = [(mode, mode, "symmetric") for mode in ("dynamic", "static", "mixed")]
     assert found == [*modes, ("static_affine", "static", "affine")]
     assert "mixed" not in pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed"))  # it is static
-
-
-@pytest.mark.slow
-def test_one_artifact_is_the_one_of_a_run(loaded, tiny, tmp_path):
-    recipe = Recipe.of(params())
-    digest, warnings = make_artifact(loaded, tmp_path / "one.pt", recipe)
-    assert warnings[0].startswith(f"asked for {recipe.samples} calibration samples")
-    chosen, _ = recipe.choose(loaded.parts.calibration)
-    calibration = calibrate(tiny, chosen, smooth=recipe.scheme.smooth)
-    policies = {"static": quantize(tiny, recipe.scheme, calibration)}
-    modes = export_policies(tmp_path, tiny, policies, calibration, loaded.parts.choosing)
-    assert modes["static"]["content_hash"] == digest == content_hash(tmp_path / "policy_static.pt")
-    assert modes["static"]["scheme"]["mode"] == "static" and modes["static"]["int8_modules"] > 0
 
 
 def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibration):

@@ -12,6 +12,7 @@ import pytest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.run import run_report as report
+from rover_lib.workshop.run.describe import runs
 
 DEMO = Path(__file__).parents[3] / "results" / "demo"
 PNG = b"\x89PNG a picture"
@@ -40,6 +41,23 @@ def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
     with pytest.raises(RoverError, match=r"policy_static\.pt: not the artifact"):
         report.write(run_dir)
     assert (run_dir / "run.json").read_bytes() == before
+
+
+DRIVES = re.compile(
+    r"ansible-playbook|deploy\.yml|drive\.yml|rover (?:drive|view|release)|lerobot_robot_rover |one to deploy"
+    r"|[Vv]erdict: deploy|put it on the rover|first metres"
+)
+
+
+def test_what_is_not_ready_is_never_asked_to_drive(run_dir):
+    """Nothing that a user sees of its end says so."""
+    guesses = {"warnings": ["this policy is no better than a guess without eyes: the mean plan"]}
+    change_stage(run_dir / "compare.json", "metrics", guesses=guesses)
+    judged = report.write(run_dir)["metrics"]
+    (listed,) = runs(run_dir.parent)
+    seen = {"end": report.text(judged), "page": (run_dir / report.PAGE).read_text(), "list": listed["verdict"]}
+    assert judged["headline"].startswith("not ready to drive") and judged["deploy"] is judged["artifact"] is None
+    assert {where: found.group() for where, words in seen.items() if (found := DRIVES.search(words))} == {}
 
 
 def of_another_run(path):
@@ -92,17 +110,6 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     assert "\n  .venv/bin/rover view runs/mine" in report.text(report.write(run_dir)["metrics"])
     monkeypatch.setenv("PATH", str(programs))
     assert report.typed("rover doctor") == "rover doctor"
-
-
-def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
-    content = report.write(run_dir)["metrics"]
-    for _ in range(2):
-        text = report.write_card(run_dir).read_text()
-    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
-    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
-    (run_dir / "README.md").write_text("mine")
-    with pytest.raises(RoverError, match="is not a card"):
-        report.write_card(run_dir)
 
 
 def test_what_others_wrote_is_no_markup(run_dir):
