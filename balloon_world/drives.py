@@ -265,11 +265,12 @@ def judge(
 
 @dataclass(frozen=True)
 class TrialReport:
-    """How a policy drove. wilson: 95 % interval of the share of hits."""
+    """How a policy drove. wilson: 95 % interval of the share of hits. hit: in each world, by its seed."""
 
     hits: int
     trials: int
     wilson: tuple[float, float]
+    hit: tuple[bool, ...]
 
 
 def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -300,10 +301,9 @@ def run_trials(
         raise TrainingError(what, found=f"{worlds} and {replan_every}")
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
-    hits = 0
-    for world_seed in progress(range(seed, seed + worlds), desc="driving", total=worlds):
-        hits += _hits_in(policy, World(world_seed, left=left), replan_every)
-    return TrialReport(hits, worlds, wilson_interval(hits, worlds))
+    seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
+    hit = tuple(_hits_in(policy, World(world_seed, left=left), replan_every) for world_seed in seeds)
+    return TrialReport(sum(hit), worlds, wilson_interval(sum(hit), worlds), hit)
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
