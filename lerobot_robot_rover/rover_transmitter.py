@@ -109,8 +109,5 @@ class RoverTransmitter(CarPart, Teleoperator):
 
 def _sticks(telemetry: Telemetry | None) -> tuple[int, int, int, int] | None:
     """Return the pulses of steering and throttle, and their periods, in microseconds; None if one was not measured."""
-    if telemetry is None:
-        return None
-    pulses = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
-    sticks = (*pulses, telemetry.receiver_steering_period_us, telemetry.receiver_throttle_period_us)
+    sticks = telemetry.receiver if telemetry else (None,)
     return None if None in sticks else sticks  # type: ignore[return-value]  # mypy does not see what `in` says

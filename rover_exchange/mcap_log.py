@@ -75,7 +75,7 @@ def _of_flight(flight: Flight) -> Iterator[Message]:
         yield _ns(begin_s + t_s), TICK, plain({name: ticks[name][i] for name in Tick._fields})
     for event in flight.events:
         at_ns = _ns(begin_s + event.t_s)
-        row = {"timestamp": _time(at_ns), "level": INFO, "message": str(event), "name": "rover", "file": "", "line": 0}
+        row = {"timestamp": _time(at_ns), "level": INFO, "message": event.text, "name": "rover", "file": "", "line": 0}
         yield at_ns, EVENT, row
     for i, t_s in enumerate(machine["t_s"].tolist()):
         yield _ns(begin_s + t_s), MACHINE, plain({name: machine[name][i] for name in ("temperature_c", "throttled")})

@@ -1,6 +1,5 @@
 """Fixtures that many tests share: a tiny policy, its calibration, its artifacts, and the demo's run."""
 
-import gc
 import os
 import sys
 from collections.abc import Callable
@@ -22,8 +21,6 @@ settings.load_profile("shared machine")
 USERS_CACHE = os.environ.get("ROVER_CACHE", "")  # empty is as unset
 LEFT_MB = 150
 _give_back_from = [0.0]  # megabytes held, above which a test's end frees what is left
-LIBRARY = 200  # modules that were imported since, of which the collector need not see again what they made
-_frozen_with = [0]  # modules
 
 
 def pytest_collection_modifyitems(items):
@@ -83,9 +80,6 @@ def _give_back():
         from rover_lib.workshop.int8.quantize import forget_graphs
 
         forget_graphs()
-        if len(sys.modules) > _frozen_with[0] + LIBRARY:
-            gc.freeze()
-            _frozen_with[0] = len(sys.modules)
         _give_back_from[0] = resident_mb() + LEFT_MB
 
 
@@ -175,27 +169,17 @@ def artifacts(made_once, request) -> dict[str, Path]:
         for scheme in (Scheme("dynamic"), Scheme("static"), mixed):
             path = folder / f"policy_{scheme.mode}.pt"
             export(quantize(thin, scheme, calibration), thin, path, samples=samples, calibration=calibration)
+        static = quantize(thin, Scheme("static"), calibration)
+        export(static, thin, folder / "policy_static.onnx.zip", samples, calibration)
 
     folder = made_once("artifacts", make)
     return {mode: folder / f"policy_{mode}.pt" for mode in ("fp32", "dynamic", "static", "mixed")}
 
 
 @pytest.fixture(scope="session")
-def onnx_static(made_once, request) -> Path:
+def onnx_static(artifacts) -> Path:
     """The same policy as `artifacts["static"]`, exported for ONNX Runtime."""
-
-    def make(folder: Path) -> None:
-        from policies import memory_samples
-
-        from rover_lib.workshop.int8.export import export
-        from rover_lib.workshop.int8.quantize import quantize
-        from rover_lib.workshop.int8.scheme import Scheme
-
-        thin, calibration = request.getfixturevalue("thin")
-        quantized = quantize(thin, Scheme("static"), calibration)
-        export(quantized, thin, folder / "policy_static.onnx.zip", memory_samples(4, seed=1), calibration)
-
-    return made_once("onnx", make) / "policy_static.onnx.zip"
+    return artifacts["static"].with_name("policy_static.onnx.zip")
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,6 @@
 """Recordings for tests: a real one, if there is one, and small ones that are made here."""
 
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,15 @@ def real_episode() -> Path:
 def real_recordings() -> Path:
     """Return the folder of several whole real recordings in shared/. Skips the test if there is none."""
     return _shared("recordings/episode_*/frames", "several real recordings").parents[1]
+
+
+def content_of(folder: Path) -> dict[str, Any]:
+    """Return what an episode's file says."""
+    return json.loads((folder / "episode_data.json").read_text())
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
 
 
 def _shared(pattern: str, what: str) -> Path:

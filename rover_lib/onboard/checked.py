@@ -46,11 +46,6 @@ def of_type(*types: type) -> Rule:
     return Rule(lambda value: isinstance(value, types), " or ".join(t.__name__ for t in types))
 
 
-def optional(rule: Rule) -> Rule:
-    """The same rule for a value that may also be None."""
-    return Rule(lambda value: value is None or rule.holds(value), f"{rule.words}, or None")
-
-
 def broken_rule(values: Mapping[str, Any], rules: Mapping[str, Rule]) -> tuple[str, str, str] | None:
     """Return the first name whose value breaks its rule, the rule in words, and the value; None if all hold.
 

@@ -149,7 +149,7 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
         if not parts:
             click.echo(f"{out_dir}: nothing to finish")
         ctx.exit(1 if failed else 0)
-    options |= {"rate_hz": hz, "status": sys.stderr, "notify": notify}
+    options |= {"rate_hz": hz, "notify": notify}
     for report in record_episodes(folder=out_dir, **options):
         click.echo(str(report))
     ctx.exit(1 if report.fault else 0)
@@ -448,7 +448,7 @@ def sum_up(file: Path, drive: int, as_json: bool) -> Any:
     summary = flight.summary()
     show(summary if as_json else {k: v for k, v in summary.items() if k != "events"}, as_json)
     for event in () if as_json else flight.events:
-        click.echo(f"{event.t_s:9.2f} s  {event}")
+        click.echo(f"{event.t_s:9.2f} s  {event.text}")
     return flight
 
 

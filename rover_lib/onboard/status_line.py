@@ -8,7 +8,6 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable
-from typing import TextIO
 
 EVERY_S, PLAIN_EVERY_S = 0.25, 10.0  # on a terminal, and elsewhere
 QUEUE_LINES = 256
@@ -16,16 +15,15 @@ CLOSE_S = 0.5  # longest wait for a terminal that was stopped
 
 
 class StatusLine(logging.Handler):
-    """One line of status (what callback returns) on a stream, overwritten on a terminal, inside the context.
+    """One line of status (what callback returns) on standard error, overwritten on a terminal, inside the context.
 
     As a handler, it shows log records above it; of a terminal that was stopped, some are lost.
     """
 
-    def __init__(self, callback: Callable[[], str], stream: TextIO | None = None, every_s: float | None = None):
+    def __init__(self, callback: Callable[[], str]):
         super().__init__()
-        self._callback, self._stream = callback, stream or sys.stderr
-        self._terminal = self._stream.isatty()
-        self._every_s = every_s or (EVERY_S if self._terminal else PLAIN_EVERY_S)
+        self._callback, self._terminal = callback, sys.stderr.isatty()
+        self._every_s = EVERY_S if self._terminal else PLAIN_EVERY_S
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: the end
         self._thread = threading.Thread(target=self._run, name="status line", daemon=True)
 
@@ -49,17 +47,11 @@ class StatusLine(logging.Handler):
                 text = f"{self._status() if line is None else line}\n"
             except queue.Empty:
                 text = self._status() + ("" if self._terminal else "\n")
-            with contextlib.suppress(OSError, ValueError):  # nobody reads the stream any more
-                self._write(f"\r\x1b[K{text}" if self._terminal else text)
+            text = f"\r\x1b[K{text}" if self._terminal else text
+            with contextlib.suppress(OSError, ValueError):  # nobody reads standard error any more
+                # Not through its buffer: if this thread got stuck with its lock, the program could not end.
+                os.write(sys.stderr.fileno(), text.encode(errors="replace"))
 
     def _status(self) -> str:
         text = self._callback()
         return text[: shutil.get_terminal_size().columns - 1] if self._terminal else text
-
-    def _write(self, text: str) -> None:
-        try:
-            fd = self._stream.fileno()
-        except (OSError, ValueError):  # a notebook's
-            self._stream.write(text)
-        else:  # not through the stream's buffer: if this thread got stuck with its lock, the program could not end
-            os.write(fd, text.encode(errors="replace"))

@@ -17,13 +17,6 @@ def rover(*args):
     return CliRunner().invoke(main, [str(a) for a in args])
 
 
-def test_each_command_has_help_and_they_are_few():
-    for group in (main, main.commands["world"], main.commands["release"]):
-        for command in group.commands.values():
-            assert command.help and command.get_short_help_str()
-    assert len(main.commands) <= 21 and rover("--help").exit_code == 0
-
-
 def test_inspects_each_kind_of_file(artifacts, tiny_file):
     content = json.loads(rover("inspect", artifacts["static"], "--json").output)
     assert content["artifact"]["mode"] == "static" and len(content["artifact"]["content_hash"]) == 64
@@ -88,7 +81,6 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
         assert all(v["n"] == 2 for v in timed.values())
     assert set(read_stage(out, "benchmark")["inputs"]) == {*map(str, files)}
     assert str(files[0]) in rover("benchmark", *files, "--iterations", 1, *few).stdout
-    assert rover("benchmark", files[0], files[0]).exit_code == 1  # given twice
 
 
 @pytest.mark.slow

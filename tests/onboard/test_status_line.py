@@ -11,8 +11,9 @@ import pytest
 def test_a_program_ends_though_its_terminal_is_stuck():
     code = (
         "import logging, time\n"
-        "from rover_lib.onboard.status_line import StatusLine\n"
-        "with StatusLine(lambda: 'x' * 3000, every_s=0.001) as status:\n"
+        "from rover_lib.onboard import status_line\n"
+        "status_line.PLAIN_EVERY_S = 0.001\n"
+        "with status_line.StatusLine(lambda: 'x' * 3000) as status:\n"
         "    time.sleep(0.3)\n"
         "    for _ in range(1000):\n"
         "        status.handle(logging.makeLogRecord({'msg': 'y' * 500}))\n"

@@ -9,13 +9,21 @@ import pytest
 
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import StandIn
-from lab.driving.policy import PLAIN, pictures
+from lab.driving.policy import PLAIN, make_artifact, pictures
 
 
 @pytest.fixture(scope="session")
 def noise():
     """Pictures of a living camera."""
     return pictures(PLAIN)
+
+
+@pytest.fixture(scope="session")
+def artifact(tmp_path_factory):
+    """A constant one, whose process starts fast."""
+    path = tmp_path_factory.mktemp("constant") / "policy_fp32.pt"
+    make_artifact(path, camera="cam_front")
+    return path
 
 
 @dataclass

@@ -23,7 +23,7 @@ from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import STOPPED, Observation, judge, most_throttle_us
-from lab.driving.policy import PLAIN, make_artifact, pictures
+from lab.driving.policy import PLAIN, pictures
 from lerobot_robot_rover.line import ENDING
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
@@ -190,13 +190,6 @@ def test_a_humans_episodes_are_recorded_read_and_replayed(eyes, plugin, tmp_path
 
 
 # ---- a policy drives, and somebody ends it
-
-
-@pytest.fixture(scope="module")
-def artifact(tmp_path_factory):
-    path = tmp_path_factory.mktemp("constant") / "policy_fp32.pt"
-    make_artifact(path, camera="cam_front")
-    return path
 
 
 @pytest.mark.emulated

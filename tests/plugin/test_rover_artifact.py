@@ -11,7 +11,6 @@ from click.testing import CliRunner
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
-from lab.driving.policy import make_artifact
 from lerobot_robot_rover import RoverArtifactConfig, modeling_rover_artifact
 from lerobot_robot_rover.__main__ import main, pack
 from lerobot_robot_rover.line import ENDING
@@ -28,14 +27,6 @@ def dataset(fps=30, camera="cam_front", size=(36, 64)):
     picture = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
     features = {"observation.state": NUMBERS, "action": NUMBERS, f"observation.images.{camera}": picture}
     return SimpleNamespace(fps=fps, features=features, stats={})
-
-
-@pytest.fixture(scope="module")
-def artifact(tmp_path_factory):
-    """A constant one, whose process starts fast."""
-    path = tmp_path_factory.mktemp("constant") / "policy_fp32.pt"
-    make_artifact(path, camera="cam_front")
-    return path
 
 
 def test_other_files_are_refused(tmp_path):

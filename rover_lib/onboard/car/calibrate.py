@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rover_lib.onboard.car.car import DEFAULT, FAST_PULSE_MAX_US, PERIOD_MIN_US, Car
-from rover_lib.onboard.car.protocol import Telemetry
 from rover_lib.onboard.errors import CarError
 
 if TYPE_CHECKING:
@@ -97,17 +96,14 @@ def _find(link: "ServoLink", sleep: Callable[[float], None]) -> None:
         link.tell(kind)
         for _ in range(round(LOOK_S / STEP_S)):
             sleep(STEP_S)
-            pulses = _pulses(link.latest())
+            status = link.latest()
+            pulses = status.receiver[:2] if status else (None, None)
             seen |= {name for name, us in zip(NAMES, pulses, strict=True) if us is not None}
             if None not in pulses:
                 return
     silent = " and ".join(name for name in NAMES if name not in seen)
     remedy = "is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?"
     raise CarError(f"no pulse of {silent or 'both channels at a time'} came from the receiver", remedy=remedy)
-
-
-def _pulses(status: Telemetry | None) -> tuple[int | None, int | None]:
-    return (status.receiver_steering_us, status.receiver_throttle_us) if status else (None, None)
 
 
 def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list[int]:
@@ -119,13 +115,12 @@ def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list
     for _ in range(round(MEASURE_S / STEP_S)):
         sleep(STEP_S)
         status = link.latest()
-        for name, pulse_us in zip(NAMES, _pulses(status), strict=True):
+        assert status, "it was received a moment ago"
+        for name, pulse_us in zip(NAMES, status.receiver[:2], strict=True):
             if pulse_us is None:
                 what = f"no pulse of {name} {where} that a servo would take, 800 to 2200 us"
                 raise CarError(what, remedy="set the transmitter's end points to 100 %, and keep it on")
-        assert status is not None
-        periods = status.receiver_steering_period_us or 0, status.receiver_throttle_period_us or 0
-        rows.append([us or 0 for us in (*_pulses(status), *periods)])
+        rows.append([us or 0 for us in status.receiver])
     columns = list(zip(*rows, strict=True))
     for name, column in zip(NAMES, columns, strict=False):
         if max(column) - min(column) > STEADY_US:

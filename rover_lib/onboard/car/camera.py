@@ -238,9 +238,9 @@ class Camera:
             self._changed.notify_all()
 
 
-def path_of(source: str, dev: Path = Path("/dev")) -> Path:
-    """Return the path of a camera's source: a number N means videoN in `dev`."""
-    return dev / f"video{source}" if source.isdigit() else Path(source)
+def path_of(source: str) -> Path:
+    """Return the path of a camera's source: a number N means /dev/videoN."""
+    return Path(f"/dev/video{source}" if source.isdigit() else source)
 
 
 def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:

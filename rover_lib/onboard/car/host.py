@@ -6,7 +6,6 @@ psutil knows neither a process's peak memory on Linux nor what a Raspberry Pi's 
 import errno
 import os
 import re
-import resource
 import socket
 import subprocess
 import time
@@ -61,8 +60,7 @@ class Host:
         for line in (_text_in(self.proc_root / "self/status") or "").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
-        # second, because a child inherits its parent's, while VmHWM starts anew
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6 or None
+        return None
 
     def core_ticks(self) -> list[tuple[int, int]] | None:
         """Return (busy, total) ticks since the machine started for each core; None if they are not reported."""

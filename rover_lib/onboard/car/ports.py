@@ -4,17 +4,18 @@ from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
 
+DEV = Path("/dev")
 PROVISIONED = "rover-arduino"  # the name that provisioning gives it
 KINDS = ("ttyACM*", "ttyUSB*")
 
 
-def list_ports(dev: Path = Path("/dev")) -> dict[Path, str]:
+def list_ports(dev: Path = DEV) -> dict[Path, str]:
     """Return each USB serial port, with its name in serial/by-id ("" where it has none)."""
     names = {link.resolve(): link.name for link in sorted((dev / "serial" / "by-id").glob("*"))}
     return {port: names.get(port.resolve(), "") for kind in KINDS for port in sorted(dev.glob(kind))}
 
 
-def find_port(dev: Path = Path("/dev")) -> str:
+def find_port(dev: Path = DEV) -> str:
     """Return the port of the only Arduino: the provisioned name, else the only USB serial port.
 
     Raises RoverError if there is none, or several, which it lists.

@@ -102,6 +102,12 @@ class Telemetry:
         """Who drives and why, in words."""
         return f"{self.state.name.lower()}: {REASONS[self.reason]}"
 
+    @property
+    def receiver(self) -> tuple[int | None, int | None, int | None, int | None]:
+        """The transmitter's pulses of steering and throttle, and then their periods."""
+        pulses = self.receiver_steering_us, self.receiver_throttle_us
+        return *pulses, self.receiver_steering_period_us, self.receiver_throttle_period_us
+
 
 def frame(body: str) -> bytes:
     """Return the line for a body: the body, its CRC-32 and the line feed."""

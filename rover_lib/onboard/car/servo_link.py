@@ -90,13 +90,11 @@ class ServoLink:
     Arduino resets itself, the link goes on, but the Arduino ignores drive commands until arm().
     """
 
-    def __init__(
-        self, port: str, *, car: Car | None = None, boot_s: float = BOOT_S, clock: Callable[[], float] = time.monotonic
-    ):
+    def __init__(self, port: str, *, car: Car | None = None, clock: Callable[[], float] = time.monotonic):
         """port: "" means the only Arduino's. car: None means this machine's. Raises RoverError if either is unclear."""
         self.port, self.car = port or find_port(), car or this_car()
         self.calibration = self.car.pwm
-        self.boot_s, self._clock = boot_s, clock
+        self._clock = clock
         self._gamepad: Gamepad | None = None
         self._relayed_s = 0.0
         self._told_boot: int | None = None  # the start in which the Arduino learned of the car
@@ -126,7 +124,7 @@ class ServoLink:
         """Open the port for this program alone, wait for the hello and a first status, and tell the Arduino of the car.
 
         The first opening after the Arduino was plugged in resets most boards; a later one does not interrupt it.
-        Raises LinkError for a port that cannot be opened, no hello within `boot_s` seconds, another firmware, or one
+        Raises LinkError for a port that cannot be opened, no hello within BOOT_S, another firmware, or one
         that refuses this car. Raises CarError as open_gamepad() does.
         """
         try:
@@ -153,11 +151,11 @@ class ServoLink:
         self._asked = opened = self._clock()
         while not (hello := self._await(lambda: self.hello, REPEAT_S)):
             now, running = self._clock(), self._telemetry
-            if now - opened > self.boot_s:
+            if now - opened > BOOT_S:
                 remedy = f"is it the rover's, and is the firmware on it (make -C firmware flash PORT={self.port})?"
-                raise LinkError(f"{self.port}: no hello from an Arduino within {self.boot_s:g} s", remedy=remedy)
+                raise LinkError(f"{self.port}: no hello from an Arduino within {BOOT_S:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
-            due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else self.boot_s / 2
+            due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else BOOT_S / 2
             if now - opened > due and now - self._asked > HELLO_EVERY_S / 2:
                 self._asked = now
                 self._write(frame(">Q"))

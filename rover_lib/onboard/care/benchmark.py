@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -72,24 +73,6 @@ def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int
             metrics["artifacts"][name]["peak_memory_mb"] = peak_mb
     if (peak_mb := metrics["artifacts"][metrics["main"]]["peak_memory_mb"]) is not None:
         metrics["peak_memory_mb"] = peak_mb
-
-
-def latency_metrics(latencies_ms: Sequence[float]) -> dict[str, float | int]:
-    """Return the distribution of one policy's latencies, and the rates that follow from it.
-
-    control_rate_hz: the highest rate at which 95 % of the inferences end within their period (1000 / p95).
-    """
-    x = np.asarray(latencies_ms, float)
-    mean_ms, p95_ms = float(x.mean()), float(np.percentile(x, 95))
-    return {
-        **{f"latency_{name}_ms": float(np.percentile(x, q)) for name, q in PERCENTILES.items()},
-        "latency_min_ms": float(x.min()),
-        "latency_mean_ms": mean_ms,
-        "latency_max_ms": float(x.max()),
-        "n": len(x),
-        "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
-        "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
-    }
 
 
 def benchmark(
@@ -160,21 +143,19 @@ def benchmark(
     return metrics
 
 
+@dataclass
 class _Run:
     """The timed part of one benchmark."""
 
-    def __init__(
-        self,
-        policies: Mapping[str, Any],
-        frames: Sequence[Any],
-        state: np.ndarray,
-        host: Host,
-        wall: Callable[[], float],
-        cpu: Callable[[], float],
-    ):
-        self.policies, self.frames, self.state = policies, frames, state
-        self.host, self.wall, self.cpu = host, wall, cpu
-        self.latencies_ms: dict[str, list[float]] = {name: [] for name in policies}
+    policies: Mapping[str, Any]
+    frames: Sequence[Any]
+    state: np.ndarray
+    host: Host
+    wall: Callable[[], float]
+    cpu: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        self.latencies_ms: dict[str, list[float]] = {name: [] for name in self.policies}
         self.readings: list[dict[str, Any]] = []
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
@@ -193,7 +174,10 @@ class _Run:
                 self.readings.append(self.host.reading())
                 read_s = passed_s
             for k in range(len(names)):
-                self._time(names[(i + k) % len(names)], self.frames[i % len(self.frames)])
+                name, frame = names[(i + k) % len(names)], self.frames[i % len(self.frames)]
+                begin_s = self.wall()
+                self.policies[name].predict_chunk(frame, self.state)
+                self.latencies_ms[name].append((self.wall() - begin_s) * 1000)
         self.wall_s, self.process_s = self.wall() - start_s, self.cpu() - cpu_start_s
         self.readings.append(self.host.reading())
         after = self.host.core_ticks()
@@ -202,13 +186,23 @@ class _Run:
             self.per_core_pct = [100 * busy / total if total > 0 else 0.0 for busy, total in spans]
 
     def metrics_of(self, name: str) -> dict[str, Any]:
-        """Return the figures of one policy: those measured, and those known from its manifest and file."""
-        policy, times_ms = self.policies[name], self.latencies_ms[name]
+        """Return the figures of one policy: those measured, and those known from its manifest and file.
+
+        control_rate_hz: the highest rate at which 95 % of the inferences end within their period (1000 / p95).
+        """
+        policy, times_ms = self.policies[name], np.asarray(self.latencies_ms[name], float)
+        mean_ms, p95_ms = float(times_ms.mean()), float(np.percentile(times_ms, 95))
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
         mode, gmac = manifest.get("mode"), manifest.get("gmac")
         return {
-            **latency_metrics(times_ms),
+            **{f"latency_{name}_ms": float(np.percentile(times_ms, q)) for name, q in PERCENTILES.items()},
+            "latency_min_ms": float(times_ms.min()),
+            "latency_mean_ms": mean_ms,
+            "latency_max_ms": float(times_ms.max()),
+            "n": len(times_ms),
+            "throughput_fps": 1000 / mean_ms if mean_ms > 0 else math.inf,
+            "control_rate_hz": 1000 / p95_ms if p95_ms > 0 else math.inf,
             "peak_memory_mb": None,
             "floor_ms": floor_ms(gmac, mode) if mode else None,
             "gmac": gmac,
@@ -234,9 +228,3 @@ class _Run:
             "clock_mhz": min(clocks_mhz, default=None),
             "throttled": self.readings[-1]["throttled"],
         }
-
-    def _time(self, name: str, frame: Any) -> None:
-        predict = self.policies[name].predict_chunk
-        start_s = self.wall()
-        predict(frame, self.state)
-        self.latencies_ms[name].append((self.wall() - start_s) * 1000)

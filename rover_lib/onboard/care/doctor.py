@@ -24,8 +24,8 @@ from rover_lib.onboard.car.camera import Camera, Frame, check_shape, path_of, si
 from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
 from rover_lib.onboard.car.host import Host, throttled_means
-from rover_lib.onboard.car.ports import find_port, list_ports
-from rover_lib.onboard.car.servo_link import BOOT_S, PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.car.ports import DEV, find_port, list_ports
+from rover_lib.onboard.car.servo_link import PROTOCOL_VERSION, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import blank, frozen
@@ -74,22 +74,20 @@ def examine(
     rate_hz: float = 30.0,
     log_folder: Path | None = None,
     host: Host | None = None,
-    dev: Path = Path("/dev"),
-    boot_s: float = BOOT_S,
 ) -> Iterator[Check]:
     """Run all checks, and yield each result as soon as it is known. Raises nothing: a check that breaks has failed.
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go [this folder].
     """
     host = host or Host()
-    device = path_of(str(camera), dev)
+    device = path_of(str(camera))
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
-    if device.is_relative_to(dev):  # otherwise it is a file or a pipe, and no camera needs to be there
+    if device.is_relative_to(DEV):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device)
     checks |= {
         "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
-        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports(dev)), dev / "none"))),
-        "Arduino": lambda: arduino(port or find_port(dev), boot_s=boot_s),
+        "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports()), DEV / "none"))),
+        "Arduino": lambda: arduino(port or find_port()),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(artifact),
         "artifact": lambda: policy(artifact),
@@ -127,18 +125,12 @@ def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
     return None
 
 
-def camera_rate(
-    source: Path | str,
-    seen: tuple[int, int] | None = None,
-    *,
-    rate_hz: float = 30.0,
-    open_camera: Callable[..., Any] = Camera,
-) -> Iterator[Check]:
+def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate_hz: float = 30.0) -> Iterator[Check]:
     """Measure for a second what the camera really delivers: frame rate, size, and whether anything can be seen.
 
     seen: (width, height) of the pictures that the policy was made with. Raises CameraError for another shape.
     """
-    with open_camera(source, rate_hz=rate_hz, **({"size": size_like(*seen)} if seen else {})) as camera:
+    with Camera(source, rate_hz=rate_hz, size=size_like(*(seen or (16, 9)))) as camera:
         first = _newest_after(camera, SETTLE_S)
         last = _newest_after(camera, MEASURE_S)
         clock = camera.time_stamps
@@ -168,9 +160,9 @@ def _newest_after(camera: Any, seconds: float) -> Frame:
     return last
 
 
-def arduino(port: str, *, boot_s: float = BOOT_S) -> Iterator[Check]:
+def arduino(port: str) -> Iterator[Check]:
     """Check that the port is free, what answers on it and how fast, and the transmitter. Raises LinkError."""
-    with ServoLink(port, boot_s=boot_s) as link:
+    with ServoLink(port) as link:
         firmware = link.hello.firmware if link.hello else "unknown"
         yield Check("Arduino", "ok", f"{port}: firmware {firmware}, protocol {PROTOCOL_VERSION}")
         times_ms = [link.round_trip_s() * 1000 for _ in range(ROUND_TRIPS)]
@@ -184,7 +176,7 @@ def arduino(port: str, *, boot_s: float = BOOT_S) -> Iterator[Check]:
 
 
 def _transmitter(link: ServoLink) -> Check:
-    steering_us, throttle_us = _pulses(_soon(link, lambda status: None not in _pulses(status), SIGNAL_S))
+    steering_us, throttle_us = _soon(link, lambda status: None not in status.receiver[:2], SIGNAL_S).receiver[:2]
     if steering_us is None or throttle_us is None:
         if link.car.human == "gamepad":
             return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
@@ -197,12 +189,12 @@ def _transmitter(link: ServoLink) -> Check:
     return warn_unless(rests, "transmitter", found, "let go of the throttle stick")
 
 
-def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S) -> Iterator[Check]:
+def receiver(port: str, ask: Callable[[str], object]) -> Iterator[Check]:
     """Lead a human once through the steps of arming, and see what the receiver sends while its transmitter is off.
 
     ask: tells the human what to do, and returns when it is done. Nothing is armed. Raises LinkError like ServoLink.
     """
-    with ServoLink(port, boot_s=boot_s) as link:
+    with ServoLink(port) as link:
         ask("Jack up the car. Switch the transmitter on, and let go of both sticks.")
         check = _transmitter(link)
         yield check
@@ -215,8 +207,8 @@ def receiver(port: str, ask: Callable[[str], object], *, boot_s: float = BOOT_S)
             return
         yield Check("arming", "ok", "transmitter on, throttle at rest, stick wiggled: it could be armed for 30 s now")
         ask("Switch the transmitter off.")
-        after = _pulses(_soon(link, lambda status: None in _pulses(status), SIGNAL_S))
-        yield _failsafe(after, link.calibration.throttle.pulse_us(0.0))
+        after = _soon(link, lambda status: None in status.receiver[:2], SIGNAL_S)
+        yield _failsafe(after.receiver[:2], link.calibration.throttle.pulse_us(0.0))
         ask("Switch the transmitter on again.")
 
 
@@ -229,10 +221,6 @@ def _soon(link: ServoLink, condition: Callable[[Telemetry], bool], seconds: floa
         if condition(telemetry) or time.monotonic() > end:
             return telemetry
         time.sleep(0.02)
-
-
-def _pulses(telemetry: Telemetry) -> tuple[int | None, int | None]:
-    return telemetry.receiver_steering_us, telemetry.receiver_throttle_us
 
 
 def _failsafe(after: tuple[int | None, ...], rest_us: int) -> Check:

@@ -140,7 +140,7 @@ class Feed:
     def _send(self, phase: str, text: str, report: Report, camera: Camera, message: dict[str, Any]) -> bool:
         try:
             shown, picture = self._picture(camera)
-            events = [[round(event.t_s, 2), str(event)[:200]] for event in tuple(self._log.recent)]
+            events = [[round(event.t_s, 2), event.text[:200]] for event in tuple(self._log.recent)]
             about = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
             line = about | {"missed": report.missed, "machine": self._log.machine, "events": events} | message | shown
             return self._put(json.dumps(line).encode() + b"\n", picture)

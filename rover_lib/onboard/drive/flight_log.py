@@ -79,9 +79,6 @@ class Event(NamedTuple):
     t_s: float
     text: str
 
-    def __str__(self) -> str:
-        return self.text
-
 
 def log_limits() -> tuple[int, int]:
     """Return FlightLog's max_bytes and keep from params.yml. Raises ParamsError."""

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,7 +61,7 @@ def open_flight_log(options: DriveOptions, settings: Settings, report: Report) -
     header: dict[str, Any] = {"artifact": str(options.artifact), "hz": options.hz, **vars(settings)}
     if not (car := this_car()).drives_like(Car()):
         header["car"] = car.description()
-    with StatusLine(lambda: report.status, sys.stderr) as status:
+    with StatusLine(lambda: report.status) as status:
         logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status], force=True)
         with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
             yield log

@@ -187,8 +187,8 @@ class Follower:
 class Commanded:
     """The latest commands, for the policy's state. One thread may add commands while others ask for the state."""
 
-    def __init__(self, keep_s: float = 3.0, rate_hz: float = 100.0):
-        self._sent: deque[tuple[float, float, float]] = deque(maxlen=max(2, int(keep_s * rate_hz)))
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, float, float]] = deque(maxlen=300)  # three seconds at 100 Hz
 
     def add(self, at_s: float, steering: float, throttle: float) -> None:
         self._sent.append((at_s, steering, throttle))

@@ -114,8 +114,9 @@ class TakeoverRecorder:
                 boot, heard_s = telemetry.boot, max(heard_s, telemetry.host_s)
                 driver = driver_by(telemetry)
                 counts[driver] += 1
-                self._write(telemetry, driver)
-                if None not in (telemetry.receiver_steering_us, telemetry.receiver_throttle_us):
+                self._last_s = telemetry.host_s
+                self.recorder.control(telemetry.host_s, telemetry.uptime_ms, *telemetry.receiver, driver=driver)
+                if None not in telemetry.receiver[:2]:
                     signal_s = heard_s
                 if not _sticks_near(telemetry, rest_us, (STEERING_REST_US, THROTTLE_REST_US)):
                     rest_s = None
@@ -134,14 +135,7 @@ class TakeoverRecorder:
             tick = max(tick + 1, int((now_s - start_s) * rate_hz))
             stop.wait(max(0.0, start_s + tick / rate_hz - clock()))
 
-    def _write(self, t: Telemetry, driver: str) -> None:
-        self._last_s = t.host_s
-        sticks = t.receiver_steering_us, t.receiver_throttle_us
-        periods = t.receiver_steering_period_us, t.receiver_throttle_period_us
-        self.recorder.control(t.host_s, t.uptime_ms, *sticks, *periods, driver=driver)
-
 
 def _sticks_near(telemetry: Telemetry, at_us: tuple[int, int], bands_us: tuple[float, float]) -> bool:
-    sticks_us = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
-    near = zip(sticks_us, at_us, bands_us, strict=True)
+    near = zip(telemetry.receiver[:2], at_us, bands_us, strict=True)
     return all(us is not None and abs(us - middle_us) <= band_us for us, middle_us, band_us in near)

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
@@ -239,14 +239,12 @@ def record(
     max_seconds: float | None = None,
     stop: threading.Event | None = None,
     label: str = "",
-    status: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
 ) -> RecordReport:
     """Record one episode of a human who drives, until `stop` is set or max_seconds are over.
 
     At each tick of rate_hz, the Arduino's newest status is recorded as a control, none twice. If something else ends
-    the episode, it is in the report's `fault`. status: a stream for a status line. Raises EpisodeError if recording
-    cannot begin.
+    the episode, it is in the report's `fault`. Raises EpisodeError if recording cannot begin.
     """
     stop = stop or threading.Event()
     lost = 0, 0
@@ -254,14 +252,13 @@ def record(
         about = About(label, arduino_port=link.port, source="human", car=link.car)
         recorder = stack.enter_context(Recorder(folder, camera, about, rate_hz=rate_hz, clock=clock))
         start = heard_s = recorder.start_s  # earlier statuses do not belong to this episode
-        if status:
 
-            def words() -> str:
-                return f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames"
+        def words() -> str:
+            return f"{clock() - start:.0f} s, {recorder.controls} controls, {recorder.frames} frames"
 
-            line = stack.enter_context(StatusLine(words, status))
-            _log.addHandler(line)
-            stack.callback(_log.removeHandler, line)
+        line = stack.enter_context(StatusLine(words))
+        _log.addHandler(line)
+        stack.callback(_log.removeHandler, line)
         tick = 0
         while not stop.is_set() and recorder.failure is None:
             now = clock()
@@ -277,9 +274,8 @@ def record(
                 break
             if telemetry is not None and telemetry.host_s > heard_s:
                 heard_s = telemetry.host_s
-                steering, throttle = telemetry.receiver_steering_us, telemetry.receiver_throttle_us
-                periods = telemetry.receiver_steering_period_us, telemetry.receiver_throttle_period_us
-                recorder.control(heard_s, telemetry.uptime_ms, steering, throttle, *periods)
+                recorder.control(heard_s, telemetry.uptime_ms, *telemetry.receiver)
+                steering, throttle = telemetry.receiver[:2]
                 lost = lost[0] + (steering is None), lost[1] + (throttle is None)
             tick = max(tick + 1, int((now - start) * rate_hz))
             stop.wait(max(0.0, start + tick / rate_hz - clock()))

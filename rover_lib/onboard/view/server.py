@@ -85,8 +85,7 @@ class View:
     address: where browsers reach it. place: the socket to which drives connect; None if a simulation is shown.
     drive_user: another user whose drives are accepted, besides this user's and root's. car: whose drives are shown;
     None means this machine's. ask: takes what a simulation's page asks for; None for a car. script: of such a page,
-    after that of every page. Raises RoverError for an
-    unknown user, and CarError and ParamsError like this_car() and CarShape.of().
+    after that of every page. Raises RoverError for an unknown user, and CarError and ParamsError like CarShape.of().
     """
 
     def __init__(

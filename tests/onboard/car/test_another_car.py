@@ -14,7 +14,7 @@ from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import About, EpisodeWriter, json_controls, read_car_of
+from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 CRAWLER = read_car(Path(__file__).parents[3] / "lab" / "cars" / "crawler.yml")
@@ -34,7 +34,8 @@ def episode(folder, car, name="episode_20260101_000000"):
 def test_a_recording_carries_its_car(tmp_path):
     folder = episode(tmp_path, CRAWLER)
     assert read_car_of(folder) == CRAWLER and read_car_of(episode(tmp_path / "first", Car())) == Car()
-    assert {row["throttle_raw_us"] for row in json_controls(folder / "episode_data.json")} == {1550, 1450}
+    controls = json.loads((folder / "episode_data.json").read_text())["control_samples"]
+    assert {row["throttle_raw_us"] for row in controls} == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
     assert (actions[:, 1].min(), actions[:, 1].max(), actions[0, 0]) == pytest.approx((-0.1, 0.1, 0.5))
 
@@ -69,9 +70,18 @@ def test_plans_with_reverse():
         assert follower.command(0.0).throttle == throttle
 
 
-def test_the_cap_of_a_car_with_reverse():
-    said, link = [], Mock(calibration=CRAWLER.pwm)
-    link.lower_cap.return_value = Mock(cap_us=1550)
-    assert arm_capped(link, 0.2, said.append) is link.arm.return_value
-    assert abs(link.lower_cap.call_args[0][0] - 1500) == 100
-    assert len(said) == 1 and "at most throttle 0.10 (1550 us)" in said[0]
+@pytest.mark.parametrize(
+    ("car", "limit", "asked_us", "gets_us", "told"),
+    [
+        (Car(), 0.1, (179,), 179, None),
+        (Car(), 0.2, (238,), 200, "at most throttle 0.14 (200 us)"),
+        (CRAWLER, 0.2, (1400, 1600), 1550, "at most throttle 0.10 (1550 us)"),  # the farther of the two directions
+    ],
+)
+def test_the_arduino_is_told_what_a_drive_may_use(car, limit, asked_us, gets_us, told):
+    """And the human, where it gives less than that: it was cut in silence."""
+    said, link = [], Mock(calibration=car.pwm)
+    link.lower_cap.return_value = Mock(cap_us=gets_us)
+    assert arm_capped(link, limit, said.append) is link.arm.return_value
+    assert link.lower_cap.call_args[0][0] in asked_us
+    assert [told in text for text in said] == [True] * (told is not None)

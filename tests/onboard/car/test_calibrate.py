@@ -57,14 +57,6 @@ class Desk:
         return measure(self, self.ask, sleep=self.sleep, **more)
 
 
-def test_a_crawler():
-    desk = Desk(CRAWLER, (20010, 19980))
-    car = desk.measure(name="crawler", wheelbase_m=0.3)
-    assert car.numbers == (20010, 1012, 1504, 1996, 19980, 1004, 1496, 1990, 99)
-    assert (car.name, car.wheelbase_m, car.reverses) == ("crawler", 0.3, True)
-    assert "unplug the motor" in desk.asked[0] and len(desk.asked) == 6
-
-
 def test_an_inverted_transmitter():
     """Positive steering is the longer pulse's side, as on the recorded car, or what an earlier car.yml said."""
     desk = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990})
@@ -117,11 +109,13 @@ def run(monkeypatch, tmp_path):
 
 
 def test_the_command_writes_what_it_measured_and_replaces_nothing_without_force(run):
-    desk = Desk(CRAWLER)
+    desk = Desk(CRAWLER, (20010, 19980))
     result, path = run(desk, "--name", "crawler", "--field-of-view-deg", "100", "--wheelbase-m", "0.3")
     assert result.exit_code == 0, result.output
     car = read_car(path)
-    assert (car.name, car.field_of_view_deg, car.wheelbase_m, car.cap_us) == ("crawler", 100, 0.3, 99)
+    assert (car.name, car.field_of_view_deg, car.wheelbase_m, car.reverses) == ("crawler", 100, 0.3, True)
+    assert car.numbers == (20010, 1012, 1504, 1996, 19980, 1004, 1496, 1990, 99)
+    assert "unplug the motor" in desk.asked[0] and len(desk.asked) == 6
     assert desk.board.hello.car == car.id  # and not one of the cars that were tried before
     path.write_text(yaml_of(Car()))
     for options, word in (((), "--force replaces it"), (("--wheelbase-m", "30", "--force"), "wheelbase_m")):

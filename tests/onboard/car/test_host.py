@@ -9,8 +9,7 @@ from rover_lib.onboard.car.host import throttled_means
 
 def test_what_a_host_cannot_tell_is_none(bare_host):
     assert bare_host.reading() == {"temperature_c": None, "clock_mhz": None, "throttled": None}
-    assert bare_host.core_ticks() is None
-    assert bare_host.process_peak_memory_mb() > 10  # as the operating system counts it
+    assert bare_host.core_ticks() is bare_host.process_peak_memory_mb() is None
 
 
 def test_what_a_pi_tells(pi_host):

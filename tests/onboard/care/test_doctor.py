@@ -89,11 +89,12 @@ def test_the_real_frame_rate(tmp_path, monkeypatch, camera, verdict, found):
     source = tmp_path / "video0"
     source.touch()
     monkeypatch.setattr(doctor, "time", camera)
-    check = only(doctor.camera_rate(source, open_camera=camera))
+    monkeypatch.setattr(doctor, "Camera", camera)
+    check = only(doctor.camera_rate(source))
     assert check.verdict == verdict and found in check.found
     assert bool(check.remedy) == (verdict != "ok")
     with pytest.raises(CameraError):  # the policy has seen another shape than it gives
-        list(doctor.camera_rate(source, (64, 48), open_camera=camera))
+        list(doctor.camera_rate(source, (64, 48)))
     assert camera.size == (640, 480)
 
 
@@ -120,7 +121,7 @@ def talking(receiver):
 def test_an_arduino(monkeypatch, receiver, verdict, found):
     monkeypatch.setattr(doctor, "SIGNAL_S", 0.1)
     with board_of(answer=talking(receiver)) as board:
-        checks = {c.name: c for c in doctor.arduino(board.port, boot_s=2)}
+        checks = {c.name: c for c in doctor.arduino(board.port)}
     assert checks["Arduino"].verdict == "ok" and "link" in checks
     assert checks["transmitter"].verdict == verdict and found in checks["transmitter"].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
@@ -135,7 +136,7 @@ def test_a_gamepad_that_nobody_holds(proc, monkeypatch):
         monkeypatch.setattr(f"rover_lib.onboard.{module}.open_gamepad", lambda: pad)
     monkeypatch.setattr(doctor, "list_gamepads", lambda: ("A (event0)", "B (event1)"))
     with board_of(answer=talking("- - - -"), hello=f"<H 4 4.2.0-gamepad 7 0 e {gamepad_car.id}") as board:
-        found = examine(camera=str(proc / "none"), port=board.port, host=Host(proc_root=proc), boot_s=2)
+        found = examine(camera=str(proc / "none"), port=board.port, host=Host(proc_root=proc))
         checks = {c.name: c for c in found}
     assert checks["transmitter"].verdict == "warning"
     assert "A (event0), B (event1)" in checks["gamepad"].found
@@ -168,7 +169,7 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
         time.sleep(0.05)  # time to read it
 
     with board_of() as board:
-        checks = list(doctor.receiver(board.port, ask, boot_s=2))
+        checks = list(doctor.receiver(board.port, ask))
     assert [c.verdict for c in checks] == verdicts
     assert found in checks[-1].found
     assert not [b for b in board.heard if b[1] in "AD"]  # nothing was armed, nothing driven
@@ -184,7 +185,7 @@ def test_a_good_artifact_and_a_damaged_one(artifacts, tmp_path, proc):
     assert re.search(r"static, \d+ actions at 30 Hz, camera \S+ \d+x\d+", checks[0].found)
     broken = tmp_path / "policy.pt"
     broken.write_bytes(artifacts["static"].read_bytes()[:-99])
-    checks = examine(broken, port=str(tmp_path / "none"), dev=tmp_path, host=Host(proc_root=proc))
+    checks = examine(broken, port=str(tmp_path / "none"), camera=str(tmp_path / "none"), host=Host(proc_root=proc))
     check = only(c for c in checks if c.name == "artifact")
     assert check.verdict == "fail" and check.found.startswith(f"{broken}: ")
 

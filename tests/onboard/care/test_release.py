@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import json
 import os
 import shutil
 import signal
@@ -83,6 +82,10 @@ def assert_drives(r: Releases, names: set[str]) -> None:
     status = r.status()
     assert status["healthy"] and status["trouble"] == "" and status["current"] in names, status
     assert content_hash(r.path_of("current")) == status["current"]
+
+
+def rover(*args: object):
+    return CliRunner().invoke(main, ["release", *map(str, args)])
 
 
 def damage(path: Path) -> None:
@@ -284,10 +287,11 @@ def test_what_is_wrong_with_the_release_in_use_is_seen_and_healed(releases, two,
     else:
         releases.current_link.unlink()
         releases.current_link.symlink_to("/etc")
-    assert not releases.status()["healthy"]
+    assert not releases.status()["healthy"] and rover("--models", releases.models, "status").exit_code == 1
     with pytest.raises(RoverError):
         releases.verify()
-    assert_drives(releases, {deploy(releases, two[0])})
+    assert_drives(releases, {name := deploy(releases, two[0])})
+    assert f"* {name[:12]}  static" in rover("--models", releases.models, "status").output
 
 
 def test_a_broken_history_a_wrong_clock_and_a_full_disk(releases, two, monkeypatch):
@@ -314,22 +318,6 @@ def test_of_two_at_once_one_is_refused_and_tidies_nothing_up(releases, two):
         lock.chmod(0o644)
         assert_drives(releases, {deploy(releases, two[1])})
     assert not half.exists() and stat.S_IMODE(lock.stat().st_mode) == 0o600
-
-
-def rover(*args: object):
-    return CliRunner().invoke(main, ["release", *map(str, args)])
-
-
-@pytest.mark.slow
-def test_a_deployment_by_hand(two, tmp_path):
-    """tests/ansible/test_fleet.py has the other commands."""
-    models = ["--models", tmp_path / "models"]
-    name = json.loads(rover(*models, "stage", two[0]).output)["name"]
-    assert json.loads(rover(*models, "switch", name).output)["changed"] is True
-    assert rover(*models, "verify").exit_code == 0 and rover(*models, "switch", "latest").exit_code == 1
-    assert f"* {name[:12]}  static" in rover(*models, "status").output
-    found = json.loads(rover(*models, "status", "--json").output)
-    assert found["healthy"] and found["current"] == name and {"service", "throttled", "last_drive_s"} <= set(found)
 
 
 PROGRAM = """#!/bin/sh

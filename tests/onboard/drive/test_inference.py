@@ -71,11 +71,8 @@ def raising(frame, state):
 
 
 def test_what_must_not_drive_is_raised():
-    for predict, match in (
-        (lambda *_: np.full((8, 2), np.nan, np.float32), "not finite"),
-        (lambda *_: np.full((8, 2), 3.0, np.float32), "outside the range"),
-        (raising, "ZeroDivisionError: by zero"),
-    ):
+    wild = lambda *_: np.full((8, 2), 3.0, np.float32)  # noqa: E731
+    for predict, match in ((wild, "outside the range"), (raising, "ZeroDivisionError: by zero")):
         with Planner(Frames(), predict, Commanded(), 30.0) as planner:
             until_raises(planner, PolicyError, match)
     with Planner(Frames(fails_after=3), lambda frame, state: CHUNK, Commanded(), 30.0) as planner:
@@ -140,11 +137,6 @@ def test_a_bad_state_is_a_sentence_and_the_process_goes_on(process):
     assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
 
 
-def test_an_artifact_that_is_not_there(tmp_path):
-    with pytest.raises(PolicyError), PolicyProcess(tmp_path / "policy.pt"):
-        pass
-
-
 def test_a_process_that_is_killed(artifacts):
     with PolicyProcess(artifacts["static"], threads=1) as process:
         os.kill(process._process.pid, signal.SIGINT)  # a terminal's Ctrl-C is not for it
@@ -171,11 +163,3 @@ def test_it_ends_with_its_parent(artifacts):
     )
     pid = int(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout)
     until(lambda: not Path(f"/proc/{pid}").exists(), 5)
-
-
-def test_the_side_that_drives_does_not_load_torch():
-    code = (
-        "import sys, rover_lib.onboard.drive.drive, rover_lib.onboard.car.camera, rover_lib.onboard.drive.inference; "
-        "sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

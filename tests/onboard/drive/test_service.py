@@ -28,14 +28,13 @@ from rover_lib.onboard.car import host
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
 from rover_lib.onboard.drive import service as s
-from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, wanted_since
+from rover_lib.onboard.drive.arming import arm_when_ready, wanted_since
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.session import Arming, Session
 from rover_lib.onboard.errors import CameraError
-from rover_lib.onboard.recording.episode import json_controls
 
 STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
 REQUEST_S = s.REQUEST_S
@@ -471,17 +470,6 @@ def test_a_drive_that_waits_in_a_terminal_does_not_arm_later(missing):
         arm_when_ready(lambda: pytest.fail("armed"), lacking(iter(missing)), threading.Event(), print, (), wanted)
 
 
-def test_the_arduino_is_told_what_a_drive_may_use():
-    """And the human, where it gives less than that: it was cut in silence."""
-    caps, said = [], []
-    link = SimpleNamespace(calibration=PwmCalibration(), arm=armed)
-    link.lower_cap = lambda us: caps.append(us) or replace(STATUS, cap_us=min(us, 200))
-    assert arm_capped(link, 0.1, said.append) == "telemetry"
-    assert (caps, said) == ([179], [])
-    arm_capped(link, 0.2, said.append)
-    assert caps == [179, 238] and "at most throttle 0.14 (200 us)" in said[0]
-
-
 # The whole: rover drive --service, as systemd starts it
 
 
@@ -516,5 +504,6 @@ def test_a_service_is_armed_by_a_human_and_a_loop_that_hangs_is_not_fed_for(syst
     flight = read_log(tmp_path / "flight.log")
     assert any(e.text == "armed" for e in flight.events)
     (episode,) = (tmp_path / "episodes").iterdir()  # of the drive, not of the time before
-    assert len(json_controls(episode / "episode_data.json")) == pytest.approx(len(flight.ticks["t_s"]), abs=2)
+    controls = json.loads((episode / "episode_data.json").read_text())["control_samples"]
+    assert len(controls) == pytest.approx(len(flight.ticks["t_s"]), abs=2)
     assert flight.ticks["plan"][0] < 10 and flight.ticks["plan_age_ms"][0] <= 1e3 * Settings().fade_s

@@ -12,7 +12,7 @@ from threading import Barrier
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from recorded import real_episode
+from recorded import content_of, names_in, real_episode
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import EpisodeError
@@ -52,14 +52,6 @@ def cut(folder, controls=5, frames=3):
         assert not find_killed(folder.parent)
         raise KeyboardInterrupt
     return folder.with_name(f".{folder.name}.part")
-
-
-def content_of(folder):
-    return json.loads((folder / "episode_data.json").read_text())
-
-
-def names_in(folder):
-    return sorted(path.name for path in folder.iterdir())
 
 
 def finish(folder):

@@ -1,6 +1,5 @@
 """The recorder beside a loop, and the loop for a human: what is recorded, and what is left when something fails."""
 
-import json
 import os
 import signal
 import threading
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from needs import until
+from recorded import content_of, names_in
 
 from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame
@@ -82,14 +82,6 @@ def virtual():
     return Stepped()
 
 
-def content_of(folder):
-    return json.loads((folder / "episode_data.json").read_text())
-
-
-def left_in(folder):
-    return sorted(p.name for p in folder.iterdir())
-
-
 # ---- beside a loop
 
 
@@ -101,7 +93,7 @@ def test_an_episode_beside_a_loop(tmp_path, virtual):
     virtual.drive(3, mode="static", plan_age_ms=80.5)
     folder = recorder.close()
     assert folder == recorder.folder == recorder.path == recorder.close() and recorder.failure is None
-    assert left_in(tmp_path / "new") == [folder.name]
+    assert names_in(tmp_path / "new") == [folder.name]
     assert abs(time.mktime(time.strptime(folder.name, "episode_%Y%m%d_%H%M%S")) - before_s) <= 2
     content = content_of(folder)
     expected = {"camera_fps": 50, "camera_resolution": [64, 36], "arduino_port": "/dev/x", "source": "rover drive"}
@@ -134,7 +126,7 @@ def test_two_in_one_second(tmp_path, virtual, monkeypatch):
             with virtual.beside(tmp_path) as second:  # while the first is recording
                 virtual.drive(1)
         paths |= {first.path.name, second.path.name}
-    assert sorted(paths) == left_in(tmp_path) and len(paths) == 4
+    assert sorted(paths) == names_in(tmp_path) and len(paths) == 4
 
 
 def test_a_fault_of_camera_or_loop_keeps_what_there_is(tmp_path, virtual, caplog):
@@ -156,7 +148,7 @@ def test_a_car_that_was_not_armed_leaves_no_episode(tmp_path, virtual, caplog):
     with pytest.raises(LinkError), virtual.beside(tmp_path) as recorder:
         virtual.wait(0.1)
         raise LinkError("arming was refused")
-    assert left_in(tmp_path) == [] and (recorder.path, recorder.failure) == (None, None) and not caplog.records
+    assert names_in(tmp_path) == [] and (recorder.path, recorder.failure) == (None, None) and not caplog.records
 
 
 # ---- the disk
@@ -169,7 +161,7 @@ def test_a_full_disk_is_seen_before_it_is_full(tmp_path, virtual, monkeypatch):
     free(1_000_000)
     with pytest.raises(EpisodeError, match=r"full.*1\.0 MB free"):
         virtual.beside(tmp_path)
-    assert left_in(tmp_path) == []
+    assert names_in(tmp_path) == []
     free(1e9)
     recorder = virtual.beside(tmp_path)
     virtual.drive(1)
@@ -197,7 +189,7 @@ def test_episodes_take_no_more_than_they_may(tmp_path, virtual):
     assert content_of(folder)["metadata"]["fault"] == recorder.failure
     with pytest.raises(EpisodeError, match="or delete some"):
         virtual.beside(tmp_path, most_bytes=module.room_for(tmp_path, 6.0))
-    assert left_in(tmp_path) == ["before", folder.name]
+    assert names_in(tmp_path) == ["before", folder.name]
 
 
 def test_a_disk_that_hangs_holds_up_nothing(tmp_path, virtual, monkeypatch):
