@@ -123,16 +123,21 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 @click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
+@click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
 @click.option("--samples", type=FROM_1, default=1024, show_default=True, help="Frames to calibrate the kit with.")
-def export(run_dir: Path, onnx: bool, kit: Path | None, samples: int) -> None:
-    """Write the policies of the run in RUN_DIR for another engine.
+def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int) -> None:
+    """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 
-    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --hailo: a kit of networks, calibration
-    set and scripts, see docs/hailo.md.
+    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md. --hailo: a
+    kit of networks, calibration set and scripts, see docs/hailo.md.
     """
-    if not onnx and kit is None:
-        raise click.UsageError("for what? --onnx or --hailo OUT")
+    if not (onnx or card) and kit is None:
+        raise click.UsageError("for what? --onnx, --card, or --hailo OUT")
+    if card:
+        from rover_lib.workshop.run.run_report import write_card
+
+        click.echo(f"written: {write_card(run_dir)}")
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 

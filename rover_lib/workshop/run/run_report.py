@@ -29,6 +29,7 @@ from rover_lib.workshop.judge.verdict import headline, verdict
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 PAGE = "report.html"
+CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 AGAIN = "'rover run' of its checkpoint makes it again"
 FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
@@ -137,21 +138,46 @@ def _worth(judged: Mapping[str, Any]) -> list[str]:
     return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
+def write_card(run_dir: Path | str) -> Path:
+    """Write README.md, a model card for the Hub, into a run's folder; return its path.
+
+    Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
+    """
+    folder = Path(run_dir)
+    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
+    path = folder / "README.md"
+    if path.exists() and CARD not in path.read_text(errors="replace"):
+        raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
+    header, *rows = columns(judged)
+    recordings = load["recordings"]
+    values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
+    path.write_text(_pages(escaped=False).get_template("card.md").render(values))
+    return path
+
+
 def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
     """run.json as one HTML page that needs no other file. folder: of the run, with its figures. name: the run's."""
     judged, env = content["metrics"], content["env"]
     header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
     drawn = {words: folder / "figures" / f"{figure}.png" for figure, words in FIGURES.items()}
-    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-    pages.filters["words"] = _to_html
-    return pages.get_template(PAGE).render(
-        {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
-        kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
-        worth=_worth(judged),
-        figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
-        files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
-        made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+    return (
+        _pages(escaped=True)
+        .get_template(PAGE)
+        .render(
+            {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
+            kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
+            worth=_worth(judged),
+            figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
+            files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
+            made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
+        )
     )
+
+
+def _pages(*, escaped: bool) -> Environment:
+    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=escaped)
+    pages.filters["words"] = _to_html
+    return pages
 
 
 def _to_html(line: str) -> Markup:  # what is between backticks as code

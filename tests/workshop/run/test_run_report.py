@@ -112,6 +112,17 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     assert report.typed("rover doctor") == "rover doctor"
 
 
+def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
+    content = report.write(run_dir)["metrics"]
+    for _ in range(2):
+        text = report.write_card(run_dir).read_text()
+    assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
+    assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
+    (run_dir / "README.md").write_text("mine")
+    with pytest.raises(RoverError, match="is not a card"):
+        report.write_card(run_dir)
+
+
 def test_what_others_wrote_is_no_markup(run_dir):
     change_stage(run_dir / "compare.json", "metrics", warnings=["<script>"])
     change_stage(run_dir / "load.json", "params", episodes="<script>")
