@@ -59,7 +59,7 @@ def moments_of(flight: Flight) -> list[Moment]:
             continue
         tick = plain({name: ticks[name][i] for name in Tick._fields})
         ahead = commanded[i : i + round(1000 / period_ms)]
-        events = [f"{e.t_s:.1f} s  {e}" for e in flight.events if e.t_s <= now_s]
+        events = [f"{e.t_s:.1f} s  {e.text}" for e in flight.events if e.t_s <= now_s]
         moments.append(Moment(now_s, frame, tick, ahead, events[-1] if events else ""))
     if not moments:
         raise EpisodeError(f"{episode}: none of its pictures is of the drive in {flight.path}", remedy="choose --drive")

@@ -160,7 +160,7 @@ def test_mcap_has_each_message_at_its_time(tmp_path):
         for name in Tick._fields:
             value = flight.ticks[name][k]
             assert row[name] == (str(value) if isinstance(value, str) else pytest.approx(float(value))), name
-    assert [row["message"] for _, row in found["/event"]] == [str(e) for e in flight.events]
+    assert [row["message"] for _, row in found["/event"]] == [e.text for e in flight.events]
     for k, (t_s, row) in zip([k for k in range(20) if k not in (3, 4)], found["/camera"], strict=True):
         assert t_s == pytest.approx(k / PICTURES_HZ + 0.01, abs=2e-6)
         assert base64.b64decode(row["data"]) == (episode / "frames" / f"frame_{k:06d}.jpg").read_bytes()
