@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
 MOST_FEATURES = 200  # an arm with six cameras has 20
+MOST_PIXELS = 4608 * 2592  # of a picture: a Pi camera's largest
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -257,7 +258,10 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
         remedy = "choose another: --camera NAME"
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
-    return _size_of(feature)
+    height, width = _size_of(feature)
+    if height * width > MOST_PIXELS:
+        raise EpisodeError(f"{root}: '{key}' has pictures of {width}x{height}", remedy="scale them to what a policy sees")
+    return height, width
 
 
 def _size_of(feature: Mapping[str, Any]) -> tuple[int, int]:

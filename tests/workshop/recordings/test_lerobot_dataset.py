@@ -82,6 +82,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(front=None), "has no camera"),
         (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
+        (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 0}}), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
