@@ -260,7 +260,7 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
     height, width = _size_of(feature)
     if height * width > MOST_PIXELS:
-        raise EpisodeError(f"{root}: '{key}' has pictures of {width}x{height}", remedy="scale them to what a policy sees")
+        raise EpisodeError(f"{root}: '{key}' has pictures of {width}x{height}", remedy="scale them down")
     return height, width
 
 
