@@ -1,10 +1,11 @@
-"""Which artifacts a rover accepts, by their manifest. Nothing in them is run."""
+"""Which artifacts a rover accepts, by their manifest and their code. Nothing in them is run."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.artifact.archive import ONNX, refused
 from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ArtifactError
@@ -12,6 +13,9 @@ from rover_lib.onboard.stage import version_of
 
 # What can be allowed to differ. Torch, engine and actions cannot: this rover could not drive with others.
 MAY_DIFFER = ("mode", "chunk", "camera", "aspect")
+CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
+ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
+OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,11 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         raise ArtifactError(f"only {', '.join(MAY_DIFFER)} can be allowed", found=", ".join(sorted(unknown)))
     with Artifact(path) as artifact:
         artifact.prove()
-        for kind, why in expected.refusals(artifact.manifest).items():
+        manifest = artifact.manifest
+        code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
+        if (wanted := OF_MODE[artifact.kind].get(manifest["mode"])) and wanted not in code:
+            raise refused(path, f"its manifest says {manifest['mode']}, its code is not")
+        for kind, why in expected.refusals(manifest).items():
             if kind not in allow:
                 remedy = f"deploy another, or allow it: {kind}" if kind in MAY_DIFFER else "deploy another"
                 raise ArtifactError(f"{path}: {why}", remedy=remedy)

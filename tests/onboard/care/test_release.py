@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from archives import rewritten, vectors_with
+from archives import manifest_with, rewritten, vectors_with
 from click.testing import CliRunner
 
 from rover_lib.cli import main
@@ -221,6 +221,9 @@ def test_what_is_refused_is_not_staged_unless_it_is_allowed(releases, artifacts,
     assert set(expected.refusals(manifest | others)) == {"engine", "chunk", "state", "camera", "aspect"}
     with pytest.raises(ArtifactError, match="mode"):
         releases.stage(artifacts["fp32"])
+    lie = rewritten(artifacts["fp32"], tmp_path / "lie.pt", {"manifest.json": manifest_with(mode="static")})
+    with pytest.raises(ArtifactError, match="its code is not"):
+        releases.stage(lie)
     assert_drives(releases, {releases.current})
     assert releases.switch(releases.stage(artifacts["fp32"], allow=["mode"]).name)
 
