@@ -29,7 +29,8 @@ THROTTLE = 0.2
 
 
 def drive(link, throttle, condition):
-    needs.keep_sending(lambda: link.send_action(0.0, throttle), condition=condition)
+    pulses = link.calibration.pulses(0.0, throttle)
+    needs.keep_sending(lambda: link.send(pulses.steering_us, pulses.throttle_us), condition=condition)
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ def checkpoint(tiny):
 
 @pytest.fixture(scope="module")
 def opened(checkpoint):
-    parts = Split(tuple(memory_samples(FRAMES)), tuple(memory_samples(4, seed=1)), (), None, {})
+    parts = Split(tuple(memory_samples(FRAMES)), tuple(memory_samples(4, seed=1)), (), None)
     return Opened(checkpoint, None, parts)
 
 

@@ -130,7 +130,9 @@ def outcome_of(read, path: Path) -> str:
     if not (child := os.fork()):
         said = "nothing"
         try:
-            signal.alarm(MOST_S)
+            # Its own time counts: a fork of this process, which may have gigabytes, waits for the kernel to copy them.
+            signal.setitimer(signal.ITIMER_VIRTUAL, MOST_S)
+            signal.alarm(6 * MOST_S)
             torch.set_num_threads(1)  # a fork has none of the threads that OpenMP began before, and would wait
             now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (now + MOST_BYTES,) * 2)
