@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.run.run import NAMES, NOTEBOOKS, files_of_a_run
+from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT, NAMES, NOTEBOOKS, files_of_a_run
 from rover_lib.workshop.run.run_folder import run_folder
 
 
@@ -46,6 +46,7 @@ def main() -> None:
     root = ["--allow-root"] if os.geteuid() == 0 else []  # a container may have no other user
     print(f"opening {folder}", file=sys.stderr)
     first = f"--LabApp.default_url=/lab/tree/{NAMES[0]}.ipynb"  # in the address that it prints, too
+    os.environ.update(KERNEL_ENVIRONMENT)
     os.execv(sys.executable, [sys.executable, "-m", "jupyterlab", *root, first, str(folder)])
 
 
