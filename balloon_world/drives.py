@@ -29,6 +29,7 @@ from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.errors import DriveFault, TrainingError
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import plain
+from rover_lib.workshop.judge.pairs import Z
 from rover_lib.workshop.progress import Progress, silent
 
 ROUNDING = 1e-6  # how far times may be rounded, in ticks
@@ -273,7 +274,7 @@ class TrialReport:
     hit: tuple[bool, ...]
 
 
-def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
+def wilson_interval(hits: int, trials: int, z: float = Z) -> tuple[float, float]:
     """Return the interval in which the true share of hits lies, by Wilson's score (95 % with the default z)."""
     share = hits / trials
     centre = share + z * z / (2 * trials)
@@ -285,7 +286,7 @@ def wilson_interval(hits: int, trials: int, z: float = 1.959963984540054) -> tup
 def run_trials(
     policy: Any,
     worlds: int = 40,
-    seed: int = 10_000,
+    seed: int = SEED,
     replan_every: int = 8,
     progress: Progress = silent,
 ) -> TrialReport:

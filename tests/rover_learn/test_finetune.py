@@ -166,7 +166,7 @@ def test_the_command_says_what_it_learned_from(car_policy, old, new, tmp_path, s
 
 
 def rows_of(kind, *changes):
-    """Episodes that are better or worse by so many points, in steering; throttle never changes."""
+    """Episodes that are better or worse by these points, in steering; throttle never changes."""
     never = {"before_throttle_pct": None, "after_throttle_pct": None}
     return [{"kind": kind, "before_steering_pct": 5.0, "after_steering_pct": 5.0 + c} | never for c in changes]
 

@@ -80,7 +80,7 @@ class EpisodeWriter:
 
     folder: must not exist; its name is the episode's id. resolution: (width, height) of the frames; None: that of the
     first. flags: write the two columns that say what was measured. Raises EpisodeError for an existing folder, frames
-    of another size, values that are no numbers, an episode without a frame or a control, or a full disk.
+    of another size, values that are not numbers, an episode without a frame or a control, or a full disk.
     """
 
     def __init__(

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
 MOST_FEATURES = 200  # an arm with six cameras has 20
-MOST_PIXELS = 4608 * 2592  # of a picture: a Pi camera's largest
+PICTURE_PIXELS = 4608 * 2592  # at most: a Pi camera's largest
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 STATE, ACTION = "observation.state", "action"
 NUMBERS = (STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -259,7 +259,7 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
         remedy = "choose another: --camera NAME"
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
     height, width = _size_of(feature)
-    if height * width > MOST_PIXELS:
+    if height * width > PICTURE_PIXELS:
         raise EpisodeError(f"{root}: '{key}' has pictures of {width}x{height}", remedy="scale them down")
     return height, width
 
