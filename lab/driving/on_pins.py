@@ -52,7 +52,7 @@ class Drive(Child):
     """`rover drive` with the bench's artifact, camera and cable."""
 
     def __init__(self, bench: "PinBench"):
-        self._marked = 0
+        self._marked, self._port = 0, str(bench.arduino.port)
         code = f"{IN_TERMINAL}{THREAD_ENDS}from rover_lib.onboard.cli import main; main()"
         devices = "--camera", bench.camera, "--port", bench.arduino.port, "--view", bench.folder / "view"
         options = "--hz", RATE_HZ, "--threads", 1, "--log", bench.folder / "flight.log"
@@ -64,12 +64,12 @@ class Drive(Child):
         self._marked = len(self.errors())
 
     def line_of(self, message: str) -> str | None:
-        """Return the first line since mark() that matches, or None if there is none within LINE_S."""
+        """Return the first line since mark() that matches, with PORT for the port, or None if none comes in LINE_S."""
         deadline, line = time.monotonic() + LINE_S, None
         while line is None and time.monotonic() < deadline:
             line = next((line for line in self.errors()[self._marked :] if re.search(message, line)), None)
             time.sleep(0.1 * (line is None))
-        return line
+        return line and line.replace(self._port, "PORT")
 
 
 class PinBench:
