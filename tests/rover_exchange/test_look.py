@@ -34,7 +34,7 @@ def drive(folder, *, recorded=True, pictures=True, seconds=SECONDS):
         for k in range(round(seconds * HZ)):
             now_s[0] = 50.0 + k / HZ
             log.tick(Tick(k / HZ, 0.25, "A" if k < 50 else "M", "a", 0.5 * np.sin(k / 20), 0.05 + k / 2000, 1500,
-                          150 + k, 1500, 149 + k, 1 + k // 6, 150.0, 125.0, 0.9 if k > 20 else 1.0, k))  # fmt: skip
+                          150 + k, 1500, 149 + k, 1 + k // 6, 150.0, 125.0, 1.0 - 0.1 * (k > 20), k, 0.5))  # fmt: skip
         now_s[0] += 0.05
         if recorded:
             log.event(f"recorded: {episode}")

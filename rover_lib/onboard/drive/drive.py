@@ -71,7 +71,7 @@ def drive_car(
         commanded = Commanded()
         planner = Planner(
             camera, policy.predict, commanded, policy.rate_hz,
-            rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits,
+            rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits, strange=lambda: policy.strange,
         )  # fmt: skip
         stack.enter_context(planner)
         session = Session(

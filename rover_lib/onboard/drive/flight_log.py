@@ -66,8 +66,9 @@ class Tick(NamedTuple):
     plan: int  # number of the plan in use, 0 for none
     plan_age_ms: float | None  # since the capture of that plan's frame
     latency_ms: float | None  # of that plan, from capture to ready
-    fade: float  # how much throttle the plan's age allows, 1 to 0
+    fade: float  # how much throttle the plan's age and an unfamiliar place allow, 1 to 0
     frame: int  # number of the newest frame
+    strange: float | None = None  # smoothed, as a share of the artifact's threshold
 
 
 _TEXTS = ("state", "reason")
@@ -365,6 +366,7 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
     try:
         match json.loads(line):
             case list(values):
+                values += [None] * (len(values) == len(Tick._fields) - 1)  # of a log from before `strange`
                 return [_value(name, value) for name, value in zip(Tick._fields, values, strict=True)]
             case {"kind": "event", "t_s": t_s, "event": str(text)} if is_number(t_s):
                 return Event(float(t_s), text)

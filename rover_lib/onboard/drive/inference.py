@@ -44,7 +44,8 @@ class Planner:
     """Keeps planning from the newest frame, in a thread; a context manager.
 
     predict: returns (chunk, 2) actions, unclipped, or raises. rate_hz: actions per second of a plan. rest_s: pause
-    after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see Plan.
+    after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see Plan. strange:
+    returns Plan.strange of the newest prediction.
     """
 
     def __init__(
@@ -57,10 +58,12 @@ class Planner:
         rest_s: float = 0.0,
         latency_s: float = 0.0,
         limits: np.ndarray = LIMITS,
+        strange: Callable[[], float | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
         self._rest_s, self._latency_s, self._limits, self._clock = rest_s, latency_s, limits, clock
+        self._strange = strange
         self._closing = threading.Event()
         self._no_rest = threading.Event()
         self._news = threading.Condition()
@@ -131,7 +134,7 @@ class Planner:
                 time.sleep(max(0.0, asked_s + self._latency_s - self._clock()))
                 self._asked_s = None
                 number += 1
-                plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits)
+                plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits, self._strange())
                 with self._news:
                     self._plan = plan
                     self._news.notify_all()
@@ -149,7 +152,8 @@ class PolicyProcess:
 
     artifact: a file, or an open Artifact. threads: of the engine; None: all cores but one, which is left for the loop.
     Raises PolicyError if the artifact cannot be used here. unconfined: why the kernel cannot confine the process, "" if
-    it does. chunk: number of actions in a plan, of which there are rate_hz per second.
+    it does. chunk: number of actions in a plan, of which there are rate_hz per second. strange: Plan.strange of the
+    newest prediction; None if the artifact has no threshold.
 
     The artifact is not trusted: the process is confined (confine.py), and nothing that it sends is unpickled. An answer
     must have the size that the manifest gives, which is read in this process.
@@ -160,6 +164,7 @@ class PolicyProcess:
         self.threads = threads or max(1, (os.cpu_count() or 1) - 1)
         self.manifest: dict[str, Any] = {}
         self.rate_hz, self.chunk, self.unconfined = 0.0, 0, ""
+        self.strange: float | None = None
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
         self._closing = threading.Event()

@@ -325,6 +325,7 @@ class _Loop:
             latency_ms=latency_ms,
             fade=order.fade,
             frame=order.frame,
+            strange=order.strange,
         )
         self.log.tick(tick)
         if self.hooks.record:

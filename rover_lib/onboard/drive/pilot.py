@@ -9,8 +9,8 @@ from typing import Protocol
 from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.inference import Planner
-from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
-from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError
+from rover_lib.onboard.drive.plan import STOP, WARN, Commanded, Follower, Plan, Settings
+from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError, RoverError
 
 FIRST_PLAN_S = 10.0
 MOVING = 0.004  # throttle above which a car moves, so that it matters what it sees
@@ -23,6 +23,7 @@ MISSING_S = 0.14
 LATE_WARNING_S = 0.1
 READ_S = 0.005  # time for the camera's thread, after a pause of the whole process
 CUT = 0.005  # of throttle; less is rounding and blending
+RECORD_HERE = "record here and train, or set drive.unfamiliar in params.yml"
 CAP = "is there a cap or dirt on the lens?"
 HOLE_S = 0.3  # a gap between actions after which another episode has begun
 
@@ -32,7 +33,7 @@ class Order:
     """What to send at a tick, and where it comes from.
 
     plan: its number, 0 without one. age_s, latency_s, fade: of that plan. frame: number of the camera's newest frame, 0
-    without one.
+    without one. strange: Follower.strange.
     """
 
     steering: float
@@ -44,6 +45,7 @@ class Order:
     latency_s: float | None = None
     fade: float = 1.0
     frame: int = 0
+    strange: float | None = None
 
 
 class Pilot(Protocol):
@@ -121,7 +123,7 @@ class PolicyPilot:
         self.sight = Sight(camera, settings)
         self._frame_age_s = self._asking_s = 0.0  # the longest since the last warnings()
         self._cut = 0.0  # the most throttle that the limit has taken away, not said yet
-        self._said_cut = False
+        self._said_cut = self._said_strange = False
 
     @property
     def plan(self) -> tuple[Plan, float] | None:
@@ -145,6 +147,8 @@ class PolicyPilot:
             self._follower.add(plan, now_s)
         command = self._follower.command(now_s)
         if command is None:
+            if self._follower.strange_s is not None:
+                raise DriveFault(_unfamiliar(self._follower.strange), remedy=RECORD_HERE)
             why = f"the policy has not answered for {self._planner.asking_s:.1f} s"
             raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
         self._cut = max(self._cut, command.cut)
@@ -159,7 +163,15 @@ class PolicyPilot:
             command.plan.latency_s,
             command.fade,
             frame.number if frame else 0,
+            self._follower.strange,
         )
+
+    def check(self) -> None:
+        """Raise RoverError if nobody may drive by the newest picture, or it is unfamiliar to the policy."""
+        self.sight.check()
+        plan = self._planner.newest()
+        if plan and plan.strange is not None and not plan.strange < 1 and self._settings.unfamiliar == STOP:
+            raise RoverError(_unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
@@ -172,10 +184,17 @@ class PolicyPilot:
         if self._cut > CUT and not self._said_cut:
             self._said_cut, limit = True, self._settings.throttle_limit
             yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
+        if self._follower.strange_s is not None and self._settings.unfamiliar == WARN and not self._said_strange:
+            self._said_strange = True
+            yield _unfamiliar(self._follower.strange)
         if age_s > LATE_WARNING_S:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
+
+
+def _unfamiliar(strange: float | None) -> str:
+    return f"the policy has seen nothing like these pictures ({strange or 0:.2f} of its limit)"
 
 
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:

@@ -8,13 +8,13 @@ Nothing here uses a clock or a device: times are arguments, in seconds of one mo
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.checked import broken_rule, number, of_type, whole
+from rover_lib.onboard.checked import broken_rule, number, of_type, one_of, whole
 from rover_lib.onboard.errors import ParamsError, PolicyError
 
 STEERING, THROTTLE = 0, 1
@@ -22,6 +22,8 @@ LIMITS = np.array([[-1.0, 0.0], [1.0, 1.0]])  # lowest and highest [steering, th
 IN_FORCE_S = 0.15  # how long a command holds: after that, the Arduino stops a car that gets no other
 BLIND_M = 1.0  # how far the car may go by one picture, at RECORDED_MPS
 RECORDED_MPS = 1.1  # throttle 0.09, the most of the recordings, of 12 m/s
+SMOOTHED = 3  # plans: one odd picture is not an odd place
+STOP, WARN, OFF = "stop", "warn", "off"  # what an unfamiliar place does
 OVERSHOOT = 0.25  # a learned action may be this far beyond an end, as a transmitter's may: it is clipped
 RULES = {
     "fade_s": number(1e-3, 3600),
@@ -33,6 +35,7 @@ RULES = {
     "black_frames": whole(2, 1000),
     "black_level": number(-255, 255),
     "flat_level": number(-255, 255),
+    "unfamiliar": one_of((STOP, WARN, OFF)),
 }
 
 
@@ -49,6 +52,7 @@ class Settings:
     black_frames: int = 3
     black_level: float = 8.0
     flat_level: float = 2.0
+    unfamiliar: str = STOP
 
     def __post_init__(self):
         remedy = "look at the section 'drive' of params.yml"
@@ -72,7 +76,10 @@ class Settings:
         known = {f.name for f in fields(cls)}
         if unknown := sorted(set(section) - known):
             raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}", remedy="look at params.yml")
-        return cls(**{**section, **{k: v for k, v in overrides.items() if v is not None}})
+        given = {**section, **{k: v for k, v in overrides.items() if v is not None}}
+        if given.get("unfamiliar") is False:  # YAML's `off`
+            given["unfamiliar"] = OFF
+        return cls(**given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +87,8 @@ class Plan:
     """The action chunk of one inference. actions[i] is meant for captured_s + i / rate.
 
     number: 1, 2, ... captured_s: when the policy's frame was captured. ready_s: when the plan arrived. actions:
-    (chunk, 2) float [steering, throttle], clipped to limits: (2, 2), the lowest and the highest action. Raises
+    (chunk, 2) float [steering, throttle], clipped to limits: (2, 2), the lowest and the highest action. strange: how
+    unfamiliar the frame is to the policy, as a share of the artifact's threshold; None if it has none. Raises
     PolicyError for actions of another shape, not finite, or beyond an end by more than OVERSHOOT: this is the last
     boundary before the servos.
     """
@@ -90,6 +98,7 @@ class Plan:
     ready_s: float
     actions: np.ndarray
     limits: np.ndarray = field(default_factory=lambda: LIMITS)
+    strange: float | None = None
 
     def __post_init__(self):
         actions = np.asarray(self.actions, float)
@@ -119,7 +128,8 @@ class Plan:
 class Command:
     """What to do at a tick: steering in [-1, 1], throttle in [0, 1], or from -1 on a car with reverse.
 
-    fade: by how much the plan's age multiplied the throttle, in [0, 1]. cut: the throttle that throttle_limit took.
+    fade: by how much the plan's age, or an unfamiliar place, multiplied the throttle, in [0, 1]. cut: the throttle that
+    throttle_limit took.
     """
 
     steering: float
@@ -130,8 +140,17 @@ class Command:
     cut: float = 0.0
 
 
+def smoothed(scores: Sequence[float]) -> float:
+    """Return the mean of the newest SMOOTHED scores of a drive's plans, Plan.strange; there is at least one."""
+    newest = scores[-SMOOTHED:]
+    return sum(newest) / len(newest)
+
+
 class Follower:
-    """Turns plans into commands. rate_hz: steps of a plan per second. For one thread at a time."""
+    """Turns plans into commands. rate_hz: steps of a plan per second. For one thread at a time.
+
+    strange: the smoothed Plan.strange; None without one. strange_s: when it first reached 1; a drive never forgets it.
+    """
 
     def __init__(self, settings: Settings, rate_hz: float):
         self.settings = settings
@@ -139,6 +158,9 @@ class Follower:
         self.plan: Plan | None = None  # the newest; None before the first
         self._offset = np.zeros(2)  # old command minus new plan, when the newest plan took over
         self._blended = 0  # ticks since then
+        self.strange: float | None = None
+        self.strange_s: float | None = None
+        self._scores: list[float] = []  # the newest SMOOTHED
 
     def add(self, plan: Plan, now_s: float) -> None:
         """Let a fresh plan take over at this tick. It is ignored unless its frame is newer than the last plan's."""
@@ -149,17 +171,30 @@ class Follower:
             old = self._wanted(before, now_s) * [1.0, self._fade(now_s - before.captured_s)]
             self._offset, self._blended = old - self._meant(plan, now_s), 0
         self.plan = plan
+        if plan.strange is not None:
+            self._scores = [*self._scores, plan.strange][-SMOOTHED:]
+            self.strange = smoothed(self._scores)
+            if not self.strange < 1 and self.strange_s is None:  # NaN, too
+                self.strange_s = now_s
 
     def stop_s(self) -> float:
         """Return the age in seconds at which the newest plan stops the car: the settings', or the chunk's end."""
         return min(self.settings.stop_s, len(self.plan.actions) / self.rate_hz) if self.plan else 0.0
 
     def command(self, now_s: float) -> Command | None:
-        """Return what the newest plan meant for now; None without a plan, or if it is too old to drive by."""
+        """Return what the newest plan meant for now; None without a plan, or if it is too old to drive by.
+
+        None, too, once the throttle has faded because the place is unfamiliar.
+        """
         plan = self.plan
         if plan is None or not (age_s := now_s - plan.captured_s) < self.stop_s():
             return None
         fade = self._fade(age_s)
+        if self.strange_s is not None and self.settings.unfamiliar == STOP:
+            fade_s = self.settings.stop_s - self.settings.fade_s
+            if (passed_s := now_s - self.strange_s) >= fade_s:
+                return None
+            fade *= 1 - passed_s / fade_s
         steering, throttle = np.clip(self._wanted(plan, now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
         limit = self.settings.throttle_limit  # forwards and backwards

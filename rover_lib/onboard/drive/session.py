@@ -175,7 +175,7 @@ class Arming:
             driving.enter_context(session.planner.without_rest())
             driving.enter_context(session.boost(session.log))
             session.planner.renew(session.settings.fade_s)
-            self._pilot.sight.check()
+            self._pilot.check()
             if session.link:
                 limit = session.settings.throttle_limit
                 self._armed = arm_capped(session.link, limit, session.log.event, session.check_wanted)

@@ -20,7 +20,7 @@ from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.watch import stop_on_signals
-from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError
+from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, RoverError
 
 PERIOD = 1 / 30
 
@@ -204,14 +204,14 @@ class Eyes:
 
 
 class Plans:
-    asking_s = 0.0
+    asking_s, strange = 0.0, None
 
     def __init__(self):
         self.plan = None
 
     def make(self, now_s, throttle=0.1):
         number = self.plan.number + 1 if self.plan else 1
-        self.plan = Plan(number, now_s, now_s, np.tile([0.2, throttle], (32, 1)))
+        self.plan = Plan(number, now_s, now_s, np.tile([0.2, throttle], (32, 1)), strange=self.strange)
 
     def newest(self):
         return self.plan
@@ -252,6 +252,18 @@ def test_what_the_limit_cuts_is_said_once(pilot):
     assert "the policy asks for throttle 0.31, cut at throttle_limit 0.2" in next(pilot.warnings())
     drives(pilot, 0.5, 1.0, throttle=0.4)
     assert list(pilot.warnings()) == []
+
+
+def test_an_unfamiliar_place_ends_the_drive_and_arms_nothing(pilot):
+    pilot.check()
+    drives(pilot, 0.5)
+    pilot.plans.strange = float("nan")
+    with pytest.raises(DriveFault, match="seen nothing like these pictures"):
+        drives(pilot, 0.6, 0.5)
+    assert pilot.eyes.frame.captured_s == pytest.approx(1.0)
+    with pytest.raises(RoverError, match="nothing like") as refused:
+        pilot.check()
+    assert refused.value.kind == "not armed"
 
 
 def test_a_camera_that_gives_no_more_pictures(pilot):
@@ -301,7 +313,7 @@ def test_a_picture_without_anything_on_it(pilot, seen, fault):
 def test_no_picture_is_nothing_to_drive_by(pilot):
     pilot.eyes.frame = None
     with pytest.raises(CameraError):
-        pilot.sight.check()
+        pilot.check()
 
 
 # ---- signals, and what surrounds the loop

@@ -61,6 +61,22 @@ def test_the_throttle_fades_with_the_plans_age():
     assert f.command(0.75).steering == pytest.approx(0.225)  # steering does not fade
 
 
+def strange(score, n=1, at_s=0.0):
+    return Plan(n, at_s, at_s, ramp(throttle=0.05), strange=score)
+
+
+@pytest.mark.parametrize(("unfamiliar", "throttle"), [("stop", 0.025), ("warn", 0.05), (False, 0.05)])
+def test_an_unfamiliar_place_fades_the_throttle_as_an_old_plan_does(unfamiliar, throttle):
+    f = Follower(Settings.of({"blend_ticks": 0, "unfamiliar": unfamiliar}), RATE)  # False: YAML's off
+    for i, score in enumerate((0.9, 1.05, 1.04, 1.0, 0.0, 0.0)):  # mean of three: 0.98, 0.997, 1.03 at 0.3 s, ...
+        f.add(strange(score, i + 1, i / 10), i / 10)
+        if i == 2:
+            assert f.strange_s is None and f.command(i / 10).fade == 1.0
+    assert f.strange_s == 0.3 and f.strange == pytest.approx(1 / 3)
+    assert f.command(0.55).throttle == pytest.approx(throttle)
+    assert (f.command(0.81) is None) == (unfamiliar == "stop")  # although it went back: a drive never forgets it
+
+
 def test_the_throttles_limit():
     f = follower(throttle_limit=0.03)
     f.add(Plan(1, 0.0, 0.0, ramp()), 0.0)
@@ -131,7 +147,7 @@ def test_a_command_that_is_no_longer_in_force_is_no_state():
     assert commanded.state(60.0, RATE).tolist() == [0.0, 0.0]
 
 
-WRONG = {"stop_s": math.nan}, {"fade_s": True}, {"frozen_frames": 0}, {"ensemble": None}, {"stop_s": 0.1}
+WRONG = {"stop_s": math.nan}, {"fade_s": True}, {"unfamiliar": "no"}, {"frozen_frames": 0}, {"ensemble": None}
 
 
 @pytest.mark.parametrize("wrong", WRONG)

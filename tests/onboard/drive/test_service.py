@@ -420,7 +420,7 @@ def session_of(asked_s=0.0, renew=lambda age_s: None, **parts):
 
 
 def arms(check=lambda: None, **given):
-    with Arming(session_of(**given), SimpleNamespace(sight=SimpleNamespace(check=check))) as arming:
+    with Arming(session_of(**given), SimpleNamespace(check=check)) as arming:
         return arming.arm()
 
 
