@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import ACT, transform
-from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
+from rover_lib.workshop.int8.graph import graph_of
+from rover_lib.workshop.int8.onnx_graph import onnx_model
 
 
 class Front(nn.Module):

@@ -23,8 +23,11 @@ class Engine(Protocol):
 
     threads: int
 
-    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
-        """(S,) float32 and one (height, width, 3) uint8 per camera in, (1, chunk, A) out. Raises RuntimeError."""
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(S,) float32 and one (height, width, 3) uint8 per camera in. Raises RuntimeError.
+
+        Returns (1, chunk, A), and (1, D) if the artifact gives an embedding.
+        """
 
     def give_back(self) -> bool:
         """Free the memory that only loading needed, after a first run; return whether to check predictions again."""

@@ -1,7 +1,8 @@
 """The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors.
 
 Beside the policy's own records it contains `extra/manifest.json` (see RULES) and `extra/parity.npz` (inputs, and the
-chunks that they must give), and no pickled Python objects.
+chunks that they must give), and no pickled Python objects. A policy that tells how unfamiliar a picture is has
+"familiar" in its manifest, an embedding beside each chunk, and the arrays of policy/familiar.py beside its vectors.
 """
 
 import hashlib
@@ -43,6 +44,7 @@ MOST_VECTORS = 16
 # far by at most 0.13 with random weights and 0.03 with trained ones.
 LARGEST_TOLERANCE = {"fp32": 1e-3, "int8": 0.3}
 CAR_ACTIONS = ("steering", "throttle")
+MOST_SIZE = 4096  # of an embedding
 
 
 def is_name(value: Any) -> bool:
@@ -62,6 +64,11 @@ def _are_cameras(cameras: Any) -> bool:
     sizes = [size for c in cameras for size in ([c.get("height"), c.get("width")], c.get("recorded", [99, 99]))]
     are_sizes = all(isinstance(s, list) and len(s) == 2 and all(is_whole(n, *SIDE_PX) for n in s) for s in sizes)
     return are_sizes and _are_names([c.get("name") for c in cameras])
+
+
+def _is_familiar(value: Any) -> bool:
+    sizes = ("directions", "size", "drives")
+    return isinstance(value, dict) and all(is_whole(value.get(name), 1, MOST_SIZE) for name in sizes)
 
 
 _NAMES = Rule(_are_names, f"1 to {MOST_NAMES} different names")
@@ -84,6 +91,7 @@ RULES = {
     "parity": of_type(dict),  # {tolerance: {action: largest difference}, reason}
     "versions": of_type(dict),  # {torch, rover_lib}, and for ONNX Runtime also {onnx, onnxruntime}
 }
+# "familiar", if it is there: {size, directions, drives}, see shapes_of_familiar and workshop/int8/familiar.py
 
 
 def save_artifact(path: Path | str, module: "torch.jit.ScriptModule", manifest: dict[str, Any], parity: Vectors) -> str:
@@ -182,6 +190,10 @@ class Artifact:
             "state": ("float32", (len(self.manifest["state_names"]),)),
             "chunk": ("float32", (self.manifest["chunk"], len(self.manifest["action_names"]))),
         } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in self.manifest["cameras"]}
+        fixed = shapes_of_familiar(self.manifest)
+        if fixed:
+            wanted["embedding"] = ("float32", fixed["familiar_mean"])
+        wanted |= {name: ("float32", shape) for name, shape in fixed.items()}
         most = MOST_VECTORS * sum(math.prod(shape) * np.dtype(dtype).itemsize for dtype, shape in wanted.values())
         try:
             with np.lib.npyio.NpzFile(io.BytesIO(read_record(self._z, PARITY)), allow_pickle=False) as packed:
@@ -192,7 +204,8 @@ class Artifact:
             raise refused(self.path, f"its parity vectors are not readable ({e})") from None
         for name, (dtype, shape) in wanted.items():
             found = vectors[name]
-            if found.dtype != dtype or found.shape != (len(vectors["state"]), *shape) or not len(found):
+            shape = shape if name in fixed else (len(vectors["state"]), *shape)
+            if found.dtype != dtype or found.shape != shape or not len(found):
                 raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
             if not np.isfinite(found).all():
                 raise refused(self.path, "its parity vectors are not finite", name)
@@ -242,6 +255,9 @@ def check_manifest(manifest: Any, where: str) -> None:
         raise refused(where, "its manifest contains unprintable text", ascii(text)[:60])
     if broken := broken_rule(manifest, RULES):
         raise refused(where, f"manifest {broken[0]} must be {broken[1]}", broken[2])
+    if "familiar" in manifest and not _is_familiar(manifest["familiar"]):
+        what = f"manifest familiar must have its sizes, 1 to {MOST_SIZE}"
+        raise refused(where, what, repr(manifest["familiar"])[:80])
     car_of(manifest)
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
@@ -257,6 +273,19 @@ def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
     camera = manifest["cameras"][0]
     height, width = camera.get("recorded", (camera["height"], camera["width"]))
     return width, height
+
+
+def shapes_of_familiar(manifest: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays that tell what is familiar, by their names in parity.npz; none without them."""
+    if not (familiar := manifest.get("familiar")):
+        return {}
+    size, directions = familiar["size"], familiar["directions"]
+    return {
+        "familiar_mean": (size,),
+        "familiar_directions": (directions, size),
+        "familiar_spread": (directions,),
+        "familiar_limits": (2,),
+    }
 
 
 def largest_tolerance(mode: str, action: str) -> float:

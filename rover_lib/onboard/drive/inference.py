@@ -214,10 +214,12 @@ class PolicyProcess:
             self._pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
-        answer = np.frombuffer(self._answer(None), np.uint8)
-        if answer.size != 4 * 2 * self.chunk:
+        answer, known = np.frombuffer(self._answer(None), np.uint8), "familiar" in self.manifest
+        if answer.size != 4 * (2 * self.chunk + known):
             raise PolicyError(f"{self.artifact}: unexpected size of a plan", found=f"{answer.size} bytes")
-        return answer.view(np.float32).reshape(self.chunk, 2)
+        values = answer.view(np.float32)
+        self.strange = float(values[-1]) if known else None
+        return values[: 2 * self.chunk].reshape(self.chunk, 2)
 
     def _answer(self, timeout_s: float | None) -> bytes:
         assert self._pipe, "it is open"
@@ -264,7 +266,8 @@ def serve(pipe: Connection, artifact: str, threads: int) -> None:
             frame = np.frombuffer(pipe.recv_bytes(), np.uint8).reshape(shape)
             try:
                 chunk = policy.predict_unclipped(frame, np.array(state, np.float32))
-                answer = b"=" + np.ascontiguousarray(chunk, np.float32).tobytes()
+                strange = [] if policy.strange is None else [policy.strange]
+                answer = b"=" + np.array([*chunk.flat, *strange], np.float32).tobytes()
             except Exception as error:
                 answer = _refusal(f"{artifact}: inference failed", error)
             pipe.send_bytes(answer)

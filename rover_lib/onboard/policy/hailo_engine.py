@@ -45,13 +45,13 @@ class HailoEngine(Engine):
         self.threads = threads or usable_cores()
         self._rest = session_of(artifact.record(ONNX), self.threads, self._path)
 
-    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
         """As Engine.run()."""
         try:
             for stream, frame in zip(self._inputs.values(), frames_rgb, strict=True):
                 self._bindings.input(stream).set_buffer(np.ascontiguousarray(frame))
             self._network.run([self._bindings], TIMEOUT_MS)
-            return self._rest.run(None, {"state": state[None], **self._answers})[0]
+            return self._rest.run(None, {"state": state[None], **self._answers})
         except Exception as e:  # HailoRT raises a dozen types, and so does ONNX Runtime
             raise RuntimeError(f"{type(e).__name__}: {e}") from None
 

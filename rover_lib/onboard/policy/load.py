@@ -13,6 +13,7 @@ from rover_lib.onboard.artifact.manifest import Artifact, car_of
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.confine import refuse_root
+from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
 from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.onboard.policy.preprocess import prepare_frame
 
@@ -24,9 +25,13 @@ def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
 
 
 class Policy:
-    """A loaded artifact, as `load_policy` returns it. car: the car for which it plans."""
+    """A loaded artifact, as `load_policy` returns it. car: the car for which it plans.
 
-    def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any]):
+    strange: how unfamiliar the newest prediction's picture is, as a share of the artifact's threshold, NaN if that
+    cannot be told; None for an artifact without one.
+    """
+
+    def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any], familiar: Familiar | None = None):
         self.path = path
         self.manifest = manifest
         self.action_names: tuple[str, ...] = tuple(manifest["action_names"])
@@ -35,7 +40,8 @@ class Policy:
         self.chunk: int = manifest["chunk"]
         self.rate_hz = float(manifest["rate_hz"])
         self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
-        self._engine = engine
+        self._engine, self._familiar = engine, familiar
+        self.strange: float | None = None
         self.car = car_of(manifest)
         self._low, self._high = action_limits(self.action_names, self.car)
 
@@ -70,10 +76,15 @@ class Policy:
 
     def run(self, state: np.ndarray, frames_rgb: list[np.ndarray]) -> np.ndarray:
         """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped."""
-        y = self._engine.run(state, frames_rgb)
+        y, *embeddings = self._engine.run(state, frames_rgb)
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
             what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
             raise PolicyError(what, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
+        if self._familiar:
+            shapes = [embedding.shape for embedding in embeddings]
+            if shapes != [(1, *self._familiar.mean.shape)]:
+                raise PolicyError(f"{self.path}: gives another embedding than its manifest says", found=shapes)
+            self.strange = float(self._familiar.strange(embeddings[0])[0])
         return y[0].copy()
 
     @property
@@ -108,20 +119,25 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     source.prove()
     engine = import_engine(source).load(source, threads)
     path, vectors = source.path, source.parity
-    policy = Policy(path, engine, source.manifest)
-    chunks = _predict(policy, vectors)
+    policy = Policy(path, engine, source.manifest, Familiar.of(vectors))
+    chunks, strange = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
-    if engine.give_back() and not np.array_equal(_predict(policy, vectors), chunks):
+    _check_strange(policy, strange, vectors)
+    if engine.give_back() and not np.array_equal(_predict(policy, vectors)[0], chunks):
         raise ArtifactError(f"{path}: predicts differently without its original weights", remedy="do not drive")
     give_back_freed()
     return policy
 
 
-def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the policy's answers to the parity vectors, (n, chunk, A) float32."""
+def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> tuple[np.ndarray, list[float | None]]:
+    """Return the policy's answers to the parity vectors: (n, chunk, A) float32, and n times Policy.strange."""
     frames = [vectors[f"frame_{c}"] for c in policy.cameras]
+    chunks, strange = [], []
     try:
-        return np.stack([policy.run(s, [f[i] for f in frames]) for i, s in enumerate(vectors["state"])])
+        for i, state in enumerate(vectors["state"]):
+            chunks.append(policy.run(state, [f[i] for f in frames]))
+            strange.append(policy.strange)
+        return np.stack(chunks), strange
     except PolicyError as e:
         raise ArtifactError(e.what, found=e.found, remedy=e.remedy) from None
     except (IndexError, RuntimeError) as e:
@@ -137,3 +153,13 @@ def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str,
         if not d <= tolerance[name]:  # so that NaN fails too
             what = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
             raise ArtifactError(what, remedy="do not drive with it")
+
+
+def _check_strange(policy: Policy, strange: list[float | None], vectors: Mapping[str, np.ndarray]) -> None:
+    """Raise ArtifactError if the parity vectors' pictures are more or less familiar here than where it was made."""
+    if not (familiar := Familiar.of(vectors)):
+        return
+    difference = np.abs(familiar.strange(vectors["embedding"]) - np.array(strange)).max()
+    if not difference <= TOLERANCE[policy.manifest["mode"] != "fp32"]:  # so that NaN fails too
+        what = f"{policy.path}: how unfamiliar a picture is differs here by {difference:.3g} of the threshold"
+        raise ArtifactError(what, remedy="do not drive with it")

@@ -41,13 +41,12 @@ class OnnxEngine(Engine):
         self._session, self.threads = session_of(model, threads, path), threads
         self.names = [i.name for i in self._session.get_inputs()]
 
-    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
         inputs = dict(zip(self.names, (state[None], *frames_rgb), strict=True))
         try:
-            (y,) = self._session.run(None, inputs)
+            return self._session.run(None, inputs)
         except Exception as e:  # ONNX Runtime raises a dozen types, none of them a RuntimeError
             raise RuntimeError(str(e)) from None
-        return y
 
 
 def load(artifact: Artifact, threads: int | None) -> OnnxEngine:

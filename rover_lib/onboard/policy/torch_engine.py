@@ -17,11 +17,11 @@ class TorchEngine:
     def __init__(self, module: torch.jit.ScriptModule):
         self._module = module
 
-    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> np.ndarray:
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
         # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
         with torch.inference_mode(), torch.jit.optimized_execution(False):
             y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
-        return y.numpy()
+        return [each.numpy() for each in (y if isinstance(y, tuple) else (y,))]
 
     def give_back(self) -> bool:
         return give_back_packed_weights(self._module) > 0

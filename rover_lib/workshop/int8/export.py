@@ -21,9 +21,12 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
 from rover_lib.onboard.wheel_version import VERSION
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.int8.familiar import Drives, fit
+from rover_lib.workshop.int8.graph import graph_of, with_embedding
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, int8_layers
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
@@ -46,10 +49,10 @@ class TorchScript:
             frozen = torch.jit.freeze(torch.jit.trace(module, example_inputs(config), check_trace=False).eval())
         self.traced = _reread(frozen)
 
-    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        """Return the actions for n inputs, (n, C, A) float32, not clipped."""
-        with torch.jit.optimized_execution(False):
-            return predictions(self.traced, inputs)
+    def run(self, inputs: tuple[Tensor, ...]) -> Sequence[Tensor]:
+        """Return the actions, (1, C, A) float32, not clipped; then the embedding, (1, D), if the module gives one."""
+        with torch.inference_mode(), torch.jit.optimized_execution(False):
+            return _each(self.traced(*inputs))
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
         return artifact.save_artifact(path, self.traced, manifest, vectors)
@@ -78,20 +81,26 @@ class Onnx:
         import onnxruntime
 
         from rover_lib.onboard.policy.onnx_engine import session_of
-        from rover_lib.workshop.int8.onnx_graph import graph_of, onnx_model
+        from rover_lib.workshop.int8.onnx_graph import onnx_model
 
         self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}
         self.names = ["state", *(f"frame_{name}" for name in config.cameras)]
         inputs = dict(zip(self.names, example_inputs(config), strict=True))
-        self.model = onnx_model(graph_of(module), inputs, ("chunk",)).SerializeToString(deterministic=True)
+        graph = graph_of(module)
+        outputs = ("chunk", "embedding")[: len(_each(graph(*inputs.values())))]
+        self.model = onnx_model(graph, inputs, outputs).SerializeToString(deterministic=True)
         self.session = session_of(self.model, torch.get_num_threads())
 
-    def predict(self, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
-        named = ({k: v.numpy() for k, v in zip(self.names, x, strict=True)} for x in inputs)
-        return torch.cat([torch.from_numpy(self.session.run(None, x)[0]) for x in named])
+    def run(self, inputs: tuple[Tensor, ...]) -> Sequence[Tensor]:
+        named = {name: x.numpy() for name, x in zip(self.names, inputs, strict=True)}
+        return [torch.from_numpy(y) for y in self.session.run(None, named)]
 
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
         return artifact.save_onnx(path, self.model, manifest, vectors)
+
+
+def _each(outputs: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return outputs if isinstance(outputs, tuple) else (outputs,)
 
 
 Form = TorchScript | Onnx
@@ -125,18 +134,29 @@ class Exporter:
     def gmac(self) -> float:
         return sum(multiply_accumulates(self.float_policy).values()) / 1e9
 
-    def export(self, policy: ACT | QuantizedPolicy, path: Path | str, calibration: Calibration | None = None) -> str:
-        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX, and return its content hash.
+    def export(
+        self,
+        policy: ACT | QuantizedPolicy,
+        path: Path | str,
+        calibration: Calibration | None = None,
+        drives: Drives | None = None,
+    ) -> tuple[str, dict[str, Any]]:
+        """Write the artifact, for ONNX Runtime if the path ends in ONNX_SUFFIX.
 
-        calibration: a quantized policy's, for the manifest. Raises ArtifactError, and writes nothing, if the engine's
-        form of the policy does not compute what the policy computes, or gives anything that is not finite.
+        calibration: a quantized policy's, for the manifest. drives: by which it will tell how unfamiliar a picture is,
+        if they are enough for that. Returns its content hash, and what `familiar.fit` says of the drives, or {}. Raises
+        ArtifactError, and writes nothing, if the engine's form of the policy does not compute what the policy computes,
+        or gives anything that is not finite.
         """
         config = self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
-        form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(module, config)
+        tells = drives is not None and not drives.warnings
+        given = with_embedding(module) if tells else module
+        form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(given, config)
         # The eager policy is slow, so it answers only the stored samples.
         expected = predictions(module, [self.inputs[i] for i in self.stored])
-        actions = form.predict(self.inputs)
+        outputs = [form.run(x) for x in self.inputs]
+        actions = torch.cat([each[0] for each in outputs])
         if not torch.isfinite(actions).all():
             raise ArtifactError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
         # The limit follows from the policy's own error. Taken from the form, it would grow with the form's mistakes.
@@ -155,7 +175,23 @@ class Exporter:
         states, *frames = zip(*(self.inputs[i] for i in self.stored), strict=True)
         vectors = {"state": np.concatenate(states), "chunk": actions[self.stored].numpy()}
         vectors |= {f"frame_{name}": np.stack(seen) for name, seen in zip(config.cameras, frames, strict=True)}
-        return form.save(path, manifest, vectors)
+        described: dict[str, Any] = {}
+        if drives is not None and tells:
+            familiar, described = fit(drives, lambda sample: form.run(inputs_of(sample, config))[1][0].numpy())
+            sizes = dict(zip(("directions", "size"), familiar.directions.shape, strict=True))
+            manifest["familiar"] = sizes | {"drives": described["drives"]}
+            vectors |= familiar.arrays() | {"embedding": np.concatenate([outputs[i][1] for i in self.stored])}
+            self._check_embedding(given, familiar, vectors["embedding"], path)
+        return form.save(path, manifest, vectors), described
+
+    def _check_embedding(self, module: nn.Module, familiar: Familiar, found: np.ndarray, path: Path | str) -> None:
+        """Raise ArtifactError unless the eager module's embeddings of the stored samples are as familiar as `found`."""
+        with torch.inference_mode():
+            wanted = np.concatenate([module(*self.inputs[i])[1] for i in self.stored])
+        gap = np.abs(familiar.strange(found) - familiar.strange(wanted)).max()
+        if not gap <= TOLERANCE[True]:
+            what = f"{path}: how familiar a picture is differs by {gap:.3g} in the written graph; nothing was written"
+            raise ArtifactError(what)
 
     def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
         """Return the manifest without its parity."""
@@ -211,8 +247,8 @@ def export(
     samples: Sequence[Sample],
     calibration: Calibration | None = None,
 ) -> str:
-    """Write one artifact as `Exporter.export` does."""
-    return Exporter(checkpoint, samples).export(policy, path, calibration)
+    """Write one artifact as `Exporter.export` does, and return its content hash."""
+    return Exporter(checkpoint, samples).export(policy, path, calibration)[0]
 
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:

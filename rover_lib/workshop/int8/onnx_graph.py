@@ -24,7 +24,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 from torch.ao.nn.intrinsic import quantized as fused_int8
 from torch.ao.nn.quantized import modules as int8
-from torch.fx import GraphModule, Interpreter, Node, Tracer
+from torch.fx import GraphModule, Interpreter, Node
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import Columns
@@ -32,16 +32,6 @@ from rover_lib.workshop.act import Columns
 OPSET = 17  # the first with LayerNormalization, the last that Hailo's parser documents
 IR_VERSION = 8  # the version of ONNX's file format that belongs to that opset
 ONNX_TYPES = {torch.float32: TensorProto.FLOAT, torch.uint8: TensorProto.UINT8, torch.int8: TensorProto.INT8}
-
-
-class _Leaves(Tracer):
-    def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
-        return isinstance(m, Columns) or super().is_leaf_module(m, module_qualified_name)
-
-
-def graph_of(module: nn.Module) -> GraphModule:
-    """Trace a float module of ours with FX. The module of a quantized policy is a graph already."""
-    return module if isinstance(module, GraphModule) else GraphModule(module, _Leaves().trace(module))
 
 
 def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> onnx.ModelProto:
@@ -310,6 +300,10 @@ def _squeeze(w: _Writer, n: Node, result: Tensor, m: None) -> str:
     return w.unary(str(n.target).capitalize(), n, w.ints(f"{n.name}_axes", n.args[1:]))  # type: ignore[arg-type]
 
 
+def _mean(w: _Writer, n: Node, result: Tensor, m: None) -> str:
+    return w.unary("ReduceMean", n, axes=[n.args[1]], keepdims=0)
+
+
 def _cast(w: _Writer, n: Node, result: Tensor, m: None) -> str:
     return w.unary("Cast", n, to=ONNX_TYPES[result.dtype])
 
@@ -367,6 +361,7 @@ WRITERS: dict[Any, Callable[..., Any]] = {
     **dict.fromkeys(("flatten", "unflatten", "reshape"), _reshape),
     **dict.fromkeys(("squeeze", "unsqueeze"), _squeeze),
     "float": _cast,
+    "mean": _mean,
     torch.cat: _cat,
     **dict.fromkeys((operator.add, "add"), _plain("Add")),  # "add": a constant plus a value, in this order
     **dict.fromkeys((operator.mul, "mul"), _plain("Mul")),

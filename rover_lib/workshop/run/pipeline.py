@@ -22,7 +22,8 @@ from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.choose import Chooser
-from rover_lib.workshop.int8.export import Exporter, export
+from rover_lib.workshop.int8.export import Exporter
+from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
@@ -34,6 +35,7 @@ from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
+DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared
 CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
 # Odd frames need more: ranges chosen on 16 were half as bad again on others. The 64 also tell what share is odd.
 ODD_CHOOSING_FRAMES = 64
@@ -112,8 +114,9 @@ def make_artifact(
     if odd_share(calibration.frames):
         scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, recipe.observers, progress)
     policy = quantize(checkpoint, scheme, calibration)
-    digest = export(policy, checkpoint, path, samples, calibration)
-    return digest, ([note] if note else []) + policy.report["warnings"]
+    drives = Drives.of(parts)
+    digest, _ = Exporter(checkpoint, samples).export(policy, path, calibration, drives)
+    return digest, ([note] if note else []) + drives.warnings + policy.report["warnings"]
 
 
 def export_policies(
@@ -122,20 +125,24 @@ def export_policies(
     policies: Mapping[str, ACT | QuantizedPolicy],
     calibration: Calibration,
     samples: Sequence[Sample],
+    drives: Drives | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Write policy_<name>.pt of each policy into `folder`, without other modes' of before; what quantize.json says."""
+    """Write policy_<name>.pt of each policy into `folder`, without other modes' of before; what quantize.json says.
+
+    drives: by which those that a rover may drive by (DRIVEN) tell how unfamiliar a picture is.
+    """
     described = {}
     for mode in set(ARTIFACTS) - policies.keys():
         (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
     exporter = Exporter(checkpoint, samples)
     for name, policy in policies.items():
         forget_graphs()
-        path = Path(folder) / f"policy_{name}.pt"
+        path, known = Path(folder) / f"policy_{name}.pt", drives if name in DRIVEN else None
+        quantized = isinstance(policy, QuantizedPolicy)
+        digest, familiar = exporter.export(policy, path, calibration if quantized else None, known)
+        described[name] = {"content_hash": digest} | ({"familiar": familiar} if familiar else {})
         if isinstance(policy, QuantizedPolicy):
-            digest = exporter.export(policy, path, calibration)
-            described[name] = policy.report | {"scheme": asdict(policy.scheme), "content_hash": digest}
-        else:
-            described[name] = {"content_hash": exporter.export(policy, path)}
+            described[name] |= policy.report | {"scheme": asdict(policy.scheme)}
     return described
 
 
@@ -150,6 +157,7 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     again = open_run(run_dir, progress)
     checkpoint, parts = again.checkpoint, again.parts
     exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES))
+    drives = Drives.of(parts)
     stage = read_stage(run_dir / "quantize.json", "quantize")
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
@@ -164,7 +172,7 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     written = {}
     for name, policy in progress(policies.items(), desc="for ONNX Runtime", total=len(policies)):
         path = run_dir / f"policy_{name}{ONNX_SUFFIX}"
-        written[path.name] = exporter.export(policy, path, calibration if name == "static" else None)
+        written[path.name], _ = exporter.export(policy, path, calibration if name == "static" else None, drives)
         forget_graphs()
     return written
 

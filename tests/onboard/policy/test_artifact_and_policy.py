@@ -54,7 +54,7 @@ def test_refuses_what_is_not_an_observation_and_plans_that_are_not_finite(artifa
     ):
         with pytest.raises(PolicyError):
             policy.predict_chunk(frame, state)
-    monkeypatch.setattr(policy._engine, "run", lambda *x: np.full((1, 32, 2), np.nan, np.float32))
+    monkeypatch.setattr(policy._engine, "run", lambda *x: [np.full((1, 32, 2), np.nan, np.float32)])
     with pytest.raises(PolicyError):
         policy.predict_chunk(FRAME, STATE)
 

@@ -1,0 +1,96 @@
+"""What is familiar to a policy: fitted on recorded pictures, with a threshold from whole drives that it never saw.
+
+    drives = Drives.of(loaded.parts)
+    familiar, described = fit(drives, embed)
+
+The threshold is split conformal prediction: the largest score, smoothed as on the rover, of n drives that neither
+trained the policy nor fitted the scores. Of new drives like them, one in n + 1 goes beyond it, whatever the scores are.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rover_lib.onboard.drive.plan import smoothed
+from rover_lib.onboard.policy.familiar import Familiar
+from rover_lib.workshop.recordings.episodes import Split
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, pick_evenly
+
+DIRECTIONS = 64  # the demo's drives that failed were stopped a little more often than with 32
+KNOWN_FRAMES = 640  # ten for each direction
+FEWEST_DRIVES = 19  # one in 20 good drives is 5 %
+MOST_DRIVES = 39  # one in 40; more would only raise the threshold
+EVERY_S = 0.1  # between the pictures of a drive, as between a Pi's plans
+SHOWN = 6  # pictures
+BETWEEN = 0.95  # of the interval of a rate
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What familiarity is fitted on: pictures of the drives that calibrate, and whole drives of the other two parts.
+
+    warnings: why there is no threshold; [] if there is one.
+    """
+
+    known: tuple[Sample, ...]
+    unseen: dict[str, tuple[Sample, ...]]
+
+    @classmethod
+    def of(cls, parts: Split) -> "Drives":
+        """Take some frames of the calibration part, and every EVERY_S a frame of the others' whole drives."""
+        names, drives = {s.episode for s in parts.calibration}, dict[str, list[Sample]]()
+        for sample in (*parts.choosing, *parts.held_out):
+            if sample.episode not in names:  # else a part of a drive, where few were parted along time
+                drives.setdefault(sample.episode, []).append(sample)
+        chosen = {name: drives[name] for name in pick_evenly(list(drives), MOST_DRIVES)}
+        every = {name: max(1, round((frame_rate_hz(of) or 1) * EVERY_S)) for name, of in chosen.items()}
+        unseen = {name: tuple(of[:: every[name]]) for name, of in chosen.items()}
+        return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen)
+
+    @property
+    def warnings(self) -> list[str]:
+        if len(self.unseen) >= FEWEST_DRIVES:
+            return []
+        what = f"{len(self.unseen)} drives are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
+        return [f"{what}: nothing stops this policy where it has seen nothing like it"]
+
+
+def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar, dict[str, Any]]:
+    """Return what is familiar, and what quantize.json says of it.
+
+    embed: returns a sample's embedding, (D,) float32. Described are the largest score of each unseen drive, as a share
+    of the threshold, the rate of good drives that the threshold stops, and the pictures that are least familiar.
+    """
+    known = np.stack([embed(sample) for sample in drives.known])
+    mean = known.mean(0)
+    _, sizes, rows = np.linalg.svd(known - mean, full_matrices=False)
+    directions = min(DIRECTIONS, (len(sizes) + 1) // 2)
+    spread = np.maximum(sizes / len(known) ** 0.5, 1e-6 * max(float(sizes[0]), 1e-6))[:directions]
+    familiar = Familiar(mean, rows[:directions], spread.astype(np.float32), np.ones(2, np.float32))
+    # Both scores in their own unit, from drives that do not set the threshold
+    unit = np.quantile(familiar.scores(known), 0.99, axis=0).clip(1e-6)
+    familiar.limits = unit.astype(np.float32)
+    scores = {name: familiar.strange(np.stack([embed(s) for s in of])) for name, of in drives.unseen.items()}
+    threshold = max(map(largest_smoothed, scores.values()))
+    familiar.limits = (unit * threshold).astype(np.float32)
+    shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
+    low, high = rate_interval(len(shares))
+    least = [
+        {"episode": name, "frame": drives.unseen[name][int(scores[name].argmax())].frame_name, "strange": shares[name]}
+        for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]
+    ]
+    rate = {"stopped_pct": 100 / (len(shares) + 1), "stopped_low_pct": 100 * low, "stopped_high_pct": 100 * high}
+    return familiar, {"drives": len(shares), **rate, "largest": shares, "least": least}
+
+
+def largest_smoothed(scores: np.ndarray) -> float:
+    """Return the largest score of a drive's pictures, (n,), after the smoothing that the rover does."""
+    return max(smoothed(scores[: i + 1].tolist()) for i in range(len(scores)))
+
+
+def rate_interval(drives: int) -> tuple[float, float]:
+    """Return the 95 % interval of the rate of new drives beyond the largest of so many: of a Beta(1, drives)."""
+    tail = (1 - BETWEEN) / 2
+    return 1 - (1 - tail) ** (1 / drives), 1 - tail ** (1 / drives)

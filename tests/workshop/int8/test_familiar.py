@@ -1,0 +1,108 @@
+"""What is familiar to a policy: the threshold, and the artifacts that carry it, in each engine."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from policies import MemorySample, memory_samples
+
+from rover_lib.onboard.artifact import manifest as artifact
+from rover_lib.onboard.artifact.manifest import Artifact
+from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.policy.load import load_policy
+from rover_lib.workshop.act import ACT
+from rover_lib.workshop.int8.export import Exporter
+from rover_lib.workshop.int8.familiar import Drives, fit, rate_interval
+from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.int8.scheme import Scheme
+
+NOISE = np.random.default_rng(5).integers(0, 256, (72, 128, 3), np.uint8)
+MADE = ("policy_fp32.pt", "policy_static.pt", "policy_fp32.onnx.zip", "policy_static.onnx.zip")
+
+
+@dataclass(frozen=True, eq=False)
+class Timed(MemorySample):
+    time_s: float = 0.0
+    frame_name: str = "picture.jpg"
+
+
+def drives_of(samples, each=2):
+    """As a split: 12 of the samples calibrate, the others are held-out drives of `each` pictures, 0.1 s apart."""
+    timed = [Timed(s.state, s.picture, i % each, str(i // each), i % each / 10) for i, s in enumerate(samples)]
+    calibration = [replace(s, episode="calibration") for s in timed[:12]]
+    return Drives.of(SimpleNamespace(calibration=calibration, choosing=(), held_out=timed[12:]))
+
+
+@pytest.fixture(scope="module")
+def made(thin, tmp_path_factory):
+    """The thin policy in both modes for both engines, with what is familiar to it, and FP32 without."""
+    (policy, calibration), folder = thin, tmp_path_factory.mktemp("familiar")
+    exporter, drives = Exporter(policy, memory_samples(4, seed=1)), drives_of(memory_samples(12 + 2 * 19))
+    for name in MADE:
+        static = "static" in name
+        module = quantize(policy, Scheme(), calibration) if static else ACT(policy.config, policy.weights)
+        exporter.export(module, folder / name, calibration if static else None, drives)
+    exporter.export(ACT(policy.config, policy.weights), folder / "without.pt")
+    return folder
+
+
+def test_of_new_drives_one_in_their_number_and_one_is_beyond_the_threshold():
+    rng, beyond, fits = np.random.default_rng(0), 0, 400
+    for _ in range(fits):
+        seen = iter(rng.normal(size=(12 + 2 * 19, 6)).astype(np.float32))
+        familiar, found = fit(drives_of(memory_samples(1) * (12 + 2 * 19)), lambda sample, seen=seen: next(seen))
+        first, both = (familiar.strange(rng.normal(size=(n, 6)).astype(np.float32)) for n in (1, 1))
+        beyond += max(first[0], (first[0] + both[0]) / 2) >= 1
+        assert found["drives"] == 19 and max(found["largest"].values()) == pytest.approx(1)
+    assert 0.025 < beyond / fits < 0.08  # 5 %
+    assert np.allclose(rate_interval(19), (0.00133, 0.17647), atol=1e-5)  # scipy.stats.beta(1, 19).ppf
+
+
+def test_too_few_drives_and_parts_of_a_drive_set_no_threshold(thin, tmp_path):
+    policy, _ = thin
+    few = drives_of(memory_samples(12 + 2 * 18))
+    assert "18 drives" in few.warnings[0] and not drives_of(memory_samples(12 + 2 * 19)).warnings
+    one = [Timed(s.state, s.picture, i, "one", i / 30) for i, s in enumerate(memory_samples(60))]
+    assert not Drives.of(SimpleNamespace(calibration=one[:20], choosing=one[20:40], held_out=one[40:])).unseen
+    module, exporter = ACT(policy.config, policy.weights), Exporter(policy, memory_samples(2))
+    plain = exporter.export(module, tmp_path / "plain.pt")
+    assert exporter.export(module, tmp_path / "few.pt", drives=few) == plain
+
+
+def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
+    state, (sample,) = np.zeros(2, np.float32), memory_samples(1)
+    policies = {name: load_policy(made / name) for name in (*MADE, "without.pt")}
+    plans = {name: policy.predict_unclipped(sample.picture, state) for name, policy in policies.items()}
+    assert np.array_equal(plans["policy_fp32.pt"], plans["without.pt"])
+    known = {name: policy.strange for name, policy in policies.items()}
+    assert known.pop("without.pt") is None and max(known.values()) < 1
+    assert known["policy_static.onnx.zip"] == pytest.approx(known["policy_static.pt"], abs=0.02)
+    assert known["policy_fp32.onnx.zip"] == pytest.approx(known["policy_fp32.pt"], abs=1e-4)
+    for name in MADE:
+        policies[name].predict_unclipped(NOISE, state)
+        assert policies[name].strange > 1.5
+    with PolicyProcess(made / "policy_static.pt", threads=1) as process:
+        assert process.predict(NOISE, state).shape == (process.chunk, 2)
+        assert process.strange == pytest.approx(policies["policy_static.pt"].strange)
+
+
+@pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes"])
+def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatch, change):
+    with Artifact(made / "policy_fp32.onnx.zip") as whole:
+        manifest, vectors, model = dict(whole.manifest), dict(whole.parity), whole.record(artifact.ONNX)
+    changed = {
+        "embedding": {"embedding": vectors["embedding"] + 0.1},
+        "mean": {"familiar_mean": np.full_like(vectors["familiar_mean"], np.nan)},
+        "limits": {"familiar_limits": np.ones(3, np.float32)},
+        "shape": {"familiar_directions": vectors["familiar_directions"].T},
+        "sizes": {},
+    }
+    if change == "sizes":
+        monkeypatch.setattr(artifact, "check_manifest", lambda *args: None)
+        manifest["familiar"] = manifest["familiar"] | {"size": -1}
+    artifact.save_onnx(tmp_path / "p.zip", model, manifest, vectors | changed[change])
+    monkeypatch.undo()
+    with pytest.raises(ArtifactError, match=r"unfamiliar|parity vector|sizes"):
+        load_policy(tmp_path / "p.zip")
