@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,7 +25,7 @@ from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
-from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
+from rover_lib.onboard.drive.plan import OFF, Commanded, Plan, Settings
 from rover_lib.onboard.errors import DriveFault, TrainingError
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import plain
@@ -44,8 +44,8 @@ Watch = Callable[[Order], bool]
 class Driven:
     """A drive through a world.
 
-    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by, or 'taken over'. orders: what was
-    commanded at each tick.
+    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by or a place was unfamiliar, or
+    'taken over'. orders: what was commanded at each tick.
     """
 
     outcome: str
@@ -135,7 +135,9 @@ class TimedCar:
             self._looked_at = self._tick
             state = self._commanded.state(self.clock(), self.policy.rate_hz)
             actions = self.policy.predict_unclipped(self.world.render(), state)
-            self._coming = Plan(len(self.plans) + 1, self.clock(), now_s + self._latency_s, actions)
+            strange = getattr(self.policy, "strange", None)
+            ready_s = now_s + self._latency_s
+            self._coming = Plan(len(self.plans) + 1, self.clock(), ready_s, actions, strange=strange)
 
 
 class WorldPilot(PolicyPilot):
@@ -166,7 +168,8 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     if latency_s < 0:
         raise TrainingError("a latency must be at least 0 s", found=latency_s)
     car = TimedCar(world, policy, latency_s)
-    return car.drive(settings, NoLog(), watch)
+    # What is judged is how the policy drives, not where it would have been stopped as unfamiliar.
+    return car.drive(replace(settings, unfamiliar=OFF), NoLog(), watch)
 
 
 # --- many drives ------------------------------------------------------------------------------------------------------

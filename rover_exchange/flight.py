@@ -33,7 +33,9 @@ def flight_figure(flight: Flight) -> Figure:
     if (ticks["fade"] < 1).any():
         # The area hangs from the top: its share of the height is the share of the throttle that is taken away.
         options = {"step": "post", "transform": throttle.get_xaxis_transform(), "color": RED, "alpha": 0.18, "lw": 0}
-        throttle.fill_between(t_s, ticks["fade"], 1, label="faded for the plan's age", **options)
+        throttle.fill_between(
+            t_s, ticks["fade"], 1, label="faded, for the plan's age or an unfamiliar place", **options
+        )
     _draw_plan(plan, ticks, flight.header.get("drive", {}))
     late.plot(t_s, ticks["late_ms"], ".", color=SLATE, ms=2.5, label="lateness of a command")
     for ax, name in zip(axes[:, 0], HEIGHTS, strict=True):
@@ -86,3 +88,9 @@ def _draw_plan(ax: Axes, ticks: Mapping[str, np.ndarray], drive: Mapping[str, An
         if isinstance(value, (int, float)):
             ax.axhline(1000 * value, color=colour, lw=1.2, ls="--", label=f"{label} {1000 * value:g} ms on")
     ax.set_ylim(0, None)
+    if np.isfinite(ticks["strange"]).any():
+        share = ax.twinx()
+        share.plot(t_s, ticks["strange"], color=RED, lw=1.1)
+        share.set(ylim=(0, max(1.2, np.nanmax(ticks["strange"]))))
+        share.axhline(1, color=RED, lw=0.8, ls=":")
+        share.set_ylabel("unfamiliar, of the limit", color=RED, fontsize=9)

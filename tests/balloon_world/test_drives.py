@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from balloon_world import drives
-from balloon_world.drives import drive_in, drive_missing, run_trials, wilson_interval
+from balloon_world.drives import NoLog, TimedCar, drive_in, drive_missing, run_trials, wilson_interval
 from balloon_world.world import World, expert
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, TrainingError
@@ -44,6 +44,18 @@ class Foresees:
             if not world.done:
                 world.step(*plan[-1])
         return np.array(plan, np.float32) * (math.nan if self.planned == self.fails_at else 1)
+
+
+class Strange(Foresees):
+    """Finds all pictures from its third on so strange."""
+
+    def __init__(self, strange):
+        super().__init__()
+        self._strange = strange
+
+    @property
+    def strange(self):
+        return self._strange if self.planned > 2 else 0.5
 
 
 def late(seconds, pushes=0, policy=None, **settings):
@@ -104,6 +116,15 @@ def test_a_plan_that_grows_too_old_stops_the_car(monkeypatch):
     assert (never.outcome, never.orders, len(path)) == ("stopped", [], 1)
     monkeypatch.setattr(Foresees, "chunk", 12)
     assert ages_in_ticks(late(0.3)[0]) == [9, 10, 11]  # a chunk that ends sooner than the limit stops the car there
+
+
+def test_a_place_that_is_unfamiliar_stops_the_car():
+    driven = {strange: TimedCar(Seen(CURVE), Strange(strange), 0.1).drive(SETTINGS, NoLog()) for strange in (0.9, 1.1)}
+    assert {strange: drive.outcome for strange, drive in driven.items()} == {0.9: "hit", 1.1: "stopped"}
+    assert late(0.1, policy=Strange(1.1))[0].outcome == "hit"  # who judges how it drives does not stop it
+    unfamiliar = [order.strange >= 1 for order in driven[1.1].orders]
+    assert unfamiliar.index(True) == 12  # with the third strange plan, of one every three ticks
+    assert 14 <= sum(unfamiliar) <= 16  # the throttle fades in half a second
 
 
 def test_a_policy_that_fails_is_not_a_car_that_was_stopped():

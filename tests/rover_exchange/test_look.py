@@ -176,12 +176,13 @@ def lines_of(ax):
 def test_what_is_drawn(tmp_path):
     flight = read_log(drive(tmp_path, pictures=False))
     figure = flight_figure(flight)
-    _, steering, throttle, plan, late = figure.axes
+    _, steering, throttle, plan, late, unfamiliar = figure.axes
     assert lines_of(steering)["commanded, us"].get_ydata().tolist() == flight.ticks["steering_us"].tolist()
     assert lines_of(throttle)["the Arduino's pin"].get_ydata().tolist() == flight.ticks["pins_throttle_us"].tolist()
     assert len(lines_of(plan)["latency of each"].get_xdata()) == 10  # one per plan, not per tick
     assert lines_of(plan)["stopped from 1000 ms on"].get_ydata()[0] == 1000
     assert lines_of(late)["lateness of a command"].get_ydata().tolist() == flight.ticks["late_ms"].tolist()
+    assert unfamiliar.get_lines()[0].get_ydata().tolist() == flight.ticks["strange"].tolist()
     empty = flight_figure(read_log(drive(tmp_path, pictures=False, recorded=False, seconds=0.0)))
     for drawn in (figure, empty):
         drawn.draw_without_rendering()

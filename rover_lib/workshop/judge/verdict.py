@@ -46,7 +46,7 @@ def verdict(
         row["because"] = _because(row, best, limits)
     if deploy is None:
         best["because"] = "the best of them"
-    why = unfit or _why(best, rows["fp32"])
+    why = unfit or [*_why(best, rows["fp32"]), *_familiar(stages["quantize"]["modes"].get(best["mode"], {}))]
     if other_robot:
         robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
         why.append(f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in other_robot)}.")
@@ -201,6 +201,16 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     elif best["times_faster"]:
         size += f", and is {best['times_faster']:.1f} times as fast, measured here"
     return [*lines, f"{size}."]
+
+
+def _familiar(made: Mapping[str, Any]) -> list[str]:
+    """Say how often it stops a good drive, and by what drives that is known; made: a mode in quantize.json."""
+    if not (found := made.get("familiar")):
+        return []
+    low, high = found["stopped_low_pct"], found["stopped_high_pct"]
+    drives, least = found["drives"], found["least"][0]
+    rate = f"It stops about 1 in {drives + 1} good drives ({low:.1f} to {high:.0f} %, from {drives} held-out ones)"
+    return [f"{rate}; it has seen nothing like {least['frame']} of {least['episode']}."]
 
 
 def _because(row: Mapping[str, Any], best: Mapping[str, Any], limits: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ Each subject has a module; `style` has what all figures share.
 # ruff: noqa: F401, these are the names that notebooks use
 
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.comparison import action_error, worst_frames
+from rover_lib.workshop.plots.comparison import action_error, familiarity, worst_frames
 from rover_lib.workshop.plots.quantization import sensitivity
 from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.plots.style import save

@@ -1,5 +1,8 @@
 """Notebook 04: INT8 beside FP32."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -63,4 +66,21 @@ def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz
     for ax in axes[-1, 1:]:
         ax.set_xlabel(AHEAD)
     legend_below(fig, axes[0, 1], 3)
+    return fig
+
+
+def familiarity(found: Mapping[str, Any], samples: Sequence[Any]) -> Figure | Note:
+    """Draw the largest score of each held-out drive beside the threshold, and the pictures that are least familiar.
+
+    found: a mode's "familiar" of quantize.json, if it has a threshold. samples: those of the held-out drives.
+    """
+    if not found:
+        return Note("too few drives are held out to tell what is unfamiliar: nothing stops the policy there")
+    fig, (ax, *fields) = style.figure_of(1 + len(found["least"]), 4, 2.3)
+    ax.bar(range(len(found["largest"])), sorted(found["largest"].values()), color=GREY)
+    ax.axhline(1, color=style.RED, lw=1.2)
+    ax.set(xlabel="held-out drives", ylabel="largest score, of the threshold", xticks=[])
+    pictures = {(sample.episode, sample.frame_name): sample for sample in samples}
+    for ax, least in zip(fields, found["least"], strict=True):
+        style.show_picture(ax, pictures[least["episode"], least["frame"]], f"{least['strange']:.2f} of it")
     return fig

@@ -53,6 +53,13 @@ def test_the_demo_deploys_static(demo):
     assert "drawn balloons" in "".join(judged["cautions"])
     assert commands(judged) == ["rover view runs/mine/policy_static.pt", "rover record --max-seconds 30 episodes"]
     assert v.verdict(demo, PARAMS, Names("runs/demo", "", ""))["next"][0]["command"] == "make watch"
+    least = [{"episode": "drive 7", "frame": "5.jpg", "strange": 1.0}]
+    rate = {"drives": 39, "stopped_low_pct": 0.065, "stopped_high_pct": 9.03}
+    demo["quantize"]["modes"]["static"]["familiar"] = rate | {"least": least}
+    assert (
+        "about 1 in 40 good drives (0.1 to 9 %" in judge(demo)["why"][-1]
+        and "5.jpg of drive 7" in judge(demo)["why"][-1]
+    )
 
 
 def row(mode, time_ms=10.0, error=0.1, size_mb=20.0, missed=()):
