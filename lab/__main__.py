@@ -152,5 +152,24 @@ def pi(ctx: click.Context, output: Path, demo: Path) -> None:
     _end(ctx, deploy_and_drive(output, demo, click.echo))
 
 
+@main.command("strange")
+@click.argument("output", type=FILE)
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose static artifact drives.")
+@click.option("--worlds", type=click.IntRange(min=1), default=200, show_default=True, help="Good drives of each kind.")
+@click.option("--each", type=click.IntRange(min=1), default=60, show_default=True, help="Drives of each strangeness.")
+@click.option("--real", type=FILE, help="Recordings of another room, to be unfamiliar.")
+def judge_strange(output: Path, demo: Path, worlds: int, each: int, real: Path | None) -> None:
+    """Make the balloon world strange, and see whether the policy stops in time, and only then. Writes OUTPUT as JSON.
+
+    Drives that were made are kept beside OUTPUT, and not made again.
+    """
+    from lab.driving.strange import judge_strangeness
+    from rover_lib.onboard.stage import write_stage
+
+    metrics = judge_strangeness(demo, worlds, each, real, output.with_suffix(".jsonl"), terminal_bar())
+    write_stage(output, "strange", params={"worlds": worlds, "each": each}, metrics=metrics)
+    show(metrics, False)
+
+
 if __name__ == "__main__":
     main()
