@@ -35,6 +35,7 @@ END_S = 1.0
 NICE = 5  # the control loop goes first
 PR_SET_PDEATHSIG = 1
 ANSWER_BYTES = 100_000
+UNTOLD = 99.0  # Plan.strange where the process tells no number, which a page could not show
 TERMINALS = {signal.SIGINT, signal.SIGHUP, signal.SIGQUIT}  # signals of a terminal to all its programs
 
 Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (2,) -> (chunk, 2)
@@ -218,7 +219,7 @@ class PolicyProcess:
         if answer.size != 4 * (2 * self.chunk + known):
             raise PolicyError(f"{self.artifact}: unexpected size of a plan", found=f"{answer.size} bytes")
         values = answer.view(np.float32)
-        self.strange = float(values[-1]) if known else None
+        self.strange = float(np.nan_to_num(values[-1], nan=UNTOLD, posinf=UNTOLD)) if known else None
         return values[: 2 * self.chunk].reshape(self.chunk, 2)
 
     def _answer(self, timeout_s: float | None) -> bytes:

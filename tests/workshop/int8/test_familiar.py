@@ -9,7 +9,7 @@ from policies import MemorySample, memory_samples
 
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.manifest import Artifact
-from rover_lib.onboard.drive.inference import PolicyProcess
+from rover_lib.onboard.drive.inference import UNTOLD, PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT
@@ -86,6 +86,10 @@ def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
     with PolicyProcess(made / "policy_static.pt", threads=1) as process:
         assert process.predict(NOISE, state).shape == (process.chunk, 2)
         assert process.strange == pytest.approx(policies["policy_static.pt"].strange)
+        whole = process._answer
+        process._answer = lambda timeout_s: whole(timeout_s)[:-4] + np.float32(np.nan).tobytes()
+        process.predict(NOISE, state)
+        assert process.strange == UNTOLD  # stops, and JSON takes it
 
 
 @pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes"])
