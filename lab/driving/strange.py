@@ -23,7 +23,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.episodes import Episode, load_recordings
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import open_run
 
@@ -34,7 +34,8 @@ BEFORE_S, AFTER_S = 0.5, 1.0  # in time is so long before the car passes the bal
 TURNED_RAD, BLUR_PX, HUE, DUSK = math.radians(15), 15, 40, 0.3
 GOOD = ("recorded", "driven", "pushed")  # by the expert, as the recordings; by the policy; by the policy with pushes
 FRAMES = 200  # on which INT8 and FP32 are compared
-BESIDE = ("mirrored", "a wall like a floor")  # of which nothing is promised
+ROOM = "another room's pictures"  # where there are recordings of one
+BESIDE = ("a film of another world", "mirrored", "a wall like a floor")  # of which nothing is promised
 IN_TIME = ("by_familiarity", "by_agreement", "by_either")
 
 
@@ -58,6 +59,11 @@ def _look(world: "StrangeWorld", frame: np.ndarray) -> np.ndarray:
 
 
 def _room(world: "StrangeWorld", frame: np.ndarray) -> np.ndarray:
+    samples = world.rooms[world.seed % len(world.rooms)].samples
+    return samples[round(world.state.time_s * RATE_HZ) % len(samples)].frame_bgr()
+
+
+def _film(world: "StrangeWorld", frame: np.ndarray) -> np.ndarray:
     world.other.state = replace(world.other.state, x_m=0.5 * world.state.time_s)  # moves, but not with the car
     return world.other.render()
 
@@ -69,7 +75,8 @@ HOW = {
     "dusk": lambda world, frame: (frame * DUSK).astype(np.uint8),
     "hue": _hue,
     "another world's look": _look,
-    "another room's pictures": _room,
+    ROOM: _room,
+    "a film of another world": _film,
     "mirrored": lambda world, frame: np.ascontiguousarray(frame[:, ::-1]),
     "a wall like a floor": lambda world, frame: np.concatenate([frame[2 * WALL - 1 : WALL - 1 : -1], frame[WALL:]]),
 }
@@ -78,9 +85,9 @@ HOW = {
 class StrangeWorld(World):
     """A world that is strange in one way, a name of HOW, from CHANGE_S on."""
 
-    def __init__(self, seed: int, how: str):
+    def __init__(self, seed: int, how: str, rooms: Sequence[Episode] = ()):
         super().__init__(seed)
-        self._how, self.other = how, World(seed + OTHER)
+        self._how, self.other, self.rooms = how, World(seed + OTHER), rooms
 
     def render(self) -> np.ndarray:
         frame = super().render()
@@ -102,23 +109,28 @@ def judge_strangeness(
     unseen = Drives.of(loaded.parts).unseen.values()
     most = max(max(_apart(_plans(policy, samples), span)) for samples in unseen)
 
+    rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
+
     def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
         how, seed = asked
         if how == "recorded":
             return _watch(policy, World(seed, SHOVES))
-        return _drive(policy, StrangeWorld(seed, how) if how in HOW else World(seed, SHOVES * (how == "pushed")), span)
+        world = StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES * (how == "pushed"))
+        return _drive(policy, world, span)
 
-    counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(HOW, each)
+    strange = [how for how in HOW if rooms or how != ROOM]
+    counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)
     asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
     found = drive_missing(artifact, asked, one, kept, progress)
     rows = {how: [row | _told(row, most) for key, row in found.items() if key[0] == how] for how in counts}
-    failed = [row for how in HOW if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
+    failed = [row for how in strange if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
     return {
         "threshold_drives": policy.manifest["familiar"]["drives"],
         "good_stopped": {how: _share([row["stopped"] for row in rows[how]]) for how in GOOD},
-        "strange": {how: _judge(rows[how]) for how in HOW},
+        "strange": {how: _judge(rows[how]) for how in strange},
         "failed_in_time": {name: _share([row[name] for row in failed]) for name in IN_TIME},
-        "real_unfamiliar_s": _judge_real(policy, real) if real else None,
+        "rooms_unfamiliar_s": _judge_rooms(policy, rooms),
+        "good_disagreeing": {how: _share([max(row["apart"]) >= most for row in rows[how]]) for how in GOOD[1:]},
         "int8_as_fp32": _compare(policy, fp32, pick_evenly(loaded.parts.held_out, FRAMES)),
     }
 
@@ -196,10 +208,10 @@ def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"drives": len(rows), "stopped": sum(row["stopped"] for row in rows), "failed": len(failed)} | told
 
 
-def _judge_real(policy: Policy, folder: Path) -> dict[str, float | None]:
+def _judge_rooms(policy: Policy, rooms: Sequence[Episode]) -> dict[str, float | None]:
     """When each recording would have stopped the car, in seconds from its first picture; None: not within two."""
     found = {}
-    for episode in load_recordings(folder, policy.chunk, params()["calibration"]["sync_s"]).episodes:
+    for episode in rooms:
         seen = episode.samples[: round(2 * RATE_HZ) : round(LATE_S * RATE_HZ)]
         scores = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in seen])
         times_s = (sample.time_s - seen[0].time_s for sample in seen)
