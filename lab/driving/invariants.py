@@ -289,7 +289,7 @@ def _as_planned(run: Run) -> str | None:
             fresh[c.at_ms : c.at_ms + VALID_MS] = False
     well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
     most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
-    if over := [c for c in run.seen.commands if c.throttle_us > most_us and not run.sick[c.at_ms]]:
+    if over := [c for c in run.seen.commands if c.throttle_us > most_us and c.planned]:
         return f"the host asks for throttle {over[0].throttle_us} us at {over[0].at_ms} ms"
     for i, (pin, neutral_us) in enumerate(NEUTRAL_US.items()):
         meant = [(p.at_ms, neutral_us + PER_UNIT_US[pin] * (min(p[2], LIMIT) if i else p[1])) for p in good]

@@ -233,7 +233,7 @@ class World:
         self.suspended_ms = 0  # for how long the host's machine has been suspended in all
         self.failing: BaseException | None = None  # to be raised when the host waits next
         self.unplugged = self.stuck = False
-        self.content_ms = 0  # content_ms (see Asked) of the newest order
+        self.content_ms, self.planned = 0, True  # see Asked: of the newest order, whose command may be sent again
         self.written: list[bytes] = []
         self._boot = 0
         self._due: list[tuple[int, int, Callable[[], object]]] = []
@@ -378,6 +378,6 @@ class World:
         self.written.append(line)
         if line.startswith(b">D"):
             _, sequence, _, steering_us, throttle_us = map(int, line[3:].split(b"*")[0].split())
-            asked = Asked(self.now_ms, throttle_us, self.content_ms, not self.mad_us, sequence, steering_us)
+            asked = Asked(self.now_ms, throttle_us, self.content_ms, self.planned, sequence, steering_us)
             self.seen.commands.append(asked)
         self.down.send(line)

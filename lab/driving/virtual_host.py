@@ -316,7 +316,7 @@ class _Pilot(PolicyPilot):
     def order(self, now_s: float) -> Order | None:
         order = super().order(now_s)
         if order:
-            self.world.content_ms = self.planner.content[order.plan]
+            self.world.content_ms, self.world.planned = self.planner.content[order.plan], not self.world.mad_us
             if self.world.mad_us:
                 order = replace(order, throttle_us=self.world.mad_us)
         return order
@@ -349,6 +349,16 @@ class _Log:
         self._world.seen.log.append((self._world.now_ms, text))
 
 
+class _Feed(Feed):
+    """A feed whose view says stop once, and keeps that for whoever asks next: also while the car is being armed."""
+
+    world: World
+
+    def over(self) -> str | None:
+        told, self.world.view_stop = self.world.view_stop, False
+        return "stopped from the view (127.0.0.1)" if told else None
+
+
 class _Session(Session):
     """The session of `rover drive`, which tells the world what the host is doing."""
 
@@ -370,9 +380,6 @@ class _Session(Session):
         self.process.armed()
         return telemetry
 
-    def over(self) -> str | None:
-        return "stopped from the view (127.0.0.1)" if self.process.world.view_stop else super().over()
-
 
 class Process:
     """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
@@ -390,7 +397,8 @@ class Process:
         world.alive = True
         self.eyes, commanded = Eyes(world), Commanded()
         self.planner = VirtualPlanner(world, self.eyes, commanded)
-        self._feed = Feed(NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self._feed = _Feed(NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self._feed.world = world
         self.session = _Session(
             DriveOptions(Path("virtual"), hz=RATE_HZ, asked_s=world.boottime()), Settings.of(params()["drive"]),
             self.report, self.log, self._feed, None, self.eyes.camera, self.planner, commanded, RATE_HZ, "virtual",
@@ -417,7 +425,6 @@ class Process:
     def armed(self) -> None:
         """Take note that the car was armed: what ends this drive is due from now on."""
         world = self.world
-        world.view_stop = False
         if self.session.service and self._limits.max_seconds:
             world.seen.stops.append((world.now_ms + LIMIT_MS, world.now_ms))
         if self.session.service and self._limits.heartbeat_s:
