@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -166,7 +166,7 @@ def drive_in(policy: Any, world: World, latency_s: float, settings: Settings, wa
     if latency_s < 0:
         raise TrainingError("a latency must be at least 0 s", found=latency_s)
     car = TimedCar(world, policy, latency_s)
-    return car.drive(settings, NoLog(), watch)
+    return car.drive(replace(settings, stuck_s=0.0), NoLog(), watch)  # its camera draws nothing for the loop
 
 
 # --- many drives ------------------------------------------------------------------------------------------------------

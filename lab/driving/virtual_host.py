@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 
 from lab.driving.virtual import DROPPING, FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
@@ -37,6 +38,7 @@ PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
 LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 NO_VIEW = Path("/nowhere/view")
+NOISE = np.random.default_rng(1).integers(0, 4, (72, 128, 3), np.uint8)  # of a camera, moved in each picture
 SIZE = (128, 72)  # of the camera's pictures, and of those that the policy has seen: width, height
 
 
@@ -237,7 +239,11 @@ class Eyes:
             return  # the last: pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
+        standing = lens.stands_ms is not None and lens.frozen_ms is None
+        shown_ms = min(content_ms, lens.stands_ms) if standing else content_ms
+        scene = scenery()[round(shown_ms / FRAME_MS) % len(scenery())]
+        if standing:
+            scene = cv2.add(scene, np.roll(NOISE, world.now_ms, 1))
         if lens.black:
             scene = (scene - scene.min()) // 64 + world.now_ms % 2
         picture = lens.film[self._shown % len(lens.film)] if lens.film else scene
@@ -341,7 +347,10 @@ class _Log:
         self._world = world
         self.start_s = world.clock()
         self.recent: deque[Any] = deque()
-        self.machine: dict[str, Any] = {}
+
+    @property
+    def machine(self) -> dict[str, Any]:
+        return {"t_s": self._world.clock() - self.start_s, "throttled": self._world.throttled}
 
     def tick(self, row: Any) -> None: ...
 
