@@ -156,7 +156,7 @@ class PolicyPilot:
         command = self._follower.command(now_s)
         if command is None:
             if self._follower.strange_s is not None:
-                raise DriveFault(_unfamiliar(self._follower.strange), remedy=RECORD_HERE)
+                raise DriveFault(unfamiliar(self._follower.strange), remedy=RECORD_HERE)
             why = f"the policy has not answered for {self._planner.asking_s:.1f} s"
             raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
         self._cut = max(self._cut, command.cut)
@@ -179,7 +179,7 @@ class PolicyPilot:
         self.sight.check()
         plan = self._planner.newest()
         if plan and plan.strange is not None and not plan.strange < 1 and self._settings.unfamiliar == STOP:
-            raise RoverError(_unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
+            raise RoverError(unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
@@ -194,14 +194,15 @@ class PolicyPilot:
             yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
         if self._follower.strange_s is not None and self._settings.unfamiliar == WARN and not self._said_strange:
             self._said_strange = True
-            yield _unfamiliar(self._follower.strange)
+            yield unfamiliar(self._follower.strange)
         if age_s > LATE_WARNING_S:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
 
 
-def _unfamiliar(strange: float | None) -> str:
+def unfamiliar(strange: float | None) -> str:
+    """Return the sentence for pictures that the policy has seen nothing like. strange: the smoothed Plan.strange."""
     return f"the policy has seen nothing like these pictures ({strange or 0:.2f} of its limit)"
 
 
