@@ -33,7 +33,7 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import TrainingError
 
-HOLD_S = 1.0
+HOLD_S = 0.6  # three plans; a car whose picture stands for 1.5 s of throttle counts as stuck
 STANDSTILL_S = 0.5  # if the machine stopped for longer than this, the world stopped too for the time beyond it
 NOISE = 3  # the noise's grey levels, 0 to 2; with noise, two frames of a car that stands still are never the same
 PIPE_BYTES = 1 << 20  # room for a whole frame

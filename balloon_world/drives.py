@@ -83,6 +83,7 @@ class TimedCar:
 
     def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> Driven:
         """Drive by the car's own loop until the world ends or `stop` is set."""
+        settings = replace(settings, stuck_s=0.0)  # its camera draws nothing for the loop
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
         try:
             drive(pilot, None, log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep)

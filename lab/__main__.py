@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.cli import ARTIFACT, FILE, Rover, drive_options, run_drive, show
+from rover_lib.onboard.cli import FILE, Rover, drive_options, run_drive, show
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.progress import terminal_bar
 
@@ -38,20 +38,6 @@ def drive(ctx: click.Context, **options: Any) -> None:
 
     build()  # in this process, where its errors are seen
     ctx.exit(run_drive(car=partial(VirtualCar, board=BOARD), **options))
-
-
-@main.command()
-@click.argument("artifact", type=ARTIFACT, required=False)
-@click.pass_context
-def doctor(ctx: click.Context, artifact: Path | None) -> None:
-    """Do `rover doctor` and its ritual with the transmitter, on an emulated Arduino. Exit code 1 if anything fails."""
-    from lab.arduino.rehearsal import rehearse
-
-    failed = False
-    for check in rehearse(artifact, lambda what: click.echo(f"  asked: {what}")):
-        click.echo(str(check))
-        failed |= check.verdict == "fail"
-    ctx.exit(1 if failed else 0)
 
 
 @main.command()

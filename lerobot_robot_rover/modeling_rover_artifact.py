@@ -22,8 +22,9 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.opening import another_car
-from rover_lib.onboard.drive.plan import Plan, Settings
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.drive.pilot import RECORD_HERE, unfamiliar
+from rover_lib.onboard.drive.plan import SMOOTHED, STOP, Plan, Settings, smoothed
+from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError
 from rover_lib.onboard.params import params
 
 _log = logging.getLogger("rover")
@@ -42,6 +43,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits = this_car().limits
         self._queue: deque[Tensor] = deque()
+        self._scores: list[float] = []  # Plan.strange of the newest plans
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
         self._process = PolicyProcess(config.file)
         weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
@@ -58,17 +60,30 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Prepare for an episode: wait for the human's gesture, which is not part of it, if a rover is connected."""
         self._queue.clear()
+        self._scores = []
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps or stop_s, a new one's."""
+        """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps or stop_s, a new one's.
+
+        Raises DriveFault where the policy has seen nothing like its pictures, unless params.yml has it otherwise.
+        """
         if boottime() - self._planned_s > _stop_s():
             self._queue.clear()
         if not self._queue:
             self._planned_s = boottime()
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
+            self._check_familiar()
         return self._queue.popleft()
+
+    def _check_familiar(self) -> None:
+        if self._process.strange is None or Settings.of(params()["drive"]).unfamiliar != STOP:
+            return
+        self._scores = [*self._scores, self._process.strange][-SMOOTHED:]
+        if not (strange := smoothed(self._scores)) < 1:
+            self._queue.clear()
+            raise DriveFault(unfamiliar(strange), remedy=RECORD_HERE)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return (B, chunk, 2) float32 [steering, throttle], clipped as `rover drive` clips it.

@@ -82,10 +82,11 @@ class Ride:
         """Return at once: there is an action from the start."""
 
     def order(self, now_s: float) -> Order:
-        """Return the newest action as an order. Raises CameraError if nobody should drive by what the camera shows."""
+        """Return the newest action as an order. Raises CameraError or DriveFault for pictures that stop the car."""
         frame = self._camera.latest()
         if frame:
             self._sight.watch(frame, now_s)
+            self._sight.watch_motion(frame)
         steering, throttle = self._action
         pulses, number = self._link.calibration.pulses(steering, throttle), frame.number if frame else 0
         return Order(steering, throttle, pulses.steering_us, pulses.throttle_us, frame=number)
@@ -107,7 +108,8 @@ class Ride:
     def _run(self) -> None:
         before = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
-        until, hooks = Until(stop=self._stop, over=self._late), Hooks(self._arm, HealthWatch(self.report, self._link))
+        health = HealthWatch(self.report, self._link, self._log, self._settings.undervoltage_s)
+        until, hooks = Until(stop=self._stop, over=self._late), Hooks(self._arm, health)
         try:
             drive(self, self._link, self._log, rate_hz=RATE_HZ, until=until, hooks=hooks, report=self.report)
         except BaseException as error:  # of any kind: LeRobot's loop must learn of it

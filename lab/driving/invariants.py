@@ -40,6 +40,9 @@ PLANNED_MS = 400  # a plan blends in within 100, and its commands hold for 265
 PER_UNIT_US = {"steering": 555.7, "throttle": 591.2}
 LIMIT = 0.2  # params.yml's throttle_limit
 BLACK_FRAMES = 4
+DRIVEN_US = 134  # a throttle from which on a car must move
+STUCK_MS = 2000  # of throttle; drive.stuck_s of params.yml is 1.5 s
+LOW_MS = 3000 + 1000 + 300  # drive.undervoltage_s of params.yml, the loop looks once a second, and ends
 MISSING_MS = 200  # from the last picture to throttle off
 UNANSWERED_MS = 150 + 50  # and a tick
 # From a stop to the end of the drive. To find a silent link takes 0.5 s, and so does each of two unanswered neutrals.
@@ -104,6 +107,7 @@ def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
     checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
+    checks += (_stuck, _supplied)
     with_pad, with_receiver = (_armed_at_rest, _pad_lost), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
     for check in (*(with_pad if seen.gamepad else with_receiver), *checks, _answered, _in_time):
         if (what := check(run)) is not None:
@@ -289,7 +293,7 @@ def _as_planned(run: Run) -> str | None:
             fresh[c.at_ms : c.at_ms + VALID_MS] = False
     well = run.clean & _for_ms(fresh, PLANNED_MS) & ~young & ~_for_any(young, PLANNED_MS)
     most_us = NEUTRAL_US["throttle"] + LIMIT * PER_UNIT_US["throttle"] + 1  # on the pins, the firmware's cap hides it
-    if over := [c for c in run.seen.commands if c.throttle_us > most_us and not run.sick[c.at_ms]]:
+    if over := [c for c in run.seen.commands if c.throttle_us > most_us and c.planned]:
         return f"the host asks for throttle {over[0].throttle_us} us at {over[0].at_ms} ms"
     for i, (pin, neutral_us) in enumerate(NEUTRAL_US.items()):
         meant = [(p.at_ms, neutral_us + PER_UNIT_US[pin] * (min(p[2], LIMIT) if i else p[1])) for p in good]
@@ -319,6 +323,33 @@ def _bad_ends(run: Run) -> str | None:
         blacks = blacks + 1 if black else 0
         if blacks == BLACK_FRAMES and (what := _off_after(run, ms, VALID_MS + 20, "black pictures")):
             return what
+    return None
+
+
+def _stuck(run: Run) -> str | None:
+    """A car that stands although its throttle is on is stopped within two seconds, and no car that moves is."""
+    stands = _each_ms(run.seen.stands, len(run.throttle), int) == 1
+    for armed, left in run.drives:
+        still = np.concatenate([[False], (stands & run.clean)[armed:left], [False]])
+        on = (run.autonomous & (run.throttle > DRIVEN_US))[armed:left]
+        for begin, end in np.flatnonzero(np.diff(still)).reshape(-1, 2):
+            if (count := int(on[begin:end].sum())) > STUCK_MS:
+                return f"{count} ms of throttle until {armed + end} ms while the car stands"
+    for _, ms, words in run.seen.drives:
+        if "does not move" in (words or "") and not stands[max(0, ms - 1400) : ms].all():
+            return f"stopped at {ms} ms as stuck, and it moved"
+    return None
+
+
+def _supplied(run: Run) -> str | None:
+    """A supply that stays low ends a drive, and no other supply does."""
+    low = _each_ms(run.seen.low, len(run.throttle), int) == 1
+    ms = _first(_for_ms(low & run.autonomous & run.clean, LOW_MS) & (run.throttle > RESTING_US))
+    if ms is not None:
+        return f"throttle at {ms} ms, and the supply has been low for {LOW_MS} ms"
+    for _, ms, words in run.seen.drives:
+        if (words or "").startswith("under-voltage") and not low[max(0, ms - 1100) : ms].any():
+            return f"stopped at {ms} ms for its supply, which was good"
     return None
 
 

@@ -60,8 +60,9 @@ def pictures(seed: int = PLAIN, size: tuple[int, int] = SIZE, count: int = 40) -
     """
     rng = np.random.default_rng(seed)
     made = []
-    for _ in range(count):
+    for i in range(count):
         picture = rng.integers(100, 112, (*size, 3), np.uint8)
         picture[: size[0] // 3, : size[1] // 3] -= 75  # so that there is something to see
+        picture = np.roll(picture, i * size[1] // count, 1)  # or the car would be stuck
         made.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
     return made

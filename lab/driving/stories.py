@@ -135,6 +135,12 @@ def _freeze(stage: Stage, h: Happening) -> None:
     stage.during(h, stage.world.lens, frozen_ms=stage.world.now_ms)
 
 
+@_may("the car stands at a wall", for_ms=LONG)
+def _stand(stage: Stage, h: Happening) -> None:
+    stage.during(h, stage.world.lens, stands_ms=stage.world.now_ms)
+
+
+_may("the supply is low", for_ms=(500, 8000))(during("", throttled="0x50005"))
 _may("frames come late", (20, 3000), A_WHILE)(during("lens", late_ms=AMOUNT))
 
 

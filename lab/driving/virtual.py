@@ -139,11 +139,13 @@ class Hand:
 class Lens:
     """What the camera shows. frozen_ms: since when it shows the same. late_ms: how old the pictures are that come.
 
-    film: what it shows instead, in turn: pictures (h, w, 3) uint8 BGR.
+    stands_ms: since when the car stands at a wall, so that only the pictures' noise changes. film: what it shows
+    instead, in turn: pictures (h, w, 3) uint8 BGR.
     """
 
     film: Sequence[np.ndarray] = ()
     frozen_ms: int | None = None
+    stands_ms: int | None = None
     black: bool = False
     silent: bool = False
     late_ms: int = 0
@@ -208,6 +210,8 @@ class Seen:
     heard: list[tuple[int, int]] = field(default_factory=list)  # statuses as the host read them, with their command
     stops: list[tuple[int, int]] = field(default_factory=list)  # when a drive was to end; since when it drove, or 0
     sick: list[tuple[int, bool]] = field(default_factory=list)  # whether lines or orders are spoilt
+    stands: list[tuple[int, bool]] = field(default_factory=list)  # whether the car stands at a wall
+    low: list[tuple[int, bool]] = field(default_factory=list)  # whether the host's supply is too low
     end_ms: int = 0
 
 
@@ -233,13 +237,14 @@ class World:
         self.suspended_ms = 0  # for how long the host's machine has been suspended in all
         self.failing: BaseException | None = None  # to be raised when the host waits next
         self.unplugged = self.stuck = False
-        self.content_ms = 0  # content_ms (see Asked) of the newest order
+        self.content_ms, self.planned = 0, True  # see Asked: of the newest order, whose command may be sent again
         self.written: list[bytes] = []
         self._boot = 0
         self._due: list[tuple[int, int, Callable[[], object]]] = []
         self._count = 0
         self._started_ms = self._hung_ms = 0
         self.view_stop = self.operator_gone = False
+        self.throttled: str | None = "0x0"  # what the host's firmware says of its supply and heat
         self.down, self.up = Wire(self, self._arrive_down), Wire(self, self._arrive_up)
         self._power(clock_ms, "p")
 
@@ -341,6 +346,8 @@ class World:
         sick = any(w.latency_ms > 1 or w.lost_pct or w.garbled_pct or w.change for w in wires)
         sick |= bool(self.lens.late_ms or self.mind.latency_ms > LATENCY_MS)  # then the throttle fades
         self.seen.sick.append((self.now_ms, bool(sick or self.stuck or self.unplugged or self.mad_us)))
+        self.seen.stands.append((self.now_ms, self.lens.stands_ms is not None))
+        self.seen.low.append((self.now_ms, self.throttled != "0x0"))
         if self.board:
             steering_us, throttle_us = hand.pulses()
             self.board.transmit(STEERING, steering_us)
@@ -378,6 +385,6 @@ class World:
         self.written.append(line)
         if line.startswith(b">D"):
             _, sequence, _, steering_us, throttle_us = map(int, line[3:].split(b"*")[0].split())
-            asked = Asked(self.now_ms, throttle_us, self.content_ms, not self.mad_us, sequence, steering_us)
+            asked = Asked(self.now_ms, throttle_us, self.content_ms, self.planned, sequence, steering_us)
             self.seen.commands.append(asked)
         self.down.send(line)

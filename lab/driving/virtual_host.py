@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 
 from lab.driving.virtual import DROPPING, FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
@@ -37,6 +38,7 @@ PLAN = (0.2, 0.15)  # steering, one way and the other, and throttle
 LIMIT_MS, HEARTBEAT_MS = 1500, 600  # those of a service's drive, if it has them
 GO_MS, BRAKE_MS = 1200, 600  # how long the policy goes and brakes, in turn
 NO_VIEW = Path("/nowhere/view")
+NOISE = np.random.default_rng(1).integers(0, 4, (72, 128, 3), np.uint8)  # of a camera, moved in each picture
 SIZE = (128, 72)  # of the camera's pictures, and of those that the policy has seen: width, height
 
 
@@ -237,7 +239,11 @@ class Eyes:
             return  # the last: pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        scene = scenery()[round(content_ms / FRAME_MS) % len(scenery())]
+        standing = lens.stands_ms is not None and lens.frozen_ms is None
+        shown_ms = min(content_ms, lens.stands_ms) if standing else content_ms
+        scene = scenery()[round(shown_ms / FRAME_MS) % len(scenery())]
+        if standing:
+            scene = cv2.add(scene, np.roll(NOISE, world.now_ms, 1))
         if lens.black:
             scene = (scene - scene.min()) // 64 + world.now_ms % 2
         picture = lens.film[self._shown % len(lens.film)] if lens.film else scene
@@ -316,7 +322,7 @@ class _Pilot(PolicyPilot):
     def order(self, now_s: float) -> Order | None:
         order = super().order(now_s)
         if order:
-            self.world.content_ms = self.planner.content[order.plan]
+            self.world.content_ms, self.world.planned = self.planner.content[order.plan], not self.world.mad_us
             if self.world.mad_us:
                 order = replace(order, throttle_us=self.world.mad_us)
         return order
@@ -341,12 +347,25 @@ class _Log:
         self._world = world
         self.start_s = world.clock()
         self.recent: deque[Any] = deque()
-        self.machine: dict[str, Any] = {}
+
+    @property
+    def machine(self) -> dict[str, Any]:
+        return {"t_s": self._world.clock() - self.start_s, "throttled": self._world.throttled}
 
     def tick(self, row: Any) -> None: ...
 
     def event(self, text: str, **fields: Any) -> None:
         self._world.seen.log.append((self._world.now_ms, text))
+
+
+class _Feed(Feed):
+    """A feed whose view says stop once, and keeps that for whoever asks next: also while the car is being armed."""
+
+    world: World
+
+    def over(self) -> str | None:
+        told, self.world.view_stop = self.world.view_stop, False
+        return "stopped from the view (127.0.0.1)" if told else None
 
 
 class _Session(Session):
@@ -370,9 +389,6 @@ class _Session(Session):
         self.process.armed()
         return telemetry
 
-    def over(self) -> str | None:
-        return "stopped from the view (127.0.0.1)" if self.process.world.view_stop else super().over()
-
 
 class Process:
     """`rover drive` from its start to its end, run in the present process. Its parts are attributes, to be broken.
@@ -390,7 +406,8 @@ class Process:
         world.alive = True
         self.eyes, commanded = Eyes(world), Commanded()
         self.planner = VirtualPlanner(world, self.eyes, commanded)
-        self._feed = Feed(NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self._feed = _Feed(NO_VIEW, self.log, "virtual", clock=world.clock, sleep=world.sleep)
+        self._feed.world = world
         self.session = _Session(
             DriveOptions(Path("virtual"), hz=RATE_HZ, asked_s=world.boottime()), Settings.of(params()["drive"]),
             self.report, self.log, self._feed, None, self.eyes.camera, self.planner, commanded, RATE_HZ, "virtual",
@@ -417,7 +434,6 @@ class Process:
     def armed(self) -> None:
         """Take note that the car was armed: what ends this drive is due from now on."""
         world = self.world
-        world.view_stop = False
         if self.session.service and self._limits.max_seconds:
             world.seen.stops.append((world.now_ms + LIMIT_MS, world.now_ms))
         if self.session.service and self._limits.heartbeat_s:

@@ -143,6 +143,12 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
         assert board._state == "S"
 
 
+def at_a_wall():
+    picture, rng = np.full((160, 320, 3), 100, np.uint8), np.random.default_rng(1)
+    picture[:50, :100] = 30
+    return [picture + rng.integers(0, 12, picture.shape, np.uint8) for _ in range(40)]
+
+
 @pytest.mark.slow
 @real_time
 @pytest.mark.parametrize(
@@ -150,8 +156,9 @@ def test_without_actions_the_car_stops_and_takes_another_gesture(bench):
     [
         (lambda board, feed: board._enter("M", "h"), DriveFault),
         (lambda board, feed: feed.close(), (DriveFault, CameraError)),
+        (lambda board, feed: feed.show(*at_a_wall()), DriveFault),
     ],
-    ids=["takeover", "unplugged"],
+    ids=["takeover", "unplugged", "stuck"],
 )
 def test_faults_of_a_drive_end_it(bench, happens, error, patient):
     with bench() as on:

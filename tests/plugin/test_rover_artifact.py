@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot_robot_rover import RoverArtifactConfig, modeling_rover_artifact
 from lerobot_robot_rover.__main__ import main, pack
 from lerobot_robot_rover.line import ENDING
-from rover_lib.onboard.errors import ParamsError, PolicyError
+from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError
 from rover_lib.onboard.policy.load import load_policy
 
 moved = "common" if ENDING else "utils"
@@ -72,6 +72,10 @@ def test_it_gives_what_our_own_loader_gives(artifacts, monkeypatch):
         np.testing.assert_allclose(act(picture), expected, atol=1e-6)
     now[0] += 2.0  # after a pause in a chunk, the rest of it is too old
     np.testing.assert_allclose(act(pictures[3]), chunks[1][0], atol=1e-6)
+    policy.reset()
+    policy._process = SimpleNamespace(predict=policy._process.predict, strange=1.01)
+    with pytest.raises(DriveFault, match="seen nothing like these pictures"):
+        act(pictures[0])
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 # Bits of vcgencmd get_throttled: true now, and 16 bits higher: has been true since the start
-THROTTLED_BITS = {0: "under-voltage", 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
+UNDER_VOLTAGE = "under-voltage"
+THROTTLED_BITS = {0: UNDER_VOLTAGE, 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
 THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints the bits
 
 
@@ -78,13 +79,19 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def throttled_means(value: str | None) -> list[str] | None:
-    """Return the meaning of each bit that is set in Host.throttled()'s value; None if there was no reading."""
+def throttled_means(value: str | None, since_the_start: bool = True) -> list[str] | None:
+    """Return the meaning of each bit that is set in Host.throttled()'s value; None if there was no reading.
+
+    since_the_start: also of what was true once, and then with "now" or "since the start".
+    """
     if value is None:
         return None
     bits = int(value, 16)
-    now = [f"{name} now" for bit, name in THROTTLED_BITS.items() if bits >> bit & 1]
-    return now + [f"{name} since the start" for bit, name in THROTTLED_BITS.items() if bits >> (bit + 16) & 1]
+    now = [name for bit, name in THROTTLED_BITS.items() if bits >> bit & 1]
+    if not since_the_start:
+        return now
+    ever = [f"{name} since the start" for bit, name in THROTTLED_BITS.items() if bits >> (bit + 16) & 1]
+    return [f"{name} now" for name in now] + ever
 
 
 def _text_in(path: Path) -> str | None:

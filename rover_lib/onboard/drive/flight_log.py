@@ -112,7 +112,7 @@ class FlightLog:
     ):
         self.path, self.start_s = Path(path), clock()
         self.recent: deque[Event] = deque(maxlen=RECENT)
-        self.machine: dict[str, Any] = {}  # its newest state: temperature_c, throttled
+        self.machine: dict[str, Any] = {}  # its newest state: t_s, temperature_c, throttled
         start = {"start": datetime.now().astimezone().isoformat(), "start_monotonic_s": self.start_s}
         self._header = {"schema": SCHEMA, "kind": "header", **start, "columns": Tick._fields, "drive": header}
         self._max_bytes, self._keep, self._clock, self._host = max_bytes, keep, clock, host or Host()
@@ -185,8 +185,8 @@ class FlightLog:
         now_s = self._clock() - self.start_s
         vcgencmd = shutil.which(self._host.vcgencmd)  # never start a program that is not there
         bits = self._host.throttled() if vcgencmd else None
-        self.machine = {"temperature_c": self._host.temperature_c(), "throttled": bits}
-        self._lines.append(_line({"kind": "machine", "t_s": now_s, **self.machine}))
+        self.machine = {"t_s": now_s, "temperature_c": self._host.temperature_c(), "throttled": bits}
+        self._lines.append(_line({"kind": "machine", **self.machine}))
         for _ in range(len(self._rows)):
             self._lines.append(_line(self._rows.popleft()))
 

@@ -75,6 +75,7 @@ class Report:
     seconds: float = 0.0
     ended: str = ""
     status: str = "getting ready"  # one line for people
+    machine: str = ""  # what there is to say of supply and heat
     world: dict[str, Any] = field(default_factory=dict)  # figures of a simulated car, added to the summary
     late_ms: array = field(default_factory=lambda: array("f"), repr=False)
     plan_age_ms: array = field(default_factory=lambda: array("f"), repr=False)
@@ -230,7 +231,8 @@ class _Loop:
         who = telemetry.why if telemetry else "dry run"
         plan = "" if order.age_s is None else f", plan {order.age_s * 1e3:.0f} ms old"
         late = f"late {max(self.report.late_ms[-100:]):.1f} ms at most, {self.report.missed} missed"
-        return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}"
+        machine = f"; {self.report.machine}" if self.report.machine else ""
+        return f"{who}: steering {order.steering:+.2f}, throttle {order.throttle:.3f}{plan}; {late}{machine}"
 
     def _wait(self, deadline: float) -> None:
         """Wait for the deadline; meanwhile send the last command again if it is not acknowledged or is KEEP_S old."""

@@ -9,6 +9,7 @@ from typing import Protocol
 from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.inference import Planner
+from rover_lib.onboard.drive.motion import Motion
 from rover_lib.onboard.drive.plan import STOP, WARN, Commanded, Follower, Plan, Settings
 from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError, RoverError
 
@@ -69,6 +70,7 @@ class Sight:
         self._moving_s: float | None = None  # since when the car has been moving
         self._throttle_s = 0.0  # when it was last told to move
         self._blank_s: float | None = None  # since when the picture has been blank
+        self._motion, self._throttle = Motion(settings.stuck_s), 0.0
 
     def check(self) -> None:
         """Raise CameraError if nobody may drive by the newest frame: it is frozen, black, without contrast or none."""
@@ -80,11 +82,16 @@ class Sight:
 
     def sent(self, at_s: float, throttle: float) -> None:
         """Take note that this throttle was sent: if it moves the car, the pictures must change from then on."""
+        self._throttle = throttle
         if abs(throttle) > MOVING:
             self._throttle_s = at_s
             self._moving_s = at_s if self._moving_s is None else self._moving_s
         elif at_s - self._throttle_s > COASTS_S:
             self._moving_s = None
+
+    def watch_motion(self, frame: Frame) -> None:
+        """Raise DriveFault if the car stands although the throttle is on. For whoever drives it, not for a human."""
+        self._motion.watch(frame, self._throttle)
 
     def watch(self, frame: Frame, now_s: float) -> None:
         """Raise CameraError if the newest frame is old, or frozen while the car moves, or blank for too long."""
@@ -142,13 +149,14 @@ class PolicyPilot:
         if frame:
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
             self.sight.watch(frame, now_s)
+            self.sight.watch_motion(frame)
         self._asking_s = max(self._asking_s, self._planner.asking_s)
         if plan := self._planner.newest():
             self._follower.add(plan, now_s)
         command = self._follower.command(now_s)
         if command is None:
             if self._follower.strange_s is not None:
-                raise DriveFault(_unfamiliar(self._follower.strange), remedy=RECORD_HERE)
+                raise DriveFault(unfamiliar(self._follower.strange), remedy=RECORD_HERE)
             why = f"the policy has not answered for {self._planner.asking_s:.1f} s"
             raise DriveFault(f"the newest plan is too old to drive by ({self._follower.stop_s():g} s): {why}")
         self._cut = max(self._cut, command.cut)
@@ -171,7 +179,7 @@ class PolicyPilot:
         self.sight.check()
         plan = self._planner.newest()
         if plan and plan.strange is not None and not plan.strange < 1 and self._settings.unfamiliar == STOP:
-            raise RoverError(_unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
+            raise RoverError(unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
 
     def sent(self, at_s: float, order: Order) -> None:
         self._commanded.add(at_s, order.steering, order.throttle)
@@ -186,14 +194,15 @@ class PolicyPilot:
             yield f"the policy asks for throttle {limit + self._cut:.2f}, cut at throttle_limit {limit:g} (params.yml)"
         if self._follower.strange_s is not None and self._settings.unfamiliar == WARN and not self._said_strange:
             self._said_strange = True
-            yield _unfamiliar(self._follower.strange)
+            yield unfamiliar(self._follower.strange)
         if age_s > LATE_WARNING_S:
             yield f"no new frame for {age_s:.2f} s"
         if plan and asking_s > LATE_FRAME_S + 1.5 * plan.latency_s:
             yield f"the policy took {asking_s:.2f} s or more, for the plan before {plan.latency_s:.2f} s"
 
 
-def _unfamiliar(strange: float | None) -> str:
+def unfamiliar(strange: float | None) -> str:
+    """Return the sentence for pictures that the policy has seen nothing like. strange: the smoothed Plan.strange."""
     return f"the policy has seen nothing like these pictures ({strange or 0:.2f} of its limit)"
 
 

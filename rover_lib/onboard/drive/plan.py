@@ -36,6 +36,8 @@ RULES = {
     "black_level": number(-255, 255),
     "flat_level": number(-255, 255),
     "unfamiliar": one_of((STOP, WARN, OFF)),
+    "stuck_s": number(0, 3600),
+    "undervoltage_s": number(0, 3600),
 }
 
 
@@ -53,6 +55,8 @@ class Settings:
     black_level: float = 8.0
     flat_level: float = 2.0
     unfamiliar: str = STOP
+    stuck_s: float = 1.5
+    undervoltage_s: float = 3.0
 
     def __post_init__(self):
         remedy = "look at the section 'drive' of params.yml"

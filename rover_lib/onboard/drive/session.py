@@ -67,7 +67,7 @@ class Session:
         Raises as loop.drive() does, but for a service no DriveFault.
         """
         options, pilot = self.options, self.make_pilot()
-        health = HealthWatch(self.report, self.link)
+        health = HealthWatch(self.report, self.link, self.log, self.settings.undervoltage_s, self.clock)
         with Arming(self, pilot) as arming:
             self.report.clear()
             arm = partial(self._arm, arming, stop, said)

@@ -10,19 +10,24 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
+from rover_lib.onboard.car.host import UNDER_VOLTAGE, throttled_means
 from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.errors import DriveFault
 from rover_lib.onboard.signal_event import SignalEvent, signals
 
 SWITCH_S = 0.0005  # after this, other threads give the interpreter back to the loop; Python's default is 5 ms
 PRIORITY = 2  # real-time; above that of the balloon world's stand-in for a car
 HUNG_S = 3.0  # without a tick; the Arduino has stopped the car long before that
 LATE_COMMAND_MS = 5.0
+OLD_S = 10.0  # a reading of supply and heat is no longer news; a command that hangs is given up after 5
+NOT_REPORTED = "this machine does not report its supply and heat: low voltage would not be seen"
 OFTEN = 5  # commands that were sent again within a second
 
 
@@ -107,20 +112,53 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
 
 
 class HealthWatch:
-    """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call."""
+    """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call.
 
-    def __init__(self, report: Report, link: ServoLink | None):
-        self._report, self._link = report, link
+    log: its thread reads the supply and the heat, for the loop must not wait for that. undervoltage_s: after this time
+    a supply that is too low raises DriveFault; 0: never.
+    """
+
+    def __init__(
+        self,
+        report: Report,
+        link: ServoLink | None,
+        log: FlightLog,
+        undervoltage_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._report, self._link, self._log = report, link, log
+        self._undervoltage_s, self._clock = undervoltage_s, clock
         self._ticks = 0
         self._counted: tuple[int, ...] | None = None
+        self._low_s: float | None = None  # since when the supply has been too low
+        self._said: str | None = None  # of supply and heat
 
     def __call__(self) -> Iterator[str]:
+        yield from self._of_the_supply()
         late_ms, self._ticks = max(self._report.late_ms[self._ticks :], default=0.0), len(self._report.late_ms)
         if late_ms > LATE_COMMAND_MS:
             yield f"commands were up to {late_ms:.1f} ms late"
         with contextlib.suppress(LinkError):  # the next tick handles it
             if self._link and (telemetry := self._link.latest()):
                 yield from self._of_the_link(self._link.garbled, telemetry)
+
+    def _of_the_supply(self) -> Iterator[str]:
+        if not (machine := self._log.machine):  # it has not been read yet
+            return
+        old = self._clock() - self._log.start_s - machine["t_s"] > OLD_S
+        now = throttled_means(None if old else machine["throttled"], since_the_start=False)
+        slow = "; plans take longer" if set(now or ()) - {UNDER_VOLTAGE} else ""
+        self._report.machine = ", ".join(now or ()) + slow
+        said = NOT_REPORTED if now is None else self._report.machine
+        if said and said != self._said:
+            yield said
+        self._said = said
+        if not now or UNDER_VOLTAGE not in now:
+            self._low_s = None
+            return
+        self._low_s = self._clock() if self._low_s is None else self._low_s
+        if self._undervoltage_s and (low_s := self._clock() - self._low_s) >= self._undervoltage_s:
+            raise DriveFault(f"{UNDER_VOLTAGE} for {low_s:.0f} s", remedy="charge the battery")
 
     def _of_the_link(self, garbled: int, t: Telemetry) -> Iterator[str]:
         counted = (self._report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from dataclasses import fields
 
 import needs
 import pytest
@@ -13,6 +14,7 @@ from lab.driving.on_pins import INJECT
 from lab.driving.rows import all_rows, run_row
 from lab.driving.stories import KEPT
 from rover_lib.onboard.car.car import read_car
+from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.stage import read_stage
 
 SAFETY = (REPOSITORY / "docs" / "safety.md").read_text()
@@ -54,6 +56,7 @@ def test_what_proves_safety_exists():
         names = re.findall(r"`([^`]+)`", cell)
         assert names, f"a hazard that nothing proves: {cell}"
         assert set(names) <= all_rows().keys() | INJECT.keys() | KEPT.keys() | tests
+    assert set(re.findall(r"`drive\.(\w+)`", SAFETY)) <= {field.name for field in fields(Settings)}
 
 
 @pytest.mark.emulated

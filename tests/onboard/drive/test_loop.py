@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError, State
 from rover_lib.onboard.drive.loop import KEEP_S, Hooks, Report, Until, drive
+from rover_lib.onboard.drive.motion import Motion
 from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
-from rover_lib.onboard.drive.watch import stop_on_signals
+from rover_lib.onboard.drive.watch import NOT_REPORTED, HealthWatch, stop_on_signals
 from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, RoverError
 
 PERIOD = 1 / 30
@@ -310,6 +312,45 @@ def test_a_picture_without_anything_on_it(pilot, seen, fault):
         drives(pilot, 0.2, start_s=0.7, **seen)
 
 
+SCENE = np.random.default_rng(0).integers(30, 220, (9, 16, 3), np.uint8).repeat(20, 0).repeat(20, 1)
+
+
+def noisy(dimmer=1.0, moved_px=0):
+    shown = np.roll(SCENE, moved_px, 1) * dimmer + np.random.default_rng().normal(0, 6, SCENE.shape)
+    return np.clip(shown, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("throttle", "picture", "stops_s"),
+    [
+        (lambda s: 0.1, lambda s: noisy(), 1.7),
+        (lambda s: -0.1, lambda s: noisy(1 - 0.1 * s), 1.7),  # dimmer light is no motion
+        (lambda s: 0.1 * (s % 0.9 < 0.6), lambda s: noisy(), 2.6),  # it brakes in between
+        (lambda s: 0.1, lambda s: noisy(moved_px=round(3 * s)), None),  # it creeps: half a degree a second
+        (lambda s: 0.1, lambda s: noisy(moved_px=round(50 * max(0.0, s - 1.3))), None),  # it starts slowly
+        (lambda s: 0.015, lambda s: noisy(), None),  # no car moves by that
+        (lambda s: 0.1 * (s % 2.5 < 0.6), lambda s: noisy(), None),  # it waits in between
+    ],
+)
+def test_a_car_that_stands_although_its_throttle_is_on(throttle, picture, stops_s):
+    motion, ended_s = Motion(1.5), None
+    for i in range(round(6 / PERIOD)):
+        try:
+            motion.watch(Frame(picture(i * PERIOD), 5.0 + i * PERIOD, i, 0, 100.0, 40.0), throttle(i * PERIOD))
+        except DriveFault as fault:
+            assert "does not move" in str(fault)
+            ended_s = i * PERIOD
+            break
+    assert (ended_s is None) == (stops_s is None) and (ended_s or 0) <= (stops_s or 0)
+
+
+def test_a_stuck_car_ends_its_drive(pilot):
+    with pytest.raises(DriveFault, match="does not move"):
+        drives(pilot, 1.8)
+    pilot.sight._motion.stuck_s = 0.0  # off
+    drives(pilot, 3.0, start_s=2.0)
+
+
 def test_no_picture_is_nothing_to_drive_by(pilot):
     pilot.eyes.frame = None
     with pytest.raises(CameraError):
@@ -334,6 +375,28 @@ def test_signals_ask_it_to_stop(number):
             assert log.events == [f"{number.name}: stopping"] and signal.getsignal(number) is before
     finally:
         signal.signal(number, earlier)
+
+
+def test_a_supply_that_stays_low_ends_a_drive_and_heat_is_told():
+    now, log, report = [0.0], SimpleNamespace(start_s=0.0, machine={}), Report()
+    health = HealthWatch(report, None, log, 3.0, clock=lambda: now[0])
+    for now[0], bits, said in (
+        (0, "0x0", []),
+        (1, "0x50005", ["under-voltage, throttled; plans take longer"]),
+        (3, "0x50001", ["under-voltage"]),
+        (3.9, "0x50000", []),  # good again
+        (5, "0x8", ["soft temperature limit; plans take longer"]),
+        (6, None, [NOT_REPORTED]),
+        (7, None, []),
+        (8, "0x1", ["under-voltage"]),
+    ):
+        log.machine = {"t_s": now[0], "throttled": bits}
+        assert list(health()) == said and report.machine == ("" if bits is None else "".join(said))
+    now[0] = 11
+    with pytest.raises(DriveFault, match="under-voltage for 3 s"):
+        list(health())
+    now[0] = 30
+    assert list(health()) == [NOT_REPORTED]  # what was read long ago is not known
 
 
 @pytest.mark.slow
