@@ -59,7 +59,7 @@ look:
 # Recordings that another version of the world made are recorded again. It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)
 	@rm -f $(DEMO)
-	$(ROVER) world record runs/demo/episodes || { rm -rf runs/demo/episodes && $(ROVER) world record runs/demo/episodes; }
+	$(ROVER) world record runs/demo/episodes
 	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	@touch $(DEMO)
