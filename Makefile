@@ -90,6 +90,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
 	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware notebooks tests $(PACKAGES)
+	PATH='$(CURDIR)/$(VENV)/bin':"$$PATH" ANSIBLE_HOME='$(CURDIR)/runs/ansible' ansible-lint --offline --profile=production --strict -q ansible
 
 # The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
 # The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.

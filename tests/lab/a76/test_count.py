@@ -200,7 +200,7 @@ def test_a_run_is_counted(report, tiny_run):
     assert fp32["workstation_steering_mae_pct"] == fp32["steering_mae_pct"] == static["reference_max_difference"] == 0
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
-    assert static["threads"] == 1 and static["frames_on_the_core"] == 12
+    assert static["threads"] == 1 and (static["frames_on_the_core"], fp32["frames_on_the_core"]) == (12, STEADY)
     assert 0 < static["far_lines_g"] < static["near_lines_g"] < 0.1 * static["instructions_g"]
     assert static["computed_pi5_ms"] == pi5.predict_ms(pi5.Work.of(static))._asdict() | {"threads": pi5.DRIVING}
     assert "policy_static" in reports.table(report)
@@ -223,14 +223,6 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(count, tiny_run, monke
     monkeypatch.setattr(counting, "side_by_side", lambda jobs, *_: {"policy_fp32": jobs["policy_fp32"]()})
     with pytest.raises(RoverError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count(0.5)
-
-
-def test_frames_of_a_slow_fp32_are_few():
-    manifests = {"policy_static": {"mode": "static", "gmac": 15.0}, "policy_fp32": {"mode": "fp32", "gmac": 15.0}}
-    plans = counting.plans_of(manifests, 50)
-    assert [*plans] == ["policy_fp32", "policy_static"] and plans["policy_fp32"] == ((0, 1, 2), STEADY)
-    assert len(plans["policy_static"].frames) == 50
-    assert len(counting.plans_of({"policy_fp32": {"mode": "fp32", "gmac": 0.5}}, 50)["policy_fp32"].frames) == 10
 
 
 def test_a_peer_without_finite_actions_of_that_shape_is_refused():
