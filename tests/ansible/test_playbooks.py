@@ -1,4 +1,4 @@
-"""The playbooks as far as one machine can tell: arguments, units. Nothing outside a temporary folder; lint is make's."""
+"""The playbooks as far as one machine can tell: arguments, units. Nothing outside a temporary folder."""
 
 import json
 import os
