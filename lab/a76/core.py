@@ -13,7 +13,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.debian import fetch_packages, install_packages, missing_packages
+from lab.debian import install_packages, make_arm64, missing_packages
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cache_folder, key_of
@@ -37,11 +36,12 @@ REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
 
 NEEDS = {  # commands and files, each with the Debian package that it comes from
     "qemu-aarch64": "qemu-user",
+    "mmdebstrap": "mmdebstrap",
     "gcc": "gcc",
     "c++filt": "binutils",
     "/usr/include/stdio.h": "libc6-dev",
 }
-RECIPE = 1  # raise it when the userland is made in another way, so that older ones are not used
+RECIPE = 2  # raise it when the userland is made in another way, so that older ones are not used
 GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
 PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
 INTERPRETER, SITE = f"usr/bin/python{PYTHON}", "opt/site"  # in the emulated Pi
@@ -95,9 +95,7 @@ def build_plugin() -> Path:
 
 
 def _make_userland(root: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
-        for package in fetch_packages(Path(scratch), GUEST_PACKAGES):
-            run("dpkg", "--extract", package, root, error=RoverError)
+    make_arm64(root, GUEST_PACKAGES, "--mode=chrootless", "--variant=extract")
     fetch_wheels(root / SITE, "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
