@@ -10,8 +10,8 @@ import grimp
 
 ROOT = Path(__file__).parents[1]
 LINTER = tomllib.loads((ROOT / "tests" / "imports.toml").read_text())["tool"]["importlinter"]
-# hailo_platform is one of Hailo's own packages, which a Pi with its card has; aiohttp is of the extra `view`.
-ONBOARD_NEEDS = {"torch", "onnxruntime", "hailo_platform", "numpy", "cv2", "simplejpeg", "filelock", "serial", "yaml"}
+# aiohttp is of the extra `view`.
+ONBOARD_NEEDS = {"torch", "onnxruntime", "numpy", "cv2", "simplejpeg", "filelock", "serial", "yaml"}
 ONBOARD_NEEDS |= {"systemd_watchdog", "click", "aiohttp", "rover_lib"}
 
 
