@@ -7,10 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command import rover
 from recorded import record_drives
 
-from rover_lib.cli import main
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.run.pipeline import Recipe, make_artifact
@@ -20,13 +19,6 @@ TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_mo
         "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1")  # fmt: skip
 
 
-def rover(*words):
-    """Run a `rover` command, check its exit status, and return what it printed."""
-    result = CliRunner().invoke(main, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
 @pytest.mark.slow
 def test_from_recordings_to_an_artifact(tmp_path, monkeypatch):
     import datasets
@@ -34,7 +26,8 @@ def test_from_recordings_to_an_artifact(tmp_path, monkeypatch):
     cache, dataset = tmp_path / "cache", tmp_path / "dataset"
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", cache)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    rover("export-dataset", record_drives(tmp_path / "mine", drives=3, frames=40), dataset, "--size", "64x36")
+    done = rover("export-dataset", record_drives(tmp_path / "mine", drives=3, frames=40), dataset, "--size", "64x36")
+    assert done.exit_code == 0, done.output
     offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
     words = ["--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY, "--policy.device=cpu"]
     words += ["--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0", "--dataset.repo_id=local/mine"]
@@ -43,7 +36,7 @@ def test_from_recordings_to_an_artifact(tmp_path, monkeypatch):
     train = [Path(sys.executable).with_name("lerobot-train"), *words]
     done = subprocess.run(train, capture_output=True, text=True, env=os.environ | offline)
     assert done.returncode == 0, done.stderr[-2000:]
-    words = json.loads(rover("inspect", tmp_path / "train", "--json"))["checkpoint"]
+    words = json.loads(rover("inspect", tmp_path / "train", "--json").output)["checkpoint"]
     assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
     artifact = tmp_path / "policy_static.pt"
     make_artifact(load(tmp_path / "train/checkpoints/last", dataset), artifact, Recipe.of(params(), samples=6))

@@ -10,6 +10,7 @@ records it, minus its translated code and the plugin's counters, which lie outsi
 """
 
 import re
+import select
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -201,12 +201,15 @@ def emulate(
     qemu = [str(word) for word in (*_qemu(core.root), "-plugin", plugin, *command)]
     with (folder / "stderr").open("wb") as stderr:
         talks: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": stderr}
-        process = subprocess.Popen(qemu, env=environment or {}, cwd=folder, text=True, errors="replace", **talks)
-    assert process.stdout  # a pipe
+        process = subprocess.Popen(qemu, env=environment or {}, cwd=folder, bufsize=0, **talks)
+    assert process.stdout  # a pipe, of which nothing is read ahead
+    memory, line = _Memory(process.pid), b"?"
     try:
-        with _Watched(process.pid) as watched:
-            for line in process.stdout:
-                watched.begin(line.rstrip("\n"))
+        while line:
+            if not select.select([process.stdout], [], [], SAMPLE_S)[0]:
+                memory.sample()
+            elif line := process.stdout.readline():
+                memory.begin(line.decode(errors="replace").rstrip("\n"))
         code = process.wait()
     finally:
         process.kill()
@@ -214,42 +217,29 @@ def emulate(
         process.stdout.close()
     if code:
         end = last_words((folder / "stderr").read_text(errors="replace"))
-        raise RoverError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
+        raise RoverError(f"the emulated program ended with {code} after {memory.step or 'its start'}: {end}")
     sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
     more = {int(f.stem): np.fromfile(f, "<u8") for f in folder.glob("*.more")}
-    return Emulation(sections, more, dict(watched.peak_mb))
+    return Emulation(sections, more, dict(memory.peak_mb))
 
 
-class _Watched(Thread):
-    """The memory of a running emulator, sampled while inside. Each printed line begins a step with its own peak."""
+class _Memory:
+    """The most memory that a running emulator held in each step. Each line that it prints begins a step."""
 
     def __init__(self, pid: int):
-        super().__init__(daemon=True)
         self.pid, self.step = pid, ""
         self.peak_mb: dict[str, float] = defaultdict(float)
-        self._lock, self._over = Lock(), Event()
 
-    def __enter__(self) -> "_Watched":
-        self.start()
-        return self
+    def sample(self) -> None:
+        peak_mb, outside_mb = _memory_mb(self.pid)
+        self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
 
-    def __exit__(self, *exc: object) -> None:
-        self._over.set()
-        self.join()
-
-    def run(self) -> None:
-        while not self._over.wait(SAMPLE_S):
-            self.begin(None)
-
-    def begin(self, step: str | None) -> None:
-        """Take a sample, and begin a step unless it is the present one; None: none begins."""
-        with self._lock:
-            peak_mb, outside_mb = _memory_mb(self.pid)
-            self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
-            if step not in (None, self.step):
-                with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
-                    Path(f"/proc/{self.pid}/clear_refs").write_text("5")
-            self.step = self.step if step is None else step
+    def begin(self, step: str) -> None:
+        self.sample()
+        if step != self.step:
+            with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
+                Path(f"/proc/{self.pid}/clear_refs").write_text("5")
+        self.step = step
 
 
 def _memory_mb(pid: int) -> tuple[float, float]:

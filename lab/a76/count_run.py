@@ -50,9 +50,9 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     core, jobs = prepare(), {}
     chosen = {stem: pick_evenly(range(len(samples)), FEW.get(m["mode"], len(samples))) for stem, m in manifests.items()}
     for stem in sorted(artifacts, key=lambda stem: len(chosen[stem])):  # FP32, which takes longest, first
-        how = {"guest": guest_of(artifacts[stem]), "counted": min(COUNTED, FEW.get(manifests[stem]["mode"], COUNTED))}
-        seen = [samples[i] for i in chosen[stem]]
-        jobs[stem] = partial(count_artifact, core, artifacts[stem], manifests[stem], seen, **how)
+        path, manifest, seen = artifacts[stem], manifests[stem], [samples[i] for i in chosen[stem]]
+        most = min(COUNTED, FEW.get(manifest["mode"], COUNTED))
+        jobs[stem] = partial(count_artifact, core, path, manifest, seen, guest=guest_of(path), counted=most)
     counts = side_by_side(jobs, "artifacts, emulated", progress)
     judged = _judge(artifacts, chosen, counts, samples, again, progress)
     rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}

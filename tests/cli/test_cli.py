@@ -6,15 +6,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command import rover
 
-from rover_lib.cli import main
 from rover_lib.onboard.cli import show
 from rover_lib.onboard.stage import atomic_path, read_stage
-
-
-def rover(*args):
-    return CliRunner().invoke(main, [str(a) for a in args])
 
 
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):

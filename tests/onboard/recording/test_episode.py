@@ -11,10 +11,9 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 from recorded import content_of, names_in, real_episode
 
-from rover_lib.cli import main
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import episode as module
 from rover_lib.onboard.recording.episode import (
@@ -55,7 +54,7 @@ def cut(folder, controls=5, frames=3):
 
 
 def finish(folder):
-    return CliRunner().invoke(main, ["record", str(folder), "--finish"])
+    return rover("record", folder, "--finish")
 
 
 # ---- what is left
