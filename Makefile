@@ -59,7 +59,7 @@ look:
 # Recordings that another version of the world made are recorded again. It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)
 	@rm -f $(DEMO)
-	$(ROVER) world record runs/demo/episodes || { rm -rf runs/demo/episodes && $(ROVER) world record runs/demo/episodes; }
+	$(ROVER) world record runs/demo/episodes
 	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	@touch $(DEMO)
@@ -90,6 +90,7 @@ lint: $(READY)
 	$(VENV)/bin/ruff format --quiet --check
 	$(VENV)/bin/mypy
 	$(VENV)/bin/codespell *.md *.yml *.toml ansible docs firmware notebooks tests $(PACKAGES)
+	PATH='$(CURDIR)/$(VENV)/bin':"$$PATH" ANSIBLE_HOME='$(CURDIR)/runs/ansible' ansible-lint --offline --profile=production --strict -q ansible
 
 # The tests use the demo as their example of a whole run, and tests/test_demo.py holds it to the gates of params.yml.
 # The demo takes minutes, and most changes are to tests; so it is made again only if one of its sources has changed.

@@ -38,43 +38,57 @@ CONTROL_LATENCY_S = 0.004  # how long after its frame a control arrives over the
 def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progress: Progress = silent) -> Path:
     """Let the expert drive through `count` worlds, with shoves that it corrects; record an episode folder per drive.
 
-    out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is.
+    out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is. One that
+    another version recorded, and nobody has touched since, is replaced.
     Returns out_dir. On one machine the same count and seed give the same bytes.
     Raises TrainingError for a negative seed, or an out_dir with something else in it.
     """
-    out_dir = Path(out_dir)
+    out_dir, names = Path(out_dir), {episode_name(_start_of(index, seed)) for index in range(count)}
     made_of = {"count": count, "seed": seed, "shoves": SHOVES, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
     made_of["car"] = this_car().description()
     key = key_of(made_of, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
-        if _marker_of(out_dir) == key:
+        if _marker_of(out_dir).get("key") == key:
             return out_dir
-        raise TrainingError(f"{out_dir}: exists and is not this recording", remedy="name another folder")
+        if not _is_untouched(out_dir, names | {MARKER}):
+            raise TrainingError(f"{out_dir}: exists and is not this recording", remedy="name another folder")
     # OpenCV releases the interpreter's lock while it draws and compresses, so threads help.
     with build_folder(out_dir) as new, ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
         drives = pool.map(lambda index: record_drive(new, index, seed), range(count))
         hits = sum(progress(drives, desc="recording", total=count))
         (new / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
-        if out_dir.exists():
-            out_dir.rmdir()  # empty, and the recording takes its place whole
+        if out_dir.exists() and not any(out_dir.iterdir()):
+            out_dir.rmdir()  # the recording takes its place whole
     return out_dir
 
 
-def _marker_of(folder: Path) -> str | None:
+def _marker_of(folder: Path) -> dict[str, Any]:
     try:
-        return json.loads((folder / MARKER).read_text()).get("key")
-    except (OSError, ValueError, AttributeError):
-        return None
+        return dict(json.loads((folder / MARKER).read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _is_untouched(folder: Path, names: set[str]) -> bool:
+    """Whether a recording has these names and no others, and no file that is newer than its marker."""
+    if not _marker_of(folder) or {path.name for path in folder.iterdir()} != names:
+        return False
+    marked_ns = (folder / MARKER).stat().st_mtime_ns
+    return all(path.stat().st_mtime_ns <= marked_ns for path in folder.rglob("*") if path.is_file())
 
 
 def record_drive(folder: Path, index: int, seed: int) -> bool:
     """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS; return whether it hit the balloon."""
     world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
-    with WorldEpisode(folder, FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES, world) as episode:
+    with WorldEpisode(folder, _start_of(index, seed), world) as episode:
         while not world.done:
             # The car drives by what the recording says: the action as the Arduino measures it.
             world.step(*episode.tick(*expert(world)))
     return world.hit
+
+
+def _start_of(index: int, seed: int) -> datetime:
+    return FIRST_DRIVE + timedelta(days=seed) + index * BETWEEN_DRIVES
 
 
 def episode_name(start: datetime) -> str:

@@ -34,7 +34,7 @@ HOLD_S = 1.5  # between two worlds
 THREADS = 1
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SIDES = {"push left": 1, "push right": -1}  # what the page of a simulation, and no other, can do to the car
-PUSHES = Path(__file__).with_name("push.js").read_bytes()
+SCRIPT = Path(__file__).with_name("simulation.js").read_bytes()
 SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
 
 Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
@@ -49,7 +49,7 @@ class Simulation:
     page's; "": the name of the artifact's folder. Raises what load_policy() raises.
     """
 
-    script = PUSHES  # for the page
+    script = SCRIPT  # for the page
 
     def __init__(self, artifact: Path | str, title: str = ""):
         artifact = Path(artifact)

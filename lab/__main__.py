@@ -47,7 +47,7 @@ def arm(run_dir: Path, peers: bool) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of lab/params.yml hold. Needs Debian
-    12 with qemu-user and gcc, which it installs if you are root.
+    12 with qemu-user, mmdebstrap and gcc, which it installs if you are root.
     """
     from lab.a76.count_run import count_run
     from lab.a76.report import table

@@ -1,6 +1,7 @@
-"""Find and install the Debian packages that this machine lacks, and fetch arm64 packages without installing them."""
+"""Find and install the Debian packages that this machine lacks, and make arm64 systems of such packages."""
 
 import os
+import platform
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -34,22 +35,26 @@ def install_packages(packages: Sequence[str], what: str) -> None:
     run(*command, error=RoverError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})
 
 
-def fetch_packages(folder: Path, packages: Sequence[str]) -> list[Path]:
-    """Fetch arm64 packages and their dependencies as .deb files into a scratch folder; return their paths.
+def debian_sources() -> tuple[str, str]:
+    """Return the name of this machine's Debian, such as bookworm, and its sources as a sources.list. Raises RoverError.
 
-    apt uses this machine's sources and keys, but lists, cache and status in the folder. packages: names, or apt's
-    patterns. Raises RoverError if they cannot be had.
+    They are of that Debian alone, without what else apt knows here.
     """
-    for subfolder in ("lists/partial", "archives/partial"):
-        (folder / subfolder).mkdir(parents=True)
-    (folder / "status").touch()  # says that nothing is installed, so that apt fetches all dependencies
-    options: dict[str, object] = {f"Dir::{name}": folder for name in ("State", "Cache", "Log")}
-    options |= {"Dir::State::lists": folder / "lists", "Dir::State::status": folder / "status"}
-    options |= {"Dir::Cache::archives": folder / "archives", "Dir::Cache::pkgcache": "", "Dir::Cache::srcpkgcache": ""}
-    options |= {"APT::Architecture": "arm64", "APT::Architectures": "arm64", "APT::Sandbox::User": "root"}
-    options |= {"Debug::NoLocking": "true"}
-    apt = ["apt-get", "--quiet", *(f"--option={key}={value}" for key, value in options.items())]
-    run(*apt, "update", error=RoverError, remedy=NO_DEBIAN)
-    download = ["install", "--yes", "--download-only", "--no-install-recommends", *packages]
-    run(*apt, *download, error=RoverError, remedy=NO_DEBIAN)
-    return sorted((folder / "archives").glob("*.deb"))
+    about = platform.freedesktop_os_release()
+    if about["ID"] != "debian":
+        raise RoverError("this needs the apt sources of a Debian 12 or 13", found=about["PRETTY_NAME"])
+    name = about["VERSION_CODENAME"]
+    listed = run("apt-get", "indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Identifier: Packages")
+    suites = {name, f"{name}-updates", f"{name}-security"}
+    return name, "".join(sorted({f"deb {line}\n" for line in listed.splitlines() if set(line.split()[1:2]) & suites}))
+
+
+def make_arm64(root: Path, packages: Sequence[str], *options: str) -> None:
+    """Make an arm64 system of this machine's Debian with these packages and what they need, by mmdebstrap.
+
+    options: of mmdebstrap; --mode=chrootless --variant=extract only unpacks, and needs neither root nor an emulator.
+    Raises RoverError if the packages cannot be had.
+    """
+    name, sources = debian_sources()
+    words = ["mmdebstrap", "--quiet", "--architectures=arm64", f"--include={','.join(packages)}", *options]
+    run(*words, name, root, "-", error=RoverError, remedy=NO_DEBIAN, input=sources)

@@ -127,12 +127,3 @@ def _draw(flight: Any, output: Path) -> None:
         raise RoverError(f"{output}: no figure has that ending", found=found, remedy="say .png, .pdf or .svg")
     with atomic_path(output) as temporary:
         figure.savefig(temporary)
-
-
-def export_kit(run_dir: Path, out: Path, samples: int) -> None:
-    """Write the Hailo kit of a run, for `rover export --hailo`. Raises RoverError as write_kit does."""
-    from rover_exchange.hailo.kit import write_kit
-    from rover_lib.workshop.run.session import open_run
-
-    write_kit(open_run(run_dir, terminal_bar()), run_dir, out, samples=samples, progress=terminal_bar())
-    click.echo(f"{out}: KIT.md says what is in it; next, where Hailo's compiler is: python3 compile.py hailo8")

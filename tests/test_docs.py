@@ -3,6 +3,9 @@
 import ast
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from importlib import import_module
@@ -20,7 +23,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def test_every_page_is_one_click_from_readme():
-    """Dead links end the build of tests/test_site.py."""
+    """Dead links end the build of the site."""
     linked = {(ROOT / link).resolve() for link in LINK.findall((ROOT / "README.md").read_text()) if "://" not in link}
     assert {p.resolve() for p in (ROOT / "docs").glob("*.md")} <= linked
 
@@ -129,3 +132,21 @@ def test_the_pages_are_short():
     """A page that grows must take something out of another."""
     pages = [*(ROOT / "docs").glob("*.md"), ROOT / "ansible" / "README.md"]
     assert sum(len(page.read_text().split()) for page in pages) <= 11_000
+
+
+NOT_COPIED = (".*", "runs", "shared", "tests")
+ELSEWHERE = re.compile(r"""<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=["'](?:https?:)?//[^>]*>""")
+
+
+@pytest.mark.slow
+def test_the_site_fetches_nothing_from_elsewhere_and_names_no_machine(tmp_path):
+    """The site that `make docs` builds; a dead link ends the build."""
+    folder = tmp_path / "checkout"
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*NOT_COPIED))
+    command = ["make", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", "docs"]  # which is set up already
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for page in (folder / "runs" / "site").rglob("*.html"):
+        text = page.read_text()
+        assert not ELSEWHERE.findall(text), page.name
+        assert not re.search(r"/(?:home|root|tmp|Users|work|var|opt|mnt)/[^ ]*runs/", text), page.name

@@ -10,21 +10,20 @@ records it, minus its translated code and the plugin's counters, which lie outsi
 """
 
 import re
+import select
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
 
-from lab.debian import fetch_packages, install_packages, missing_packages
+from lab.debian import install_packages, make_arm64, missing_packages
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.cache import cache_folder, key_of
@@ -37,11 +36,12 @@ REQUIREMENTS = REPOSITORY / "requirements_pi.txt"
 
 NEEDS = {  # commands and files, each with the Debian package that it comes from
     "qemu-aarch64": "qemu-user",
+    "mmdebstrap": "mmdebstrap",
     "gcc": "gcc",
     "c++filt": "binutils",
     "/usr/include/stdio.h": "libc6-dev",
 }
-RECIPE = 1  # raise it when the userland is made in another way, so that older ones are not used
+RECIPE = 2  # raise it when the userland is made in another way, so that older ones are not used
 GUEST_PACKAGES = ("python3.11", "libgomp1", "libstdc++6")
 PYTHON, PLATFORM = "3.11", "aarch64-manylinux_2_28"
 INTERPRETER, SITE = f"usr/bin/python{PYTHON}", "opt/site"  # in the emulated Pi
@@ -95,9 +95,7 @@ def build_plugin() -> Path:
 
 
 def _make_userland(root: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=root.parent, prefix=".apt.") as scratch:
-        for package in fetch_packages(Path(scratch), GUEST_PACKAGES):
-            run("dpkg", "--extract", package, root, error=RoverError)
+    make_arm64(root, GUEST_PACKAGES, "--mode=chrootless", "--variant=extract")
     fetch_wheels(root / SITE, "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
@@ -203,12 +201,15 @@ def emulate(
     qemu = [str(word) for word in (*_qemu(core.root), "-plugin", plugin, *command)]
     with (folder / "stderr").open("wb") as stderr:
         talks: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": stderr}
-        process = subprocess.Popen(qemu, env=environment or {}, cwd=folder, text=True, errors="replace", **talks)
-    assert process.stdout  # a pipe
+        process = subprocess.Popen(qemu, env=environment or {}, cwd=folder, bufsize=0, **talks)
+    assert process.stdout  # a pipe, of which nothing is read ahead
+    memory, line = _Memory(process.pid), b"?"
     try:
-        with _Watched(process.pid) as watched:
-            for line in process.stdout:
-                watched.begin(line.rstrip("\n"))
+        while line:
+            if not select.select([process.stdout], [], [], SAMPLE_S)[0]:
+                memory.sample()
+            elif line := process.stdout.readline():
+                memory.begin(line.decode(errors="replace").rstrip("\n"))
         code = process.wait()
     finally:
         process.kill()
@@ -216,42 +217,29 @@ def emulate(
         process.stdout.close()
     if code:
         end = last_words((folder / "stderr").read_text(errors="replace"))
-        raise RoverError(f"the emulated program ended with {code} after {watched.step or 'its start'}: {end}")
+        raise RoverError(f"the emulated program ended with {code} after {memory.step or 'its start'}: {end}")
     sections = {int(f.stem): np.fromfile(f, BLOCK) for f in folder.glob("*.blocks")}
     more = {int(f.stem): np.fromfile(f, "<u8") for f in folder.glob("*.more")}
-    return Emulation(sections, more, dict(watched.peak_mb))
+    return Emulation(sections, more, dict(memory.peak_mb))
 
 
-class _Watched(Thread):
-    """The memory of a running emulator, sampled while inside. Each printed line begins a step with its own peak."""
+class _Memory:
+    """The most memory that a running emulator held in each step. Each line that it prints begins a step."""
 
     def __init__(self, pid: int):
-        super().__init__(daemon=True)
         self.pid, self.step = pid, ""
         self.peak_mb: dict[str, float] = defaultdict(float)
-        self._lock, self._over = Lock(), Event()
 
-    def __enter__(self) -> "_Watched":
-        self.start()
-        return self
+    def sample(self) -> None:
+        peak_mb, outside_mb = _memory_mb(self.pid)
+        self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
 
-    def __exit__(self, *exc: object) -> None:
-        self._over.set()
-        self.join()
-
-    def run(self) -> None:
-        while not self._over.wait(SAMPLE_S):
-            self.begin(None)
-
-    def begin(self, step: str | None) -> None:
-        """Take a sample, and begin a step unless it is the present one; None: none begins."""
-        with self._lock:
-            peak_mb, outside_mb = _memory_mb(self.pid)
-            self.peak_mb[self.step] = max(self.peak_mb[self.step], peak_mb - outside_mb)
-            if step not in (None, self.step):
-                with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
-                    Path(f"/proc/{self.pid}/clear_refs").write_text("5")
-            self.step = self.step if step is None else step
+    def begin(self, step: str) -> None:
+        self.sample()
+        if step != self.step:
+            with suppress(OSError):  # if it has ended, or the kernel cannot forget, earlier peaks count too
+                Path(f"/proc/{self.pid}/clear_refs").write_text("5")
+        self.step = step
 
 
 def _memory_mb(pid: int) -> tuple[float, float]:

@@ -6,7 +6,7 @@ count_run("runs/demo")      # writes runs/demo/arm.json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +26,7 @@ from rover_lib.workshop.run_program import run
 
 REFERENCE = "policy_fp32"
 FRAMES = 50
-SLOW_GMAC = 1.0  # a larger FP32 takes a minute and a half for an emulated inference, so a few frames must be enough
-
-
-class Plan(NamedTuple):
-    """The frames that an artifact predicts in the emulated Pi, and how many inferences are counted one by one."""
-
-    frames: tuple[int, ...]
-    counted: int = COUNTED
+FEW = {"fp32": STEADY, "dynamic": COUNTED}  # frames of what is slow: FP32 takes minutes for an emulated inference
 
 
 def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
@@ -54,14 +47,14 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     samples = pick_evenly(again.parts.held_out, frames)
     if not samples:
         raise RoverError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
-    core, plans = prepare(), plans_of(manifests, len(samples))
-    jobs = {}
-    for stem, plan in plans.items():
-        path, chosen = artifacts[stem], [samples[i] for i in plan.frames]
-        guest = guest_of(path)
-        jobs[stem] = partial(count_artifact, core, path, manifests[stem], chosen, guest=guest, counted=plan.counted)
+    core, jobs = prepare(), {}
+    chosen = {stem: pick_evenly(range(len(samples)), FEW.get(m["mode"], len(samples))) for stem, m in manifests.items()}
+    for stem in sorted(artifacts, key=lambda stem: len(chosen[stem])):  # FP32, which takes longest, first
+        path, manifest, seen = artifacts[stem], manifests[stem], [samples[i] for i in chosen[stem]]
+        most = min(COUNTED, FEW.get(manifest["mode"], COUNTED))
+        jobs[stem] = partial(count_artifact, core, path, manifest, seen, guest=guest_of(path), counted=most)
     counts = side_by_side(jobs, "artifacts, emulated", progress)
-    judged = _judge(artifacts, plans, counts, samples, again, progress)
+    judged = _judge(artifacts, chosen, counts, samples, again, progress)
     rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
     metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
@@ -71,23 +64,9 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
 
 
-def plans_of(manifests: Mapping[str, Mapping[str, Any]], frames: int) -> dict[str, Plan]:
-    """Plan how each artifact is counted. FP32 takes longest, so it comes first."""
-    plans, every = {}, range(frames)
-    for stem in sorted(manifests, key=lambda stem: stem != REFERENCE):
-        mode, gmac = manifests[stem]["mode"], manifests[stem]["gmac"]
-        if mode == "fp32" and gmac >= SLOW_GMAC:
-            plans[stem] = Plan(tuple(every[:STEADY]), STEADY)
-        elif mode in ("fp32", "dynamic"):  # both are slow
-            plans[stem] = Plan(pick_evenly(every, COUNTED))
-        else:
-            plans[stem] = Plan(tuple(every))
-    return plans
-
-
 def _judge(
     artifacts: Mapping[str, Path],
-    plans: Mapping[str, Plan],
+    chosen: Mapping[str, Sequence[int]],
     counts: Mapping[str, Counted],
     samples: Sequence[Any],
     again: Opened,
@@ -97,17 +76,17 @@ def _judge(
     rows: dict[str, dict[str, Any]] = {}
     ranges, names = again.recordings.action_range(), again.checkpoint.config.action_names
     here = chunks_here(artifacts[REFERENCE], samples, progress)
-    differences = np.abs(counts[REFERENCE].chunks - here[list(plans[REFERENCE].frames)]).max((0, 1))
+    differences = np.abs(counts[REFERENCE].chunks - here[list(chosen[REFERENCE])]).max((0, 1))
     difference = float(differences.max())
     tolerance = read_manifest(artifacts[REFERENCE])["parity"]["tolerance"]
     if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
         raise RoverError(f"{artifacts[REFERENCE]}: differs by {difference:.2g} on the core", remedy="quantize again")
-    for stem, plan in plans.items():
-        expected, chosen = here[list(plan.frames)], [samples[i] for i in plan.frames]
-        at_home = expected if stem == REFERENCE else chunks_here(artifacts[stem], chosen, progress)
+    for stem, frames in chosen.items():
+        expected, seen = here[list(frames)], [samples[i] for i in frames]
+        at_home = expected if stem == REFERENCE else chunks_here(artifacts[stem], seen, progress)
         rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
         rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
-        rows[stem] |= {"reference": REFERENCE, "frames_on_the_core": len(plan.frames)}
+        rows[stem] |= {"reference": REFERENCE, "frames_on_the_core": len(frames)}
         rows[stem]["reference_max_difference"] = difference
     return rows
 

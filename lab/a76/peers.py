@@ -69,27 +69,21 @@ EXECUTORCH = Engine("executorch", ".pte", ("executorch==1.5.1", *EXECUTORCH_PACK
 ENGINES = (ONNXRUNTIME, EXECUTORCH)
 
 
-def packages_here(engine: Engine) -> Path:
-    """Return the folder of an engine's packages for this machine, from the cache or fetched now."""
-    made = {"packages": engine.packages, "python": sys.version_info[:2], "machine": os.uname().machine}
+def packages_of(engine: Engine, there: bool) -> Path:
+    """Return the folder of an engine's packages for this machine or the emulated Pi, from the cache or fetched now.
+
+    For ExecuTorch there, it includes our compiled caller of its C++ runtime.
+    """
+    wanted, where = (engine.packages[:1], FOR_GUEST) if there else (engine.packages, ("--python", sys.executable))
+    made = {"packages": wanted, "for": where if there else [sys.version_info[:2], os.uname().machine]}
+    compiled = [SHIM] if there and engine is EXECUTORCH else []
 
     def make(folder: Path) -> None:
-        fetch_wheels(folder, "--python", sys.executable, *engine.packages)
-
-    return cache_folder(f"peer-{engine.name}", key_of(made), make)
-
-
-def packages_there(engine: Engine) -> Path:
-    """Return the same for the emulated Pi; for ExecuTorch, it includes our compiled caller of its C++ runtime."""
-    made = {"packages": engine.packages[0], "for": FOR_GUEST}
-    compiled = [SHIM] if engine is EXECUTORCH else []
-
-    def make(folder: Path) -> None:
-        fetch_wheels(folder, *FOR_GUEST, engine.packages[0])
+        fetch_wheels(folder, *where, *wanted)
         if compiled:
             _compile(folder)
 
-    return cache_folder(f"arm-peer-{engine.name}", key_of(made, *compiled), make)
+    return cache_folder(f"peer-{engine.name}", key_of(made, *compiled), make)
 
 
 def _compile(folder: Path) -> None:
@@ -120,7 +114,7 @@ def quantize_with(
         calibration = Path(scratch) / "calibration.npz"
         prepared = np.stack([prepare_frame(s.frame_bgr(), height, width) for s in samples])
         np.savez(calibration, state=np.stack([s.state for s in samples]).astype(np.float32), frames=prepared)
-        environment = {**os.environ, "PYTHONPATH": str(packages_here(engine))}
+        environment = {**os.environ, "PYTHONPATH": str(packages_of(engine, there=False))}
         maker = FOLDER / f"make_{engine.name}.py"
         command = [sys.executable, maker, checkpoint.path.resolve(), calibration, temporary]
         versions = json.loads(run(*command, error=RoverError, env=environment).splitlines()[-1])
@@ -143,7 +137,7 @@ def count_peers(run_dir: Path | str, *, progress: Progress = silent) -> dict[str
     calibrating, _ = choose_calibration(again.parts.calibration, given["samples"], given["seed"])
     made, counts = {}, {}
     for engine in progress(ENGINES, desc="peers' quantization", total=len(ENGINES)):
-        size, packages = again.checkpoint.config.image_sizes[0], packages_there(engine)
+        size, packages = again.checkpoint.config.image_sizes[0], packages_of(engine, there=True)
         guest = Guest(FOLDER / "guest.py", (engine.name, *size), packages)
         made[engine.name] = quantize_with(engine, again.checkpoint, calibrating, run_dir / "peers")
         counts[engine.name] = partial(count_artifact, core, made[engine.name][0], manifest, samples, guest=guest)

@@ -70,19 +70,23 @@ def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float |
     return worst(mine / error if error else float("inf") for mine, error in judged)
 
 
-def table(content: dict[str, Any]) -> str:
-    """Show arm.json as text: the counts, fewest instructions first; then the computed times and the gates."""
-    metrics = content["metrics"]
-    counted = metrics["artifacts"] | metrics.get("peers", {})
-    ordered = sorted(counted.items(), key=lambda item: item[1]["instructions_g"])
+def rows_of(metrics: Mapping[str, Any]) -> list[list[str]]:
+    """Return a row for each count, a header first, and the fewest instructions after it. metrics: of arm.json."""
+    counted = {**metrics["artifacts"], **metrics.get("peers", {})}
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
-    for name, found in ordered:
+    for name, found in sorted(counted.items(), key=lambda item: item[1]["instructions_g"]):
         cells = [number(found[key], how) for key, how in COLUMNS.values()]
         errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
         span = "{low:.3g} to {high:.3g}".format_map(found["computed_pi5_ms"])
         rows.append([name, *cells, number(worst(errors), ".3f"), str(found["frames_on_the_core"]), span])
-    lines = [f"{LABEL}, 10^9 instructions of an inference; times are computed from them (docs/clock.md)", *align(rows)]
-    for row in metrics["gates"]:
+    return rows
+
+
+def table(content: dict[str, Any]) -> str:
+    """Show arm.json as text: the counts with the computed times, then the gates."""
+    rows = align(rows_of(content["metrics"]))
+    lines = [f"{LABEL}, 10^9 instructions of an inference; times are computed from them (docs/clock.md)", *rows]
+    for row in content["metrics"]["gates"]:
         verdict = {True: "pass", False: "FAIL", None: "not measured"}[row["passed"]]
         lines.append(f"{verdict}: {row['gate']}, {number(row['found'], '.4g')} {row['relation']} {row['limit']:g}")
     return "\n".join(lines)

@@ -8,7 +8,6 @@ replaces it) and no time of its own.
 import ast
 import contextlib
 import os
-import platform
 import secrets
 import shutil
 import socket
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 from urllib.request import getproxies
 
+from lab.debian import debian_sources
 from lab.pi.debian_image import debian_image
 from lab.pi.emulation import in_cgroup
 from rover_lib.onboard.errors import RoverError
@@ -156,11 +156,7 @@ def _lend_systemd(root: Path) -> None:
 
 def _lend_registries(etc: Path) -> None:
     """Give the Pi this machine's access to Debian's and Python's packages: sources, proxies, certificates, pip.conf."""
-    listed = run("apt-get", "indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Identifier: Packages")
-    codename = platform.freedesktop_os_release()["VERSION_CODENAME"]  # the Pi's too, see debian_image
-    suites = {codename, f"{codename}-updates", f"{codename}-security"}
-    sources = sorted({f"deb {line}\n" for line in listed.splitlines() if set(line.split()[1:2]) & suites})
-    (etc / "apt/sources.list").write_text("".join(sources))
+    (etc / "apt/sources.list").write_text(debian_sources()[1])
     settings = [x for x in run("apt-config", "dump").splitlines() if x.startswith(("Acquire::http", "Acquire::https"))]
     proxies = getproxies()
     settings += [f'Acquire::{kind}::Proxy "{proxies[kind]}";' for kind in ("http", "https") if kind in proxies]

@@ -15,6 +15,7 @@ from rover_lib.onboard.signal_event import signals
 from rover_lib.workshop.run_program import run
 
 NEEDS = {  # commands, each with its Debian package
+    "mmdebstrap": "mmdebstrap",
     "systemd-nspawn": "systemd-container",
     "qemu-aarch64-static": "qemu-user-static",
     "ssh": "openssh-client",

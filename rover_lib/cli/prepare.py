@@ -3,7 +3,6 @@
 import functools
 import re
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,20 +119,17 @@ def inspect(episodes: "Source", as_json: bool) -> None:
     show(describe(episodes, terminal_bar()), as_json)
 
 
-@click.command(short_help="Write a run's policies for other engines: ONNX Runtime, Hailo.")
+@click.command(short_help="Write a run's policies for ONNX Runtime, or its model card.")
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
-@click.option("--hailo", "kit", type=FILE, metavar="OUT", help="A kit for Hailo's compiler, in the new folder OUT.")
-@click.option("--samples", type=FROM_1, default=1024, show_default=True, help="Frames to calibrate the kit with.")
-def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int) -> None:
+def export(run_dir: Path, onnx: bool, card: bool) -> None:
     """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 
-    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md. --hailo: a
-    kit of networks, calibration set and scripts, see docs/hailo.md.
+    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md.
     """
-    if not (onnx or card) and kit is None:
-        raise click.UsageError("for what? --onnx, --card, or --hailo OUT")
+    if not (onnx or card):
+        raise click.UsageError("for what? --onnx or --card")
     if card:
         from rover_lib.workshop.run.run_report import write_card
 
@@ -144,9 +140,6 @@ def export(run_dir: Path, onnx: bool, card: bool, kit: Path | None, samples: int
         for name, digest in export_onnx(run_dir, terminal_bar()).items():
             path = run_dir / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
-    if kit:
-        (hailo,) = entry_points(group="rover.kits", name="hailo")
-        hailo.load()(run_dir, kit, samples)
 
 
 @click.command(short_help="Collect the packages for a Pi without internet.")

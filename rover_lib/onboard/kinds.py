@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, HEF, ONNX
+from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, ONNX
 from rover_lib.onboard.errors import RoverError
 
 CALLED = {
@@ -163,7 +163,7 @@ def _of_archive(file: Path) -> tuple[str, ...]:
         # An artifact's directory, which names its records, is not opened as a zip for that.
         f.seek(max(0, file.stat().st_size - DIRECTORY_BYTES))
         directory = f.read()
-        if any(name.encode() in directory for name in (ONNX, HEF, "/code/")):
+        if any(name.encode() in directory for name in (ONNX, "/code/")):
             return ("artifact",)
         with zipfile.ZipFile(file) as z, z.open(next(n for n in z.namelist() if n.endswith("/data.pkl"))) as content:
             keys = content.read(HEAD)

@@ -1,5 +1,6 @@
 """Drives with a human beside them, what is learned from that, and what is said of it."""
 
+import shutil
 from dataclasses import replace
 from itertools import product
 
@@ -8,7 +9,7 @@ import pytest
 from interrupted import interrupt
 from policies import of_a_cars_size
 
-from balloon_world import learn
+from balloon_world import drives, learn
 from balloon_world.drives import count_hits
 from balloon_world.learn import Experiment, demonstrate, drive_corrected, gates, human_beside, run_experiment
 from balloon_world.world import World, expert
@@ -122,11 +123,27 @@ def run_dir(set_params, recorded, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def learned_once(monkeypatch):
+    """Only the first training and export are real: the others get the same files. And what drives is a quick policy."""
+    finetune, make, first = learn.finetune, learn.make_artifact, []
+
+    def finetune_once(checkpoint, episodes, name, *, runs_dir, **how):
+        if first:
+            return shutil.copytree(first[0], runs_dir / name)
+        finetune(checkpoint, episodes, name, runs_dir=runs_dir, **how)
+        first.append(runs_dir / name)
+
+    monkeypatch.setattr(drives, "load_policy", lambda artifact, threads: Straight())
+    monkeypatch.setattr(learn, "finetune", finetune_once)
+    monkeypatch.setattr(learn, "make_artifact", lambda it, to, *how, **more: to.exists() or make(it, to, *how, **more))
+
+
 FEW = Experiment(rounds=2, drives=2, worlds=2, other_worlds=1, steps=2, samples=8)
 
 
 @pytest.mark.slow
-def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, tmp_path, monkeypatch):
+def test_both_arms_learn_from_as_many_seconds_and_a_kill_costs_nothing(run_dir, learned_once, tmp_path, monkeypatch):
     out = tmp_path / "learned"
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         interrupt(patch, learn, "drive_corrected", at=2)

@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import pytest
@@ -27,8 +28,17 @@ def test_episodes_say_what_was_done(recorded):
             assert (control["steering_period_us"], control["throttle_period_us"]) == (21316, 1016)
 
 
-def test_the_same_seed_gives_the_same_bytes(recorded, tmp_path):
-    assert bytes_of(record_episodes(tmp_path / "again", count=5, seed=3)) == bytes_of(recorded)
+def test_the_same_seed_gives_the_same_bytes_also_in_place_of_another_versions(recorded, tmp_path):
+    again = shutil.copytree(recorded, tmp_path / "again")
+    marker = again / ".recorded.json"
+    marker.write_text(marker.read_text().replace('"key": "', '"key": "of another version '))
+    (again / "episode_20250104_120000" / "control_data.csv").write_text("another")
+    refused = {path: path.read_bytes() for path in again.rglob("*") if path.is_file()}
+    with pytest.raises(TrainingError, match="is not this recording"):  # somebody has edited it
+        record_episodes(again, count=5, seed=3)
+    assert {path: path.read_bytes() for path in refused} == refused
+    marker.touch()
+    assert bytes_of(record_episodes(again, count=5, seed=3)) == bytes_of(recorded)
     before = {p: p.stat().st_mtime_ns for p in recorded.rglob("*")}
     assert record_episodes(recorded, count=5, seed=3) == recorded  # which is left as it is
     assert {p: p.stat().st_mtime_ns for p in recorded.rglob("*")} == before

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from recorded import record_drives
 
 from balloon_world import drives, students
 from balloon_world.drives import SEED
@@ -58,7 +59,7 @@ def counted(folder, high_ms, **changed):
 
 
 @pytest.fixture
-def made(tmp_path, recorded, monkeypatch):
+def made(tmp_path, monkeypatch):
     """A teacher's run and a student's, and the drives that were driven: (off, kind, seed, latency)."""
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(drives, "load_policy", Policy)
@@ -76,11 +77,12 @@ def made(tmp_path, recorded, monkeypatch):
     artifact(teacher / "policy_static.pt", "teacher's", off=0.001)
     artifact(student / "policy_static.pt", "student's", off=0.002, misses=1, gmac=3.0, height=180)
     distilled(student)
-    write_stage(teacher / "load.json", "load", params={"episodes": str(recorded)}, metrics={})
+    write_stage(
+        teacher / "load.json", "load", params={"episodes": str(record_drives(tmp_path / "episodes"))}, metrics={}
+    )
     return SimpleNamespace(teacher=teacher, student=student, driven=driven)
 
 
-@pytest.mark.slow
 def test_rows_are_of_both_and_each_is_as_late_as_computed_for_it(made):
     counted(made.teacher, 90)
     counted(made.student, 20)

@@ -6,23 +6,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command import rover
 
-from rover_lib.cli import main
 from rover_lib.onboard.cli import show
 from rover_lib.onboard.stage import atomic_path, read_stage
-
-
-def rover(*args):
-    return CliRunner().invoke(main, [str(a) for a in args])
-
-
-def test_inspects_each_kind_of_file(artifacts, tiny_file):
-    content = json.loads(rover("inspect", artifacts["static"], "--json").output)
-    assert content["artifact"]["mode"] == "static" and len(content["artifact"]["content_hash"]) == 64
-    content = json.loads(rover("inspect", tiny_file, "--json").output)
-    assert content["checkpoint"]["format"] == "trainer"
-    assert "parameters_acting" in rover("inspect", tiny_file).output
 
 
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
@@ -64,6 +51,7 @@ def test_what_a_file_says_cannot_control_the_terminal(capsys):
     assert "drive \\x1b[31mred" in (out := capsys.readouterr().out) and "a\\nb" in out and "\x1b" not in out
 
 
+@pytest.mark.slow  # two processes import torch
 def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypatch):
     alone = "rover_lib.onboard.care.benchmark.peak_memory_alone_mb"
     monkeypatch.setattr(alone, lambda path, threads: None)  # for speed
@@ -81,10 +69,3 @@ def test_benchmark_times_two_artifacts_of_one_name(artifacts, tmp_path, monkeypa
         assert all(v["n"] == 2 for v in timed.values())
     assert set(read_stage(out, "benchmark")["inputs"]) == {*map(str, files)}
     assert str(files[0]) in rover("benchmark", *files, "--iterations", 1, *few).stdout
-
-
-@pytest.mark.slow
-def test_inspects_recordings(tmp_path):
-    result = rover("world", "record", tmp_path / "episodes", "--count", 2, "--seed", 5)
-    assert result.exit_code == 0, result.output
-    assert json.loads(rover("inspect", tmp_path / "episodes", "--json").output)["recordings"]["episodes"] == 2

@@ -4,9 +4,7 @@ import json
 import zipfile
 
 import pytest
-from click.testing import CliRunner
-
-from rover_lib.cli import main
+from command import rover
 
 
 @pytest.fixture
@@ -57,7 +55,7 @@ def contents(folder):
 @pytest.mark.parametrize(("command", "thing"), WRONG, ids=[command for command, *_ in WRONG])
 def test_names_the_thing_and_what_to_do(here, command, thing):
     before = contents(here)
-    result = CliRunner().invoke(main, command.split())
+    result = rover(*command.split())
     assert result.exit_code != 0
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     (sentence,) = [line for line in result.output.splitlines() if line.startswith(("rover: ", "Error: "))]

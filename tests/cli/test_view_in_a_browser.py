@@ -1,50 +1,51 @@
 """`rover view` as a user sees it, in a real browser of a phone's size: its pictures, its buttons, a lost connection."""
 
-import asyncio
+import re
+import shutil
 import signal
 import subprocess
 import sys
-from urllib.parse import quote
+from contextlib import ExitStack
 
 import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra look")
 
-from browser import Browser, chromium  # it needs aiohttp
+from playwright.sync_api import expect, sync_playwright
 
-pytestmark = [chromium, pytest.mark.slow]
+CHROMIUM = shutil.which("chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not CHROMIUM, reason="needs the Debian package chromium")]
+PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True}
+PATIENT_MS = 120_000  # this machine may be busy
 
 
-@pytest.fixture
-def simulation(demo_run):
-    """What `make watch` shows: the page's URL."""
+def test_a_simulation_on_a_phone(demo_run):
+    """What `make watch` shows, by the page's own Content-Security-Policy."""
     words = ["-m", "rover_lib.cli", "view", demo_run / "policy_static.pt", "--web-port", "0"]
-    shown = subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True)
-    yield shown.stdout.readline().strip()
-    shown.send_signal(signal.SIGINT)
-    shown.communicate(timeout=120)  # Python takes a second of processor to end, and may get little
-
-
-def test_a_simulation_on_a_phone(simulation, tmp_path):
-    async def scene():
-        async with Browser(tmp_path / "profile") as browser:
-            tab = await browser.open(quote(simulation, safe=""))
-            await tab.be_a_phone()
-            await tab.until("newest.world")
-            assert await tab.sideways("body") == {"cut": [], "scrolls": []}
-            await tab.until("newest.world.results.INT8[1] > 0")
-            await tab.click("drive FP32")
-            await tab.until("newest.world.drives === 'FP32'")
-            await tab.click("stop")
-            await tab.until("newest.phase === 'ended' && newest.text.startsWith('stopped here')")
-            await tab.click("next")
-            await tab.until("newest.phase === 'driving' && newest.ribbon.length > 3")  # where the plan leads
-            key = {"type": "keyDown", "key": "ArrowLeft"}
-            await tab.ask("Input.dispatchKeyEvent", **key)
-            await tab.until("hint.textContent.includes('Recovered from')")
-            await tab.value("wire.close(); connect = () => {}; true")
-            await tab.until("document.getElementById('phase').textContent.startsWith('no news for')")
-            await tab.click("stop")
-            assert "NO CONNECTION: stop the car with the transmitter" in await tab.text("answer")
-
-    asyncio.run(scene())
+    expect.set_options(timeout=PATIENT_MS)
+    with (
+        subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as shown,
+        ExitStack() as stack,
+        sync_playwright() as driver,
+        driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"]) as browser,
+    ):
+        stack.callback(shown.terminate)
+        page = browser.new_page(**PHONE)
+        page.goto(shown.stdout.readline().strip())
+        phase, said = page.locator("#phase"), page.locator("#missing")
+        expect(page.get_by_role("button", name=re.compile(r"^INT8: hit \d+ of [1-9]"))).to_be_visible()
+        boxes = [element.bounding_box() for element in page.locator("body *:visible").all()]
+        assert len(boxes) > 20 and all(box["x"] >= -1 and box["x"] + box["width"] <= 391 for box in boxes)
+        page.get_by_role("button", name="FP32").click()
+        expect(page.get_by_role("button", name="FP32")).to_have_class("on")
+        page.get_by_role("button", name="STOP").click()
+        expect(said).to_have_text(re.compile("^stopped here"))
+        expect(phase).to_have_text("ended")
+        page.get_by_role("button", name="next world").click()
+        expect(phase).to_have_text("driving")
+        page.keyboard.press("ArrowLeft")
+        expect(page.locator("#hint")).to_contain_text("Recovered from")
+        shown.send_signal(signal.SIGINT)
+        expect(phase).to_contain_text("no news for")
+        page.get_by_role("button", name="STOP").click()
+        expect(page.locator("#answer")).to_have_text("NO CONNECTION: stop the car with the transmitter")

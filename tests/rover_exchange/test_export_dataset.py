@@ -7,11 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 from test_episodes import edit, load, record
 
 from rover_exchange.export_dataset import export_dataset
-from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -86,8 +85,7 @@ def test_repairs_and_omissions_are_reported(recorded, tmp_path):
     (first / "frames/frame_000008.jpg").unlink()
     whole = (first / "frames/frame_000015.jpg").read_bytes()
     (first / "frames/frame_000015.jpg").write_bytes(whole[:200] + bytes(60) + whole[260:])  # seen in decoding
-    words = ["export-dataset", str(recorded), str(tmp_path / "out"), "--json"]
-    result = CliRunner().invoke(main, words)
+    result = rover("export-dataset", recorded, tmp_path / "out", "--json")
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "out/rover_export.json").read_text())
     kinds = {f["kind"]: f["count"] for f in report["faults_while_reading"]}

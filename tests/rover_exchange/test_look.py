@@ -9,13 +9,12 @@ import av
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 from PIL import Image
 
 from rover_exchange import film
 from rover_exchange.flight import flight_figure
 from rover_exchange.moments import began_s, moments_of
-from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
@@ -49,10 +48,6 @@ def drive(folder, *, recorded=True, pictures=True, seconds=SECONDS):
         lines += [f"99,{start + 0.5},../../../secret.jpg", "100,nan,frames/frame_000003.jpg"]
         (episode / "frame_data.csv").write_text("\n".join(lines))
     return path
-
-
-def rover(*args):
-    return CliRunner().invoke(main, [str(a) for a in args])
 
 
 def test_each_picture_has_what_the_log_says_of_its_moment(tmp_path):

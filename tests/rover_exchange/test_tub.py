@@ -7,11 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 
 from rover_exchange.export_dataset import usual_rate_hz
 from rover_exchange.tub import read_tub
-from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.recordings.samples import frame_rate_hz
@@ -146,7 +145,7 @@ def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatc
     root = tub(tmp_path / "tub", records(50), deleted=[25])
     (tmp_path / "car.yml").write_text(yaml_of(LEFT))
     monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
-    done = CliRunner().invoke(main, ["export-dataset", str(root), str(tmp_path / "dataset")])
+    done = rover("export-dataset", root, tmp_path / "dataset")
     assert done.exit_code == 0, done.output
     ours, again = read_tub(root, LEFT).samples, load_recordings(tmp_path / "dataset", chunk=2)
     assert again.layout.rate_hz == 20 and again.samples[0].car.drives_like(LEFT)

@@ -15,7 +15,7 @@ from rover_lib.onboard.stage import version_of
 MAY_DIFFER = ("mode", "chunk", "camera", "aspect")
 CODE_OF_MODE = {"static": b"ops.quantized.conv2d", "mixed": b"ops.quantized.conv2d", "dynamic": b"linear_dynamic"}
 ONNX_OF_MODE = {"static": b"QuantizeLinear", "mixed": b"QuantizeLinear"}
-OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE, "hailo": {}}
+OF_MODE: dict[str, dict[str, bytes]] = {"torch": CODE_OF_MODE, "onnxruntime": ONNX_OF_MODE}
 
 
 @dataclass(frozen=True)

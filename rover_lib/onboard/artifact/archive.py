@@ -1,7 +1,6 @@
 """The zip file around an artifact: a limited number of records, each with a known name and a bounded size.
 
-It holds a program for torch (TorchScript's own records), for ONNX Runtime (an ordinary .onnx), or for a Hailo chip (a
-compiled network, and an .onnx for the part that runs on the processor after it).
+It holds a program for torch (TorchScript's own records), or for ONNX Runtime (an ordinary .onnx).
 """
 
 import os
@@ -22,10 +21,8 @@ ABOUT = frozenset({"extra/manifest.json", "extra/parity.npz"})
 REQUIRED = {
     "torch": ABOUT | {"data.pkl", "constants.pkl", "version"},
     "onnxruntime": ABOUT | {"model.onnx"},
-    "hailo": ABOUT | {"network.hef"},
 }
 MANIFEST, PARITY, ONNX = "archive/extra/manifest.json", "archive/extra/parity.npz", "archive/model.onnx"
-HEF = "archive/network.hef"
 RECORD_BYTES = {  # largest size by name after "archive/"
     r"version|byteorder|\.data/serialization_id": 100,
     r"(data|constants)\.pkl": PICKLE_BYTES,
@@ -33,7 +30,7 @@ RECORD_BYTES = {  # largest size by name after "archive/"
     r"extra/parity\.npz": PARITY_BYTES,
     r"code/__torch__/[\w/]+\.py": CODE_BYTES,
     r"code/__torch__/[\w/]+\.py\.debug_pkl": DEBUG_BYTES,
-    r"constants/\d{1,6}|model\.onnx|network\.hef": ARCHIVE_BYTES,
+    r"constants/\d{1,6}|model\.onnx": ARCHIVE_BYTES,
 }
 
 
@@ -68,9 +65,9 @@ def read_record(z: zipfile.ZipFile, name: str) -> bytes:
 
 
 def kind_of(records: list[zipfile.ZipInfo]) -> str:
-    """Return the engine that an archive's policy is for: torch, onnxruntime or hailo."""
+    """Return the engine that an archive's policy is for: torch or onnxruntime."""
     names = {record.filename for record in records}
-    return "hailo" if HEF in names else "onnxruntime" if ONNX in names else "torch"
+    return "onnxruntime" if ONNX in names else "torch"
 
 
 def _check_directory(file: BinaryIO, path: Path | str) -> None:
@@ -118,8 +115,7 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
     if total > ARCHIVE_BYTES:
         raise refused(path, f"{total} bytes are more than an artifact has")
     kind = kind_of(records)
-    optional = {"model.onnx"} if kind == "hailo" else set()
-    if kind != "torch" and names - REQUIRED[kind] - optional:
+    if kind != "torch" and names - REQUIRED[kind]:
         raise refused(path, "it is a policy for two engines")
     for name in sorted(REQUIRED[kind] - names):
         raise ArtifactError(f"{path}: no {name.removeprefix('extra/')} in it", remedy="give a policy_*.pt of a run")

@@ -1,7 +1,7 @@
 """The engines that run artifacts, by the name in an artifact's manifest. Only `load` imports one.
 
 An engine's module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact
-here. threads: None lets the engine choose. UNCONFINED, if it has it: why its process cannot be confined (confine.py).
+here. threads: None lets the engine choose.
 """
 
 from collections.abc import Sequence
@@ -9,12 +9,11 @@ from typing import Protocol
 
 import numpy as np
 
-TORCH, ONNXRUNTIME, HAILO = "qnnpack", "onnxruntime", "hailo"
-PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime", HAILO: "hailo_platform"}  # the package each engine needs
+TORCH, ONNXRUNTIME = "qnnpack", "onnxruntime"
+PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime"}  # the package each engine needs
 MODULES = {
     TORCH: "rover_lib.onboard.policy.torch_engine",
     ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
-    HAILO: "rover_lib.onboard.policy.hailo_engine",
 }
 
 

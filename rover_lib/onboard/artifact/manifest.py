@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record, refused
-from rover_lib.onboard.artifact.engines import HAILO, ONNXRUNTIME
+from rover_lib.onboard.artifact.engines import ONNXRUNTIME
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.checked import Rule, broken_rule, is_number, is_whole, number, of_type, one_of, whole
 from rover_lib.onboard.errors import ArtifactError, CarError
@@ -158,7 +158,7 @@ class Artifact:
             check_manifest(manifest, str(self.path))
         except (ValueError, zipfile.BadZipFile, RecursionError) as e:
             raise refused(self.path, f"its manifest is not readable ({e})") from None
-        kind = manifest["engine"] if manifest["engine"] in (ONNXRUNTIME, HAILO) else "torch"
+        kind = ONNXRUNTIME if manifest["engine"] == ONNXRUNTIME else "torch"
         if kind != self.kind:
             raise refused(self.path, "its manifest names another engine than its policy's", manifest["engine"][:60])
         return manifest
@@ -218,7 +218,7 @@ class Artifact:
 
     @property
     def kind(self) -> str:
-        """The engine that its policy is for, by the records: torch, onnxruntime or hailo."""
+        """The engine that its policy is for, by the records: torch or onnxruntime."""
         return kind_of(self._z.infolist())
 
     def record(self, name: str) -> bytes:

@@ -1,6 +1,6 @@
 """Measure the latency of policies on this machine: its distribution, the host's state, and a Pi 5's lower bound.
 
-    metrics = benchmark({"static": static, "fp32": fp32}, frames, state, iterations=1000)
+    metrics = benchmark(Timing({"static": static, "fp32": fp32}, frames, state, iterations=1000))
 
 All policies are timed in one run. Each round has one inference of every policy, and starts with a different one. So a
 machine that heats up or is shared slows all of them alike. A value that the host does not report (no thermal zone, no
@@ -48,7 +48,7 @@ def _predict_alone(path: str, threads: int) -> float | None:
 def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mapping[str, Any]) -> dict[str, Any]:
     """Time artifacts from anywhere, by name, in a confined process, on the frames of the first one's parity vectors.
 
-    options: of benchmark(). Each artifact's memory is measured too. Raises PolicyError for one that does not load.
+    options: of Timing. Each artifact's memory is measured too. Raises PolicyError for one that does not load.
     """
     metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
     metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
@@ -62,7 +62,7 @@ def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]
     frames = []
     for i in range(len(vectors["state"])):  # stored as RGB; a camera gives BGR
         frames.append({camera: vectors[f"frame_{camera}"][i][:, :, ::-1] for camera in cameras})
-    return benchmark(policies, frames, vectors["state"][0], **options)
+    return benchmark(Timing(policies, frames, vectors["state"][0], **options))
 
 
 def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int | None) -> None:
@@ -75,108 +75,104 @@ def _add_memory(metrics: dict[str, Any], paths: Mapping[str, Path], threads: int
         metrics["peak_memory_mb"] = peak_mb
 
 
+@dataclass(frozen=True)
+class Timing:
+    """What is timed, and how. Raises ParamsError without policies, frames or iterations, and for unknown names.
+
+    policies: name -> an object with predict_chunk(frame, state); its `.manifest` ("mode", "gmac"), `.path` and
+    `.threads` are used if it has them. frames: used in turn. warmup: inferences of each policy that are not counted.
+    iterations: number of rounds. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures
+    are at the top level ("": the first's). reference: what the others' speed is compared with ("": nothing).
+    """
+
+    policies: Mapping[str, Any]
+    frames: Sequence[Any]
+    state: np.ndarray
+    warmup: int = 10
+    iterations: int = 100
+    at_most_s: float = math.inf
+    main: str = ""
+    reference: str = ""
+
+    def __post_init__(self) -> None:
+        names, unknown = list(self.policies), {self.main, self.reference} - {"", *self.policies}
+        if not names or not len(self.frames) or not self.iterations > 0 or unknown:
+            what = f"a benchmark needs frames, iterations and policies, {self.main} and {self.reference} among them"
+            raise ParamsError(what, found=f"{len(self.frames)}, {self.iterations} and {names}")
+
+
 def benchmark(
-    policies: Mapping[str, Any],
-    frames: Sequence[Any],
-    state: np.ndarray,
+    timing: Timing,
     *,
-    warmup: int = 10,
-    iterations: int = 100,
-    at_most_s: float = math.inf,
-    main: str | None = None,
-    reference: str | None = None,
     memory_alone: bool = False,
     host: Host | None = None,
     wall: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
     progress: Progress = lambda items, **_: items,
 ) -> dict[str, Any]:
-    """Time every policy's predict_chunk(frame, state), interleaved, and return the metrics of benchmark-<host>.json.
+    """Time every policy's predict_chunk, interleaved, and return the metrics of benchmark-<host>.json.
 
-    policies: name -> an object with predict_chunk; its `.manifest` ("mode", "gmac"), `.path` and `.threads` are used if
-    it has them. frames: used in turn. warmup: inferences of each policy that are not counted. iterations: number of
-    rounds. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures are at the top level
-    (None: the first's). reference: what the others' speed is compared with. memory_alone: measure each artifact's
-    memory in a process of its own. wall, cpu: clocks of elapsed and of processor time, in seconds.
+    memory_alone: measure each artifact's memory in a process of its own. wall, cpu: clocks of elapsed and of processor
+    time, in seconds.
 
     cpu_pct is processor time as a share of all cores that this process may use. temperature_c is the highest and
     clock_mhz the lowest reading. peak_memory_mb is the artifact's alone if it was measured, else None, and this
-    process's at the top level. Raises ParamsError without policies, frames or iterations, or if main or reference is
-    not among the policies.
+    process's at the top level.
     """
-    names = list(policies)
-    main = main or next(iter(names), None)
-    if not len(frames) or not iterations > 0 or main not in names or reference not in (None, *names):
-        what = f"a benchmark needs frames, iterations, and policies with {main} and {reference} among them"
-        raise ParamsError(what, found=f"{len(frames)}, {iterations} and {names}")
-    host = host or Host()
-    cores = usable_cores()
-    for name in names:
-        for i in range(warmup):
-            policies[name].predict_chunk(frames[i % len(frames)], state)
-    run = _Run(policies, frames, state, host, wall, cpu)
-    run.measure(progress(range(iterations), desc="timing", total=iterations), at_most_s)
-    threads = getattr(policies[main], "threads", None)
-
-    artifacts = {name: run.metrics_of(name) for name in names}
-    top = dict(artifacts[main])
-    if reference is not None:
-        for name, metrics in artifacts.items():
-            metrics |= run.speedup(name, reference)
+    policies, main = timing.policies, timing.main or next(iter(timing.policies))
+    for policy in policies.values():
+        for i in range(timing.warmup):
+            policy.predict_chunk(timing.frames[i % len(timing.frames)], timing.state)
+    run, cores = _Run(timing, host or Host(), wall, cpu), usable_cores()
+    run.measure(progress(range(timing.iterations), desc="timing", total=timing.iterations))
     metrics = {
-        **top,
-        "peak_memory_mb": host.process_peak_memory_mb(),
+        **run.metrics_of(main),
+        "peak_memory_mb": run.host.process_peak_memory_mb(),
         "cpu_pct": 100 * run.process_s / run.wall_s / cores if run.wall_s > 0 else None,
         **run.host_metrics(),
         "main": main,
-        "reference": reference,
-        "threads": threads,
+        "reference": timing.reference or None,
+        "threads": getattr(policies[main], "threads", None),
         "cores": cores,
-        "warmup": warmup,
+        "warmup": timing.warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
-        "artifacts": artifacts,
+        "artifacts": {name: run.metrics_of(name) | run.speedup(name) for name in policies},
     }
     if memory_alone:
-        paths = {name: path for name in names if (path := getattr(policies[name], "path", None))}
-        _add_memory(metrics, paths, threads)
+        paths = {name: path for name in policies if (path := getattr(policies[name], "path", None))}
+        _add_memory(metrics, paths, metrics["threads"])
     return metrics
 
 
-@dataclass
 class _Run:
     """The timed part of one benchmark."""
 
-    policies: Mapping[str, Any]
-    frames: Sequence[Any]
-    state: np.ndarray
-    host: Host
-    wall: Callable[[], float]
-    cpu: Callable[[], float]
-
-    def __post_init__(self) -> None:
-        self.latencies_ms: dict[str, list[float]] = {name: [] for name in self.policies}
+    def __init__(self, timing: Timing, host: Host, wall: Callable[[], float], cpu: Callable[[], float]):
+        self.timing, self.host, self.wall, self.cpu = timing, host, wall, cpu
+        self.latencies_ms: dict[str, list[float]] = {name: [] for name in timing.policies}
         self.readings: list[dict[str, Any]] = []
         self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
-    def measure(self, rounds: Iterable[int], at_most_s: float) -> None:
+    def measure(self, rounds: Iterable[int]) -> None:
         """Time the rounds, or as many as begin within at_most_s, and fill the lists."""
-        names = list(self.policies)
+        timing, names = self.timing, list(self.timing.policies)
         before = self.host.core_ticks()
         cpu_start_s, start_s = self.cpu(), self.wall()
         read_s = -math.inf
         for i in rounds:
             passed_s = self.wall() - start_s
-            if i >= LEAST_ROUNDS and passed_s >= at_most_s:
+            if i >= LEAST_ROUNDS and passed_s >= timing.at_most_s:
                 break
             if passed_s >= read_s + READ_S:
                 self.readings.append(self.host.reading())
                 read_s = passed_s
+            frame = timing.frames[i % len(timing.frames)]
             for k in range(len(names)):
-                name, frame = names[(i + k) % len(names)], self.frames[i % len(self.frames)]
+                name = names[(i + k) % len(names)]
                 begin_s = self.wall()
-                self.policies[name].predict_chunk(frame, self.state)
+                timing.policies[name].predict_chunk(frame, timing.state)
                 self.latencies_ms[name].append((self.wall() - begin_s) * 1000)
         self.wall_s, self.process_s = self.wall() - start_s, self.cpu() - cpu_start_s
         self.readings.append(self.host.reading())
@@ -190,7 +186,7 @@ class _Run:
 
         control_rate_hz: the highest rate at which 95 % of the inferences end within their period (1000 / p95).
         """
-        policy, times_ms = self.policies[name], np.asarray(self.latencies_ms[name], float)
+        policy, times_ms = self.timing.policies[name], np.asarray(self.latencies_ms[name], float)
         mean_ms, p95_ms = float(times_ms.mean()), float(np.percentile(times_ms, 95))
         manifest = getattr(policy, "manifest", None) or {}
         path = getattr(policy, "path", None)
@@ -210,12 +206,13 @@ class _Run:
             "size_mb": Path(path).stat().st_size / 1e6 if path and Path(path).is_file() else None,
         }
 
-    def speedup(self, name: str, reference: str) -> dict[str, float | None]:
+    def speedup(self, name: str) -> dict[str, float | None]:
         """Return how many times as fast as the reference a policy is: by p50, and from 5 to 95 % of the rounds."""
-        times_ms, reference_ms = self.latencies_ms[name], self.latencies_ms[reference]
-        p50_ms, reference_p50_ms = (float(np.percentile(x, 50)) for x in (times_ms, reference_ms))
-        paired = np.asarray(reference_ms) / np.maximum(times_ms, 1e-9)
-        low, high = np.percentile(paired, (5, 95)).tolist()
+        if not self.timing.reference:
+            return {}
+        times_ms, reference_ms = (np.asarray(self.latencies_ms[n]) for n in (name, self.timing.reference))
+        p50_ms, reference_p50_ms = float(np.median(times_ms)), float(np.median(reference_ms))
+        low, high = np.percentile(reference_ms / np.maximum(times_ms, 1e-9), (5, 95)).tolist()
         return {"speedup": reference_p50_ms / p50_ms if p50_ms > 0 else None, "speedup_p5": low, "speedup_p95": high}
 
     def host_metrics(self) -> dict[str, Any]:

@@ -79,17 +79,20 @@ def examine(
 
     artifact: the policy to check. camera, port: as for `rover drive`. log_folder: where flight logs go [this folder].
     """
-    host = host or Host()
+    host, manifest = host or Host(), None
+    with contextlib.suppress(ArtifactError, OSError):  # the artifact's own check reports it
+        manifest = read_manifest(artifact) if artifact else None
+    seen = seen_size(manifest) if manifest else None
     device = path_of(str(camera))
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(DEV):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device)
     checks |= {
-        "camera": lambda: camera_rate(device, seen_by(artifact), rate_hz=rate_hz),
+        "camera": lambda: camera_rate(device, seen, rate_hz=rate_hz),
         "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports()), DEV / "none"))),
         "Arduino": lambda: arduino(port or find_port()),
         "ModemManager": lambda: modem_manager(host.proc_root),
-        "car": lambda: car(artifact),
+        "car": lambda: car(manifest),
         "artifact": lambda: policy(artifact),
         "power": lambda: power(host),
         "governor": lambda: governor(host.sys_root),
@@ -116,13 +119,6 @@ def access(name: str, device: Path) -> Iterator[Check]:
         yield Check(name, "ok", f"{user} may use {device}")
     else:
         yield Check(name, "fail", f"{user} may not use {device}, of group {group}", remedy)
-
-
-def seen_by(artifact: Path | str | None) -> tuple[int, int] | None:
-    """Return (width, height) of the pictures that an artifact was made with; None if there is no sound artifact."""
-    with contextlib.suppress(ArtifactError, OSError):
-        return seen_size(read_manifest(Path(artifact))) if artifact else None
-    return None
 
 
 def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate_hz: float = 30.0) -> Iterator[Check]:
@@ -234,10 +230,10 @@ def _failsafe(after: tuple[int | None, ...], rest_us: int) -> Check:
     return Check(name, "warning", f"{found}: an armed car may drive on, and nobody can tell", remedy)
 
 
-def car(artifact: Path | str | None = None) -> Iterator[Check]:
+def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
     """Say which car this is, and warn if the artifact was calibrated for another. If its human has a gamepad, open it.
 
-    Raises CarError for a bad car.yml or gamepad.
+    manifest: the artifact's. Raises CarError for a bad car.yml or gamepad.
     """
     this, path = this_car(), car_file()
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
@@ -245,11 +241,9 @@ def car(artifact: Path | str | None = None) -> Iterator[Check]:
         open_gamepad().close()
         found = ", ".join(map(str, list_gamepads()))
         yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
-    if artifact and Path(artifact).is_file():
-        with contextlib.suppress(ArtifactError):  # the artifact's own check reports it
-            if not (meant := car_of(read_manifest(Path(artifact)))).drives_like(this):
-                remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
-                yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
+    if manifest and not (meant := car_of(manifest)).drives_like(this):
+        remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
+        yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:

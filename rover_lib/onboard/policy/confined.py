@@ -56,8 +56,9 @@ def load_confined(
     notify: told why, if the process is not confined.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
-    reasons = [getattr(import_engine(artifact), "UNCONFINED", "") for artifact in artifacts.values()]
-    if reason := next(filter(None, reasons), "") or confine(sum(memory_mb(path, threads) for path in paths.values())):
+    for artifact in artifacts.values():
+        import_engine(artifact)
+    if reason := confine(sum(memory_mb(path, threads) for path in paths.values())):
         notify(reason)
     return {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}, artifacts
 

@@ -247,8 +247,7 @@ class EpisodeWriter:
         self._part, self._lock = part, lock
         known = {*CONTROL_FIELDS, *FLAG_FIELDS}
         for kind, time in KINDS.items():
-            for line in _lines(part, kind):
-                row = _whole_row(line, kind)
+            for row in _rows(part, kind):
                 if row and kind == "frame" and not _is_whole_picture(part / str(row.get("image_path"))):
                     self._damaged.add(row.get("image_path"))
                     row = None
@@ -265,11 +264,8 @@ class EpisodeWriter:
         damaged = f"; {self._left_out} damaged rows and pictures are left out" if self._left_out else ""
         self.metadata["fault"] = f"the recording was cut off{damaged}"
 
-    def _rows_of(self, part: Path, kind: str) -> Iterator[dict[str, Any]]:
-        for line in _lines(part, kind):
-            row = _whole_row(line, kind)
-            if row and row.get("image_path") not in self._damaged:
-                yield row
+    def _whole_rows(self, part: Path, kind: str) -> Iterator[dict[str, Any]]:
+        return (row for row in _rows(part, kind) if row and row.get("image_path") not in self._damaged)
 
     def _append(self, kind: str, row: dict[str, Any], t_s: float) -> None:
         line = json.dumps(row, allow_nan=False).encode() + b"\n"
@@ -342,7 +338,7 @@ class EpisodeWriter:
             f.write(json.dumps(head, indent=2, allow_nan=False).removesuffix("\n}"))
             for kind, names in columns.items():
                 f.write(f',\n  "{kind}_samples": [')
-                for i, row in enumerate(self._rows_of(part, kind)):
+                for i, row in enumerate(self._whole_rows(part, kind)):
                     fields = json.dumps({name: row.get(name) for name in names}, separators=(",\n      ", ": "))[1:-1]
                     f.write(f"{',' if i else ''}\n    {{\n      {fields}\n    }}")
                 f.write("\n  ]")
@@ -352,7 +348,7 @@ class EpisodeWriter:
                 # ends lines with CR LF, as the user's recorder did
                 table = csv.DictWriter(f, names, extrasaction="ignore")
                 table.writeheader()
-                table.writerows(self._rows_of(part, kind))
+                table.writerows(self._whole_rows(part, kind))
 
 
 def find_killed(folder: Path) -> list[Path]:
@@ -400,19 +396,15 @@ def _holds_anything(part: Path) -> bool:
     return any(path.stat().st_size for path in part.rglob("*") if path.is_file() and path.name != ABOUT)
 
 
-def _lines(part: Path, kind: str) -> Iterator[bytes]:
-    path = part / f"{kind}.rows"
-    if path.is_file():
-        with path.open("rb") as file:
-            yield from file
-
-
-def _whole_row(line: bytes, kind: str) -> dict[str, Any] | None:
-    try:
-        row = json.loads(line)
-    except ValueError:
-        return None
-    return row if isinstance(row, dict) and KINDS[kind] in row else None
+def _rows(part: Path, kind: str) -> Iterator[dict[str, Any] | None]:
+    """Yield what was recorded of a kind, row by row; None for a damaged row."""
+    with contextlib.suppress(FileNotFoundError), (part / f"{kind}.rows").open("rb") as file:
+        for line in file:
+            try:
+                row = json.loads(line)
+            except ValueError:
+                row = None
+            yield row if isinstance(row, dict) and KINDS[kind] in row else None
 
 
 def _is_whole_picture(path: Path) -> bool:

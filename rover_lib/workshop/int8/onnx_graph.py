@@ -29,7 +29,7 @@ from torch.fx import GraphModule, Interpreter, Node
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.workshop.act import Columns
 
-OPSET = 17  # the first with LayerNormalization, the last that Hailo's parser documents
+OPSET = 17  # the first with LayerNormalization
 IR_VERSION = 8  # the version of ONNX's file format that belongs to that opset
 ONNX_TYPES = {torch.float32: TensorProto.FLOAT, torch.uint8: TensorProto.UINT8, torch.int8: TensorProto.INT8}
 

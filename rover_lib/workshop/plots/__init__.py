@@ -3,13 +3,11 @@
     plots.save(plots.action_error(report), run_dir, "04_action_error")  # a figure, or a sentence if it would be empty
     plots.gates(rows)                                                   # a table
 
-Each subject has a module; `style` has what all figures share.
+`style` has what all figures share.
 """
 # ruff: noqa: F401, these are the names that notebooks use
 
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.comparison import action_error, familiarity, worst_frames
-from rover_lib.workshop.plots.quantization import sensitivity
-from rover_lib.workshop.plots.recordings import episode_overview
+from rover_lib.workshop.plots.figures import action_error, episode_overview, familiarity, sensitivity, worst_frames
 from rover_lib.workshop.plots.style import save
 from rover_lib.workshop.plots.tables import gates

@@ -9,7 +9,7 @@ Figures are drawn for a notebook's width at 100 dots per inch, and shown and sav
 
 import io
 from base64 import b64encode
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,15 +40,7 @@ COLOURS = {
     "steering": "#332288",
     "throttle": "#CC79A7",
 }
-NAMES = {
-    "fp32": "FP32",
-    "static_affine": "static, affine",
-    "torch_affine": "torch, affine",
-    "onnxruntime": "ONNX Runtime INT8",
-    "fp32.onnx": "FP32, for ONNX Runtime",
-    "static.onnx": "static INT8, for ONNX Runtime",
-    "executorch": "ExecuTorch INT8",
-}
+NAMES = {"fp32": "FP32", "static_affine": "static, affine"}
 MOST_ACTIONS = 3  # a figure shows at most this many beside each other
 
 
@@ -111,30 +103,10 @@ def line_of(mode: str) -> dict[str, Any]:
     return {"color": COLOURS.get(mode, GREY), "label": NAMES.get(mode, mode), "lw": 1.8}
 
 
-def legend(ax: Axes, **options: Any) -> None:
-    ax.legend(frameon=False, fontsize=9, **options)
-
-
 def legend_below(fig: Figure, ax: Axes, columns: int) -> None:
     """Put one legend, with what `ax` has, below all of a figure's axes."""
     handles, labels = ax.get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
-
-
-def bar_values(ax: Axes, y: Iterable[float], x: Iterable[Any], form: str) -> None:
-    """Write the numbers at the ends of horizontal bars, with room for them."""
-    for at, value in zip(y, x, strict=True):
-        ax.annotate(form.format(value), (value, at), (4, 0), textcoords="offset points", va="center", fontsize=9)
-    ax.margins(x=0.16)
-
-
-def judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
-    """Return the keys <action>_mae_pct of the judged actions. The others are named in the legend of `ax`."""
-    keys = [k for k in errors if k.endswith("_mae_pct")]
-    for key in keys:
-        if errors[key] is None:
-            ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
-    return [k for k in keys if errors[k] is not None]
 
 
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:

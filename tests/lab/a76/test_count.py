@@ -2,7 +2,6 @@
 
 import struct
 import subprocess
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,15 +20,16 @@ from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.care import pi5
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.progress import silent
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 
 # Of the thin policy, in 1e6 instructions on an emulated Cortex-A76; a count may leave it by 2 %.
-BUDGETS_M = {"policy_fp32": 55.8, "policy_static": 10.8, "policy_static.onnx": 11.8}
+BUDGETS_M = {"policy_static": 10.8, "policy_static.onnx": 11.8}
 SVC = 0xD4000001
 START, ROUNDS, SECTION = 0x400000, 1000, 7
 
@@ -146,16 +146,11 @@ def tiny_run(thin, tmp_path_factory) -> Path:
     """A run's folder with artifacts of the tests' thin policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
     (checkpoint, calibration), samples = thin, memory_samples(16)
-    # Each parity vector of FP32 takes the emulated core four seconds.
-    scheme, options = q.Scheme("static"), {"samples": samples[:1]}
-    calibration.save(folder / "calibration.pt")
+    scheme, options = q.Scheme("static"), {"samples": samples[:1]}  # each parity vector takes the emulated core a while
     export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
     static = q.quantize(checkpoint, scheme, calibration)
-    digest = export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
+    export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
     export(static, checkpoint, folder / "policy_static.onnx.zip", calibration=calibration, **options)
-    modes = {"static": {"scheme": asdict(scheme), "content_hash": digest}}
-    inputs = {"calibration.pt": sha256_of(folder / "calibration.pt")}
-    write_stage(folder / "quantize.json", "quantize", params={}, metrics={"modes": modes}, inputs=inputs)
     return folder
 
 
@@ -165,36 +160,47 @@ def core(users_cache) -> Core:
 
 
 @pytest.fixture(scope="module")
-def again(thin) -> SimpleNamespace:
-    """What `opened` would give: held-out frames from memory."""
+def count(core, thin, tiny_run):
+    """count(off): count_run on held-out frames from memory. FP32 is not emulated, but predicts as here, so much off.
+
+    Importing torch takes the emulated core half a minute, which is spent on static INT8 alone.
+    """
     recordings = SimpleNamespace(action_range=lambda: {"steering": (-0.5, 0.5), "throttle": (0.0, 0.1)})
     parts = SimpleNamespace(held_out=memory_samples(12, seed=1))
-    return SimpleNamespace(checkpoint=thin[0], parts=parts, recordings=recordings)
+    again = SimpleNamespace(checkpoint=thin[0], parts=parts, recordings=recordings)
+    full = read_stage(Path(__file__).parents[3] / "results/full/arm.json", "arm")["metrics"]["artifacts"]["policy_fp32"]
+
+    def run(off: float) -> dict:
+        def count_artifact(core, path, manifest, samples, **options):
+            if path.stem != "policy_fp32":
+                return counting_really(core, path, manifest, samples, **options)
+            return Counted(full, counting.chunks_here(path, samples, silent) + np.float32(off))
+
+        counting_really = counting.count_artifact
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(counting, "count_artifact", count_artifact)
+            patch.setattr(counting, "open_run", lambda run_dir: again)
+            return count_run(tiny_run, frames=12)
+
+    return run
 
 
 @pytest.fixture(scope="module")
-def report(core, tiny_run, again) -> dict:
-    """count_run on held-out frames from memory. FP32 is counted like a slow one: a frame takes four seconds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counting, "SLOW_GMAC", 0.0)
-        patch.setattr(counting, "open_run", lambda run_dir: again)
-        return count_run(tiny_run, frames=12)
+def report(count) -> dict:
+    return count(0.0)
 
 
 def test_a_run_is_counted(report, tiny_run):
     assert read_stage(tiny_run / "arm.json", "arm") == report
     assert report["metrics"]["label"] == "counted on an emulated Cortex-A76"
     fp32, static = (report["metrics"]["artifacts"][stem] for stem in ("policy_fp32", "policy_static"))
-    assert fp32["sdot_g"] == 0 < static["sdot_g"] < static["simd_g"] < static["instructions_g"] < fp32["instructions_g"]
+    assert 0 < static["sdot_g"] < static["simd_g"] < static["instructions_g"]
     assert sum(static["instructions_by_kernel"].values()) == pytest.approx(static["instructions_g"])
     assert any("neondot" in kernel for kernel in static["instructions_by_kernel"])
-    assert static["reference_max_difference"] < 1e-4
-    assert fp32["workstation_steering_mae_pct"] == fp32["workstation_throttle_mae_pct"] == 0
-    assert fp32["steering_mae_pct"] < 1e-3 and fp32["throttle_mae_pct"] < 1e-2  # another order of sums
-    assert (fp32["frames_on_the_core"], fp32["tenth_g"]) == (STEADY, None)
+    assert fp32["workstation_steering_mae_pct"] == fp32["steering_mae_pct"] == static["reference_max_difference"] == 0
     assert 0 < static["steering_mae_pct"] < 2 * static["workstation_steering_mae_pct"]
     assert 100 < static["peak_memory_mb"] < 500
-    assert static["threads"] == 1 and static["frames_on_the_core"] == 12
+    assert static["threads"] == 1 and (static["frames_on_the_core"], fp32["frames_on_the_core"]) == (12, STEADY)
     assert 0 < static["far_lines_g"] < static["near_lines_g"] < 0.1 * static["instructions_g"]
     assert static["computed_pi5_ms"] == pi5.predict_ms(pi5.Work.of(static))._asdict() | {"threads": pi5.DRIVING}
     assert "policy_static" in reports.table(report)
@@ -213,13 +219,10 @@ def test_what_onnx_runtime_runs_is_counted_like_the_rest(report):
     assert onnx["peak_memory_mb"] < torchs["peak_memory_mb"] - 100  # torch alone is more
 
 
-def test_an_fp32_that_differs_on_the_core_is_no_reference(core, tiny_run, again, monkeypatch):
-    monkeypatch.setattr(counting, "open_run", lambda run_dir: again)
-    monkeypatch.setattr(counting, "SLOW_GMAC", 0.0)
-    fake = Counted({}, np.full((STEADY, 32, 2), 0.5, np.float32))
-    monkeypatch.setattr(counting, "count_artifact", lambda *args, **options: fake)
+def test_an_fp32_that_differs_on_the_core_is_no_reference(count, tiny_run, monkeypatch):
+    monkeypatch.setattr(counting, "side_by_side", lambda jobs, *_: {"policy_fp32": jobs["policy_fp32"]()})
     with pytest.raises(RoverError, match=r"policy_fp32\.pt: differs by .* on the core"):
-        count_run(tiny_run, frames=4)
+        count(0.5)
 
 
 def test_a_peer_without_finite_actions_of_that_shape_is_refused():
@@ -230,7 +233,7 @@ def test_a_peer_without_finite_actions_of_that_shape_is_refused():
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):
-    broken = tmp_path / "broken.onnx.zip"  # importing torch would take the core half a minute
+    broken = tmp_path / "broken.onnx.zip"
     broken.write_bytes((tiny_run / "policy_static.onnx.zip").read_bytes()[:-1000])
     with pytest.raises(RoverError, match=r"ended with 1 after load: error: .*broken\.onnx\.zip: not an artifact"):
         count_artifact(core, broken, {}, memory_samples(1), counted=3)

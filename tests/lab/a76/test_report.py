@@ -1,11 +1,15 @@
-"""What is said about counts: gates, errors, shares of threads. Needs no emulator."""
+"""What is said about counts: gates, errors, shares of threads, notebook 06. Needs no emulator."""
+
+import shutil
 
 import numpy as np
 import pytest
+from executed import shown
 
 from lab.a76 import count_run as counting
 from lab.a76 import report
 from lab.params import lab_params
+from rover_lib.workshop.run import run as runs
 
 
 def test_what_is_not_divided_over_the_threads_is_executed_by_one():
@@ -50,3 +54,23 @@ def test_an_action_that_never_changes_is_not_judged():
     assert errors["steering_mae_pct"] == pytest.approx(100 * np.abs(chunks[1] - chunks[0])[..., 0].mean(), rel=1e-4)
     still = artifact(throttle_mae_pct=None, workstation_throttle_mae_pct=None)
     assert gates(policy_static=still)["policy_static error on the emulated core, times the workstation's"] is True
+
+
+# ---- notebook 06
+
+
+@pytest.mark.slow
+def test_counts_are_shown(tmp_path):
+    shutil.copy(runs.NOTEBOOKS.parent / "results" / "full" / "arm.json", tmp_path)
+    text = shown(runs.execute("06_arm", tmp_path))
+    assert report.LABEL in text
+    assert "teacher at 320x180" in text  # the computed times
+
+
+@pytest.mark.slow
+def test_nothing_counted_is_a_sentence(tmp_path):
+    (tmp_path / "mine").mkdir()
+    assert "make count NAME=mine counts" in shown(runs.execute("06_arm", tmp_path / "mine"))
+    assert {p.name for p in (tmp_path / "mine").iterdir()} == {"06_arm.ipynb"}
+    with pytest.raises(runs.RoverError, match="not found"):
+        runs.execute("06_arm", tmp_path / "nothing")

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 from pty_board import board_of
 
-from rover_lib.cli import main
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.host import Host
@@ -222,10 +221,10 @@ def test_a_pi_that_is_well_and_one_that_is_not(pi_host, bare_host, proc, monkeyp
 def test_a_check_that_breaks_is_its_own_fail(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor, "governor", lambda *args: 1 / 0)
     devices = ("--camera", tmp_path / "video0", "--port", tmp_path / "ttyUSB0")
-    result = CliRunner().invoke(main, ["doctor", *map(str, devices)])
+    result = rover("doctor", *devices)
     assert {"camera", "Arduino", "governor"} <= set(re.findall(r"^fail +(\w+)", result.stdout, re.M))
     assert result.exit_code == 1 and re.search(r"^\w+ +memory ", result.stdout, re.M)
     monkeypatch.setattr(
         doctor, "examine", lambda *args, **options: [doctor.Check("a", "ok", ""), doctor.Check("b", "warning", "")]
     )
-    assert CliRunner().invoke(main, ["doctor"]).exit_code == 0
+    assert rover("doctor").exit_code == 0

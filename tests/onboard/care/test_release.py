@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 from archives import manifest_with, rewritten, vectors_with
-from click.testing import CliRunner
+from command import rover
 
-from rover_lib.cli import main
 from rover_lib.onboard.artifact.acceptance import Expected
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.release import Releases
@@ -82,10 +81,6 @@ def assert_drives(r: Releases, names: set[str]) -> None:
     status = r.status()
     assert status["healthy"] and status["trouble"] == "" and status["current"] in names, status
     assert content_hash(r.path_of("current")) == status["current"]
-
-
-def rover(*args: object):
-    return CliRunner().invoke(main, ["release", *map(str, args)])
 
 
 def damage(path: Path) -> None:
@@ -290,11 +285,11 @@ def test_what_is_wrong_with_the_release_in_use_is_seen_and_healed(releases, two,
     else:
         releases.current_link.unlink()
         releases.current_link.symlink_to("/etc")
-    assert not releases.status()["healthy"] and rover("--models", releases.models, "status").exit_code == 1
+    assert not releases.status()["healthy"] and rover("release", "--models", releases.models, "status").exit_code == 1
     with pytest.raises(RoverError):
         releases.verify()
     assert_drives(releases, {name := deploy(releases, two[0])})
-    assert f"* {name[:12]}  static" in rover("--models", releases.models, "status").output
+    assert f"* {name[:12]}  static" in rover("release", "--models", releases.models, "status").output
 
 
 def test_a_broken_history_a_wrong_clock_and_a_full_disk(releases, two, monkeypatch):
@@ -337,7 +332,7 @@ def test_parity_in_the_services_sandbox(releases, two, tmp_path, monkeypatch):
         script.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     old, name = releases.current, releases.stage(two[1]).name
-    result = rover("--models", releases.models, "--sandboxed", "switch", name)
+    result = rover("release", "--models", releases.models, "--sandboxed", "switch", name)
     assert (tmp_path / "asked").read_text().startswith(f"start rover-check@{name}.service\n")
     assert result.exit_code == 1 and "computes something else" in result.output
     assert_drives(releases, {old})

@@ -10,11 +10,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command import rover
 from needs import until
 from recorded import content_of, names_in
 
-from rover_lib.cli import main
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
@@ -297,6 +296,6 @@ def test_signals_and_faults_end_an_episode_or_all(tmp_path, monkeypatch, number,
     monkeypatch.setattr(module.SignalEvent, "wait", pause)
     for device in ("Camera", "ServoLink"):
         monkeypatch.setattr(module, device, lambda *_, **options: nullcontext())
-    done = CliRunner().invoke(main, ["record", "--episodes", "3", "--label", "to the left", str(tmp_path)])
+    done = rover("record", "--episodes", "3", "--label", "to the left", tmp_path)
     assert done.exit_code == (when == "fault") and done.stdout.count("recorded: ") == len(begun) == episodes
     assert begun[0]["label"] == "to the left"

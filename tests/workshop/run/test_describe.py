@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from recorded import record_drives
 
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
@@ -28,6 +29,14 @@ def test_a_run_its_report_and_a_flight_log(demo, tmp_path):
     with FlightLog(tmp_path / "flight.log", header={"hz": 30}, max_bytes=1_000_000, keep=1):
         pass
     assert "drives" in describe(Source(tmp_path / "flight.log"))["flight log"]
+
+
+def test_an_artifact_a_checkpoint_and_recordings(artifacts, tiny_file, tmp_path):
+    found = describe(Source(artifacts["static"]))["artifact"]
+    assert found["mode"] == "static" and len(found["content_hash"]) == 64
+    found = describe(Source(tiny_file))["checkpoint"]
+    assert found["format"] == "trainer" and "parameters_acting" in found
+    assert describe(Source(record_drives(tmp_path, drives=2)))["recordings"]["episodes"] == 2
 
 
 def test_runs_are_listed_with_their_verdicts(demo):
