@@ -77,10 +77,10 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     familiar.limits = (unit * threshold).astype(np.float32)
     shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
     low, high = rate_interval(len(shares))
-    least = [
-        {"episode": name, "frame": drives.unseen[name][int(scores[name].argmax())].frame_name, "strange": shares[name]}
-        for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]
-    ]
+    least = []
+    for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
+        sample = drives.unseen[name][int(scores[name].argmax())]
+        least.append({"episode": name, "row": sample.row, "frame": sample.frame_name, "strange": shares[name]})
     rate = {"stopped_pct": 100 / (len(shares) + 1), "stopped_low_pct": 100 * low, "stopped_high_pct": 100 * high}
     return familiar, {"drives": len(shares), **rate, "largest": shares, "least": least}
 

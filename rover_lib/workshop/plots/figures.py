@@ -132,7 +132,7 @@ def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz
     return fig
 
 
-def familiarity(found: Mapping[str, Any], samples: Sequence[Any]) -> Figure | Note:
+def familiarity(found: Mapping[str, Any] | None, samples: Sequence[Any]) -> Figure | Note:
     """Draw the largest score of each held-out drive beside the threshold, and the pictures that are least familiar.
 
     found: a mode's "familiar" of quantize.json, if it has a threshold. samples: those of the held-out drives.
@@ -143,7 +143,7 @@ def familiarity(found: Mapping[str, Any], samples: Sequence[Any]) -> Figure | No
     ax.bar(range(len(found["largest"])), sorted(found["largest"].values()), color=GREY)
     ax.axhline(1, color=style.RED, lw=1.2)
     ax.set(xlabel="held-out drives", ylabel="largest score, of the threshold", xticks=[])
-    pictures = {(sample.episode, sample.frame_name): sample for sample in samples}
+    pictures = {(sample.episode, sample.row): sample for sample in samples}
     for ax, least in zip(fields, found["least"], strict=True):
-        style.show_picture(ax, pictures[least["episode"], least["frame"]], f"{least['strange']:.2f} of it")
+        style.show_picture(ax, pictures[least["episode"], least["row"]], f"{least['strange']:.2f} of it")
     return fig

@@ -130,8 +130,8 @@ def test_an_action_that_never_changed_is_neither_judged_nor_drawn(policies):
         figure.draw_without_rendering()
     steering, throttle = (ax for ax in error.axes if ax.get_title())
     assert steering.get_lines() and not throttle.get_lines() and len(throttle.texts) == 1
-    seen, least = sample(), {"episode": "episode", "frame": "5.jpg", "strange": 1.0}
-    seen.frame_name = "5.jpg"
+    seen, least = sample(), {"episode": "episode", "row": 5, "strange": 1.0}
+    seen.row = 5
     plots.familiarity({"largest": {"a": 0.5, "b": 1.0}, "least": [least] * 2}, [seen]).draw_without_rendering()
     nothing = replace(report, action_range={"steering": (0.1, 0.1), "throttle": (0.0, 0.0)})
     assert nothing.worst("static") == []
