@@ -270,6 +270,15 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
+def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
+    """Return how the pushed car hits as plots.hits draws it, over the seconds of a human, for each way to learn on."""
+    before, *policies = content["metrics"]["policies"]
+    found = {policy["arm"]: [(0.0, before["pushed"])] for policy in policies}
+    for policy in policies:
+        found[policy["arm"]].append((policy["human_s"], policy["pushed"]))
+    return found
+
+
 def table(content: Mapping[str, Any]) -> Table:
     """Show the policies of learn.json as a table."""
     rows = []

@@ -9,6 +9,7 @@ Each subject has a module; `style` has what all figures share.
 
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.comparison import action_error, worst_frames
+from rover_lib.workshop.plots.drives import hits, students
 from rover_lib.workshop.plots.quantization import sensitivity
 from rover_lib.workshop.plots.recordings import episode_overview
 from rover_lib.workshop.plots.style import save
