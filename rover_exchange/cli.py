@@ -87,7 +87,7 @@ def open_browser(url: str) -> None:
 @click.argument("file", type=PathTo("flight log"))
 @click.option("-o", "--output", type=Output(), help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
-@click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
+@click.option("--video", type=Output(), help="A film of the drive, .mp4.")
 @click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures if it was recorded.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
 def log(file: Path, output: Path | None, drive: int, video: Path | None, mcap: Path | None, as_json: bool) -> None:

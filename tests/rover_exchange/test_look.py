@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from PIL import Image
 
 from rover_exchange import film
 from rover_exchange.flight import flight_figure
@@ -107,20 +106,17 @@ def test_the_path_and_the_bars_are_of_the_moment_and_of_its_car(tmp_path):
 @pytest.mark.slow
 def test_a_film_has_the_drives_pace_and_pictures(tmp_path):
     log = drive(tmp_path)
-    for ending in ("mp4", "webp"):
-        done = rover("log", log, "--video", tmp_path / f"out.{ending}")
-        assert done.exit_code == 0 and not (tmp_path / "flight.log.png").exists(), done.output
+    done = rover("log", log, "--video", tmp_path / "out.mp4")
+    assert done.exit_code == 0 and not (tmp_path / "flight.log.png").exists(), done.output
     with av.open(str(tmp_path / "out.mp4")) as container:
         images = [image.to_ndarray(format="rgb24") for image in container.decode(video=0)]
     assert len(images) == 58 and images[0].shape == (360 + film.PANEL, 640, 3)
     means = [image[5:60].mean() for image in images]  # above the horizon: each picture is lighter than the one before
     assert abs(means[0] - 30) < 4 and 115 < means[-1] < 129 and np.all(np.diff(means) > -1)
-    with Image.open(tmp_path / "out.webp") as webp:
-        assert webp.n_frames == 10 and webp.width == 400 and webp.info["loop"] == 0
 
 
 @pytest.mark.parametrize(
-    ("made", "output", "word"), [({}, "out.avi", ".mp4 or .webp"), ({"recorded": False}, "out.mp4", "--record")]
+    ("made", "output", "word"), [({}, "out.avi", "ends in .mp4"), ({"recorded": False}, "out.mp4", "--record")]
 )
 def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
     done = rover("log", drive(tmp_path, **made), "--video", tmp_path / output)
