@@ -50,7 +50,7 @@ HALF_A_TICK_S = 0.5 / RATE_HZ
 JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
-HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
+HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red decoy"}
 DRIVES_FILE = "drives.jsonl"
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import av
 import cv2
@@ -43,7 +42,7 @@ def write_film(path: Path, flight: Flight, progress: Progress = silent) -> int:
         with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
             for picture in _pictures(flight, moments, progress):
                 if stream is None:
-                    stream = cast(VideoStream, container.add_stream("libx264", RATE_HZ, options={"crf": "23"}))
+                    stream = container.add_stream("libx264", RATE_HZ, options={"crf": "23"})
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"  # what browsers play
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))

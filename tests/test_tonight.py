@@ -51,20 +51,25 @@ def lines() -> Iterator[tuple[str, str]]:
             yield machine, line
 
 
+def execute(source: Path, folder: Path, given: dict, bars: bool) -> None:
+    """Run a notebook's cells in this process."""
+    run_cells(source.stem, folder, **given)
+    shutil.copy(source, folder)
+
+
 class Evening:
     """A human who types on the laptop, W, and on the Pi, P, and who has a transmitter."""
 
     def __init__(self, folder: Path, board: EmulatedArduino, patch: pytest.MonkeyPatch):
         self.machines, self.board, self.patch = {"W": folder / "laptop", "P": folder / "pi"}, board, patch
-        self.deployed = Path()
-        self.camera, self.typed = folder / "camera", dict[str, str]()
+        self.camera, self.typed, self.deployed = folder / "camera", list[str](), ""
         for machine in self.machines.values():
             machine.mkdir()
         self.installed = self.machines["P"] / "etc" / "rover" / "car.yml"
         patch.setattr(car_module, "PLACES", (self.machines["W"] / "car.yml", self.installed))
         patch.setattr(cli, "ask", self.do)
         patch.setattr(recorder, "PAUSE_S", 0.1)
-        patch.setattr(runs, "_execute", lambda source, folder, given, bars: self.execute(source, folder, given))
+        patch.setattr(runs, "_execute", execute)
 
     def do(self, asked: str) -> None:
         """Do with the transmitter what a command asks for."""
@@ -81,11 +86,6 @@ class Evening:
                 return self.board.transmitter(*REST)
             self.board.transmitter(1504 + 300 * math.sin(tick / 9), 1560 + 20 * math.sin(tick / 5))
 
-    def execute(self, source: Path, folder: Path, given: dict) -> None:
-        """Run a notebook's cells in this process."""
-        run_cells(source.stem, folder, **given)
-        shutil.copy(source, folder)
-
     def type(self, machine: str, line: str) -> None:
         self.patch.chdir(self.machines[machine])
         words = shlex.split(line, comments=True)
@@ -94,12 +94,12 @@ class Evening:
             copy = shutil.copytree if "-r" in words else shutil.copy
             copy(self.machines["P"] / str(source).lstrip("/"), target)
         elif words[0] == "ansible-playbook":
-            artifact = [word.partition("=")[2] for word in words if word.startswith("rover_artifact=")]
-            self.deployed = Path(*artifact) if artifact else self.deployed
+            given = dict(word.split("=") for word in words if "=" in word)
+            self.deployed = given.get("rover_artifact", self.deployed)
             command = [Path(sys.executable).parent / words[0], *words[1:], "--syntax-check"]
             subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
             if "ansible/drive.yml" in words:
-                self.drive_by_policy(words)
+                self.drive_by_policy(given["rover_seconds"])
         elif words[0] == "make" and "run" in words:
             command = ["make", "-ns", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready", *words[1:]]
             said = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout
@@ -108,6 +108,8 @@ class Evening:
             subprocess.run([*words, f"BUILD={Path.cwd()}/firmware"], cwd=ROOT, check=True, capture_output=True)
         elif "rover" in words:
             self.rover(words[words.index("rover") + 1 :])
+        else:
+            assert words[:2] == ["make", "demo"] or words[0] in (".", "ssh"), line
 
     def rover(self, words: list[str]) -> None:
         name, *arguments = words
@@ -115,21 +117,18 @@ class Evening:
             known = {option for parameter in rover.commands[name].params for option in parameter.opts}
             devices = {"--port": self.board.port, "--camera": str(self.camera)}
             arguments += [word for option, at in devices.items() if option in known for word in (option, at)]
-        arguments += shlex.split(SHORTER.get(name, ""))
         ended = threading.Event()
-        human = threading.Thread(target=self.drive, args=(ended,))
         if name == "record":
-            human.start()
-        done = CliRunner().invoke(rover, [name, *arguments], catch_exceptions=False)
+            threading.Thread(target=self.drive, args=(ended,), daemon=True).start()
+        done = CliRunner().invoke(rover, [name, *arguments, *shlex.split(SHORTER.get(name, ""))])
         ended.set()
-        self.typed[name] = done.output
+        self.typed.append(name)
         assert done.exit_code == 0, done.output
 
-    def drive_by_policy(self, words: list[str]) -> None:
+    def drive_by_policy(self, seconds: str) -> None:
         """Do what the rover's service does once it is armed: wiggle, see it drive, and take over."""
         log = Path("runs/rovers/rover1/flight.log")
         log.parent.mkdir(parents=True, exist_ok=True)
-        seconds = next(word.partition("=")[2] for word in words if word.startswith("rover_seconds="))
         options = ["--max-seconds", seconds, "--port", self.board.port, "--camera", self.camera, "--log", log]
         command = [Path(sys.executable).parent / "rover", "drive", self.deployed, *options]
         self.board.ready(True)
@@ -139,8 +138,8 @@ class Evening:
             armed = any("rover: armed" in line for line in process.stderr)
             needs.until(lambda: any(e.pin == "throttle" and e.pulse_us > 1520 for e in self.board.pulses()))
             self.board.transmitter(*STICKS["to the right"])
-            _, self.typed["drive"] = process.communicate(timeout=20)
-        assert armed and process.returncode == 4, self.typed["drive"]
+            _, said = process.communicate(timeout=20)
+        assert armed and process.returncode == 4, said
 
 
 @pytest.mark.release
@@ -152,5 +151,6 @@ def test_the_page_leads_to_a_first_drive(demo_run, tmp_path, monkeypatch):
         with CameraFeed(evening.camera, *pictures(PLAIN, (180, 320))):
             for machine, line in lines():
                 evening.type(machine, line)
+    assert evening.typed == ["calibrate", "doctor", "record", "train", "run", "log"]
     measured = read_car(evening.installed)
     assert measured.name == "mycar" and measured.numbers == pytest.approx(CRAWLER.numbers, abs=30)

@@ -59,8 +59,8 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
     pictures = []
     for name, (figure, stage) in PICTURES.items():
         pictures.append(root / "pictures" / f"{name}.png")
-        shown = root / "results" / "demo" / f"{stage}.json"
-        store_picture(runs_dir / "demo" / "figures" / f"{figure}.png", pictures[-1], shown)
+        stored = root / "results" / "demo" / f"{stage}.json"
+        store_picture(runs_dir / "demo" / "figures" / f"{figure}.png", pictures[-1], stored)
     return [*texts, *pictures]
 
 

@@ -8,14 +8,12 @@ from matplotlib.figure import Figure
 
 from rover_lib.workshop.plots import style
 
-Counted = tuple[float, Mapping[str, Any]]  # x, and hits, trials and Wilson's interval
 
-
-def hits(lines: Mapping[str, Sequence[Counted]], xlabel: str) -> Figure:
-    """Draw the share of worlds that were hit, a line for each name, with Wilson's 95 % interval."""
+def hits(lines: Mapping[str, Sequence[tuple[float, Mapping[str, Any]]]], xlabel: str) -> Figure:
+    """Draw the share of worlds that were hit over x, a line of (x, counts of drives) for each name."""
     fig, axes = style.new_figure(1)
     ax = axes[0, 0]
-    beside = max(x for points in lines.values() for x, _ in points) / 150  # so that no line hides another
+    beside = max(x for points in lines.values() for x, _ in points) / 150  # no line shall hide another
     for i, (name, points) in enumerate(lines.items()):
         share = np.array([100 * counts["hits"] / counts["trials"] for _, counts in points])
         ends = [[100 * value for key, value in counts.items() if "wilson" in key] for _, counts in points]
@@ -36,7 +34,7 @@ def students(rows: Sequence[Mapping[str, Any]]) -> Figure:
         action = key.removeprefix("recorded_").removesuffix("_pct")
         errors = [row[key] for row in rows]
         ax.plot([row[cost] for row in rows], errors, "o", color=style.action_colour(action, i), label=action)
-        for row in rows:
+        for row in rows if errors[0] is not None else ():  # nor are the others judged
             ax.annotate(row["name"], (row[cost], row[key]), (6, 4), textcoords="offset points", fontsize=9)
     ax.set(xlabel=f"{label} for a plan", ylabel="error to the recordings (%)", xlim=(0, None))
     ax.set_ylim(0, 1.15 * ax.get_ylim()[1])

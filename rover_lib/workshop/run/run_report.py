@@ -152,8 +152,8 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
     recordings = load["recordings"]
-    known = load["checkpoint"].get("published", {}) | {key: value for key, value in given.items() if value}
-    hub = {key: value for key, value in sorted(known.items()) if value}
+    known = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
+    hub = {key: value for key, value in known.items() if value}
     hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
     values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
