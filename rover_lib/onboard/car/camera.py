@@ -55,11 +55,10 @@ class CameraKind(Protocol):
     """A kind of camera. An entry point of the group `rover_lib.cameras` names its class, and `--camera` that name."""
 
     def read(self, source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
-        """Yield each picture as it comes, with its time stamp by time.monotonic(), until `closing` is set.
+        """Yield each picture as it comes, and its time by time.monotonic() or None, until `closing` is set.
 
         source: what --camera says, NAME or NAME:MORE. size: (width, height) to ask for. Raises CameraError.
         """
-        ...
 
 
 def size_like(width: int, height: int) -> tuple[int, int]:

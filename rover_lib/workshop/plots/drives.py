@@ -11,8 +11,7 @@ from rover_lib.workshop.plots import style
 
 def hits(lines: Mapping[str, Sequence[tuple[float, Mapping[str, Any]]]], xlabel: str) -> Figure:
     """Draw the share of worlds that were hit over x, a line of (x, counts of drives) for each name."""
-    fig, axes = style.new_figure(1)
-    ax = axes[0, 0]
+    fig, ((ax,),) = style.new_figure(1)
     beside = max(x for points in lines.values() for x, _ in points) / 150  # no line shall hide another
     for i, (name, points) in enumerate(lines.items()):
         share = np.array([100 * counts["hits"] / counts["trials"] for _, counts in points])
@@ -28,8 +27,7 @@ def students(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw each policy's error to the recordings over what its plan costs. rows: of students.json."""
     counted = all(row["instructions_g"] for row in rows)
     cost, label = ("instructions_g", "10^9 instructions") if counted else ("gmac", "10^9 multiply-accumulates")
-    fig, axes = style.new_figure(1)
-    ax = axes[0, 0]
+    fig, ((ax,),) = style.new_figure(1)
     for i, key in enumerate(key for key in rows[0] if key.startswith("recorded_")):
         action = key.removeprefix("recorded_").removesuffix("_pct")
         errors = [row[key] for row in rows]
