@@ -91,15 +91,26 @@ def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]
     return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
 
 
+def _how(row: Mapping[str, Any]) -> str:
+    how = f"{row['pushes']} pushes" if row["pushes"] else "left alone"
+    return how if row["compensate"] else f"{how}, not compensated"
+
+
+def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
+    """Return the rows of drive.json as plots.hits draws them, over the latency in ms."""
+    found: dict[str, list[tuple[float, Mapping[str, Any]]]] = {}
+    for row in content["metrics"]["rows"]:
+        found.setdefault(_how(row), []).append((row["latency_ms"], row))
+    return found
+
+
 def table(content: Mapping[str, Any]) -> Table:
     """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
-        how = [f"{r['pushes']} pushes"] if r["pushes"] else ["left alone"]
-        how += [] if r["compensate"] else ["not compensated"]
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
         hits = f"{r['hits']} of {r['trials']}"
-        rows.append((", ".join(how), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
+        rows.append((_how(r), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
     verdict = {True: "pass", False: "FAIL", None: "not measured"}
     gates = content["metrics"]["gates"]
     notes = [f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}" for g in gates]

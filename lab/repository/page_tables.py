@@ -14,6 +14,7 @@ from typing import Any
 
 import nbformat
 
+from balloon_world.learn import HOW
 from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
@@ -150,13 +151,12 @@ def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
     conditions = {key: value["trials"] for key, value in policies[0].items() if isinstance(value, dict)}
-    words = {"alone": "left alone", "decoy": "beside a red decoy"}
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
         return (name, f"{policy['human_s']:.0f}", *(str(policy[how]["hits"]) for how in conditions))
 
-    hits = (f"{words.get(how, how)}: hits of {trials}" for how, trials in conditions.items())
+    hits = (f"{HOW[how]}: hits of {trials}" for how, trials in conditions.items())
     return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
