@@ -17,8 +17,11 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
     kept, missed, unknown = (sum(row["passed"] is passed for row in rows) for passed in (True, False, None))
     caption = f"{kept} of {len(rows)} promises kept"
     caption += f", {missed} missed" if missed else ""
-    caption += f", {unknown} not measured" if unknown else ""
-    cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
+    caption += f", {unknown} undecided" if unknown else ""
+    cells = []
+    for row in rows:
+        verdict = "not shown" if row["passed"] is None and row["found"] is not None else KEPT[row["passed"]]
+        cells.append((gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), verdict))
     return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption)
 
 

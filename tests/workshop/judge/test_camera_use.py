@@ -67,6 +67,27 @@ def test_what_must_be_known_before_it_drives(policy, says):
     assert len(warnings) == (says is not None) and (says is None or says in warnings[0])
 
 
+class Turns(Known):
+    """Follows the picture with its steering alone."""
+
+    def __init__(self):
+        super().__init__(looks=np.array([0.4, 0]), copies=0)
+
+
+def test_a_plan_moves_so_far_for_each_ms_that_its_picture_is_older():
+    """The k-th frame shows k: a picture that is 33 ms older moves steering by 0.004, which is 0.4 % of its range."""
+    samples = [
+        SimpleNamespace(
+            frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8), state=np.zeros(2), episode="a", row=k, time_s=k / 30
+        )
+        for k in range(60)
+    ]
+    found = look(Turns(), fidelity(Turns(), {}, samples[1::2], RANGE), samples)
+    assert found.summary()["steering_per_ms_pct"] == pytest.approx(0.4 / (1000 / 30))
+    assert found.summary()["throttle_per_ms_pct"] is None and "does not move" in str(found.table())
+    assert looked(Turns()).per_ms_pct == {"steering": None, "throttle": None}  # no older picture is known
+
+
 def test_an_action_that_never_changes_is_not_judged():
     found = looked(Known(looks=np.array([1, 0]), copies=1), action_range=RANGE | {"throttle": (0.1, 0.1)})
     assert found.warnings() == [] and found.summary()["throttle_by_picture_pct"] is None

@@ -1,0 +1,221 @@
+"""Which error tells the policies that drive worse? Drive degraded versions through the same worlds as FP32.
+
+    python -m lab.judging results/lab/judging.json runs/demo/episodes runs/demo runs/tiny ...
+
+Each policy drives in FP32 and in every version of VERSIONS, pushed and with late plans. A version that hits fewer
+worlds than FP32 by more than chance loses; each measure is held against that. Drives are kept in the cache, so that the
+same command continues after an interruption.
+"""
+
+import copy
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from balloon_world import drives, world
+from balloon_world.drives import SEED, append_row, drive_in, read_rows
+from balloon_world.world import World
+from rover_lib.onboard.drive import loop, pilot, plan
+from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.load import action_limits
+from rover_lib.onboard.policy.preprocess import prepare_frame
+from rover_lib.onboard.stage import plain, sha256_of, write_stage
+from rover_lib.workshop.act import ACT, block_of, example_inputs
+from rover_lib.workshop.act_config import ActConfig
+from rover_lib.workshop.cache import cache_folder, cache_root, key_of
+from rover_lib.workshop.int8.observe import RangeObserver, calibrate, restore_observed
+from rover_lib.workshop.int8.quantize import convert
+from rover_lib.workshop.int8.scheme import ENGINE, Scheme
+from rover_lib.workshop.judge.camera_use import look
+from rover_lib.workshop.judge.compare import Fidelity, fidelity
+from rover_lib.workshop.judge.pairs import CHANCE, compare_pairs, loses
+from rover_lib.workshop.recordings.samples import car_of, pick_evenly
+from rover_lib.workshop.run.session import Opened, load
+
+FP32, DRIVING = "FP32", (world, drives, loop, pilot, plan)  # the modules that a drive depends on
+WORLDS, PUSHES, LATENCY_S = 200, 4, 0.2
+CALIBRATION, HELD_OUT, FIRST_STEPS = 60, 120, 8
+
+
+@dataclass(frozen=True)
+class Version:
+    """How static INT8 is degraded. noise: of the weights, in their channel's standard deviation. ranges: a factor.
+
+    block: the only one whose weights are degraded; "" for all.
+    """
+
+    weight_bits: int = 8
+    activation_bits: int = 8
+    noise: float = 0.0
+    ranges: float = 1.0
+    block: str = ""
+
+
+VERSIONS = {
+    "INT8": Version(),
+    **{f"weights {bits}": Version(weight_bits=bits) for bits in (7, 6, 5, 4, 3)},
+    **{f"activations {bits}": Version(activation_bits=bits) for bits in (7, 6, 5, 4, 3)},
+    "noise of weights": Version(noise=0.3),
+    "ranges": Version(ranges=0.3),
+    "one block": Version(weight_bits=2, block="backbone.layer3"),
+}
+
+
+class Driver:
+    """A module that drives, and is compared, as an artifact. size: of its picture; action_names, car: to compare."""
+
+    def __init__(
+        self, module: Any, size: tuple[int, int], rate_hz: float, config: ActConfig | None = None, car: Any = None
+    ):
+        self.module, self.size, self.rate_hz, self.car = module, size, rate_hz, car
+        self.chunk, self.action_names = (config.chunk, config.action_names) if config else (0, ())
+
+    @torch.inference_mode()
+    def predict_unclipped(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+        frame = torch.from_numpy(prepare_frame(frame_bgr, *self.size))
+        return self.module(torch.from_numpy(np.asarray(state, np.float32))[None], frame)[0].numpy()
+
+    def predict_chunk(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
+        return self.predict_unclipped(frame_bgr, state).clip(*action_limits(self.action_names, self.car))
+
+
+def degraded(opened: Opened, calibration: Any, version: Version) -> nn.Module:
+    """Return static INT8, its ranges those of all calibration frames, degraded; the kernels are those of the rover.
+
+    Fewer bits are fewer steps of the same INT8: weights are rounded beforehand, activations get a larger scale.
+    """
+    config, scheme, rng = opened.checkpoint.config, Scheme(smooth=calibration.smooth), torch.Generator().manual_seed(0)
+    prepared = restore_observed(opened.checkpoint, scheme, calibration)
+    for name, m in prepared.named_modules():
+        if isinstance(m, RangeObserver):
+            m.quant_max = 2 ** (version.activation_bits - 1) - 1
+            m.quant_min = -m.quant_max - 1
+            m.min_val *= version.ranges
+            m.max_val *= version.ranges
+        elif isinstance(m, nn.Conv2d) and version.block in ("", block_of(name)):
+            weight = m.weight.detach().flatten(1)
+            weight = weight + version.noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
+            step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (version.weight_bits - 1) - 1)
+            m.weight = nn.Parameter(((weight / step).round() * step).view_as(m.weight), requires_grad=False)
+    return convert(prepared, config, scheme).eval()
+
+
+def errors_of(report: Fidelity, version: str, per_ms_pct: Mapping[str, float | None]) -> dict[str, dict[str, float]]:
+    """Return every measure of a version by action, in its unit."""
+    found, reference = report.summary(version), report.reference.astype(np.float64)
+    spread = np.abs(reference - reference.mean(0)).mean((0, 1))
+    errors: dict[str, dict[str, float]] = {}
+    for i, action in enumerate(report.action_names):
+        mae_pct, moved = found[f"{action}_mae_pct"], per_ms_pct[action]
+        errors[action] = {
+            "range_pct": mae_pct,
+            "spread_pct": 100 * report.errors(version)[..., i].mean() / spread[i],
+            "worst_tenth_pct": found[f"{action}_worst_tenth_pct"],
+            "first_steps_pct": float(np.mean(found[f"{action}_mae_per_step_pct"][:FIRST_STEPS])),
+            **({"delay_ms": mae_pct / moved} if moved else {}),
+        }
+    return errors
+
+
+def prepare(checkpoint: Path, episodes: Path, folder: Path) -> None:
+    """Write every version's module, and what it errs on held-out frames, to `folder`."""
+    opened = load(checkpoint, episodes)
+    config, car = opened.checkpoint.config, car_of(opened.recordings.samples)
+    calibration = calibrate(opened.checkpoint, pick_evenly(opened.parts.calibration, CALIBRATION))
+    modules: dict[str, Any] = {FP32: ACT(config, opened.checkpoint.weights)}
+    modules |= {label: degraded(opened, calibration, each) for label, each in VERSIONS.items()}
+    modules = {label: torch.jit.trace(m, example_inputs(config), check_trace=False) for label, m in modules.items()}
+    (size,) = config.image_sizes
+    drivers = {label: Driver(module, size, config.rate_hz, config, car) for label, module in modules.items()}
+    samples, ranges = pick_evenly(opened.parts.held_out, HELD_OUT), opened.recordings.action_range()
+    report = fidelity(drivers[FP32], {label: drivers[label] for label in VERSIONS}, samples, ranges)
+    per_ms_pct = look(drivers[FP32], report, opened.parts.held_out).per_ms_pct
+    errors = {label: errors_of(report, label, per_ms_pct) for label in VERSIONS}
+    for label, module in modules.items():
+        torch.jit.save(module, folder / f"{label}.pt")
+    described = {"size": size, "rate_hz": config.rate_hz, "per_ms_pct": per_ms_pct, "errors": errors}
+    (folder / "described.json").write_text(json.dumps(plain(described)))
+
+
+def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
+    """Return a row for each version of a policy: its pairs with FP32, and its errors. What was driven is kept."""
+    torch.set_num_threads(1)
+    torch.backends.quantized.engine = ENGINE
+    checkpoint, settings = run / "best_model.pth", params()["drive"]
+    made_of = {"checkpoint": sha256_of(checkpoint), "versions": [asdict(each) for each in VERSIONS.values()]}
+    made_of |= {"frames": [CALIBRATION, HELD_OUT], "torch": torch.__version__}
+    folder = cache_folder("judging", key_of(made_of), lambda new: prepare(checkpoint, episodes, new))
+    described = json.loads((folder / "described.json").read_text())
+    drivers = {}
+    for label in (FP32, *VERSIONS):
+        module = torch.jit.load(folder / f"{label}.pt")
+        drivers[label] = Driver(module, described["size"], described["rate_hz"])
+    how = {"drive": settings, "pushes": PUSHES, "latency": LATENCY_S, **made_of}
+    hit = drive_all(drivers, Settings.of(settings), cache_root() / f"drives-{key_of(how, *DRIVING)}.jsonl")
+    rows = []
+    for label in VERSIONS:
+        pairs = compare_pairs(hit[FP32], hit[label])
+        row = {"policy": run.name, "version": label, "fp32_hits": sum(hit[FP32]), "hits": sum(hit[label]), **pairs}
+        rows.append(row | {"loses": loses(pairs), "errors": described["errors"][label]})
+    return rows
+
+
+def drive_all(drivers: Mapping[str, Driver], settings: Settings, path: Path) -> dict[str, list[bool]]:
+    """Drive everybody through the same worlds; return who hit which. path: keeps the drives; others are driven."""
+    kept = {(row["version"], row["seed"]): row["hit"] for row in read_rows(path)}
+    seeds = range(SEED, SEED + WORLDS)
+    for seed in seeds:
+        missing = [label for label in drivers if (label, seed) not in kept]
+        drawn = World(seed, PUSHES) if missing else None  # to draw it takes a third of a drive's time
+        for label in missing:
+            own = copy.copy(drawn)
+            own.trajectory = [own.state]
+            kept[label, seed] = drive_in(drivers[label], own, LATENCY_S, settings).outcome == "hit"
+            append_row(path, {"version": label, "seed": seed, "hit": kept[label, seed]})
+    return {label: [kept[label, seed] for seed in seeds] for label in drivers}
+
+
+def roc(rows: Sequence[Mapping[str, Any]], measure: str, actions: Sequence[str]) -> dict[str, Any]:
+    """Return how well a measure's worse action tells versions that lose from those that do not.
+
+    auc: of two versions, one of each kind, how often the loser has the larger error. limit: the largest that lets no
+    loser pass. refused: of the others, how many it refuses.
+    """
+    found = {True: [], False: []}
+    for row in rows:
+        found[row["loses"]].append(max(row["errors"][action].get(measure, 0.0) for action in actions))
+    losers, others = np.array(found[True]), np.array(found[False])
+    larger = (losers[:, None] > others) + 0.5 * (losers[:, None] == others)
+    limit = float(losers.min())
+    return {"auc": float(larger.mean()), "least_of_losers": limit, "refused": int((others >= limit).sum())}
+
+
+def main(output: Path, episodes: Path, runs: Sequence[Path]) -> None:
+    """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
+    rows = [row for run in runs for row in judge(run, episodes)]
+    actions = list(rows[0]["errors"])
+    curves = {measure: roc(rows, measure, actions) for measure in rows[0]["errors"][actions[0]]}
+    curves |= {"steering_range_pct": roc(rows, "range_pct", actions[:1])}
+    curves |= {"steering_delay_ms": roc(rows, "delay_ms", actions[:1])}
+    lost = sum(row["loses"] for row in rows)
+    metrics = {"pairs": len(rows), "lose": lost, "measures": curves, "rows": rows}
+    given = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S, "chance": CHANCE}
+    given |= {"versions": {label: asdict(each) for label, each in VERSIONS.items()}, "drive": params()["drive"]}
+    write_stage(output, "judging", params=given, metrics=metrics)
+    for measure, found in curves.items():
+        print(
+            f"{measure}: AUC {found['auc']:.3f}, least of losers {found['least_of_losers']:.3g}, "
+            f"refuses {found['refused']} of {len(rows) - lost}"
+        )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]), [Path(run) for run in sys.argv[3:]])
