@@ -22,6 +22,7 @@ from torch import nn
 from balloon_world import drives, world
 from balloon_world.drives import SEED, append_row, drive_in, read_rows
 from balloon_world.world import World
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.params import params
@@ -29,7 +30,6 @@ from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.stage import plain, sha256_of, write_stage
 from rover_lib.workshop.act import ACT, block_of, example_inputs
-from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.int8.observe import RangeObserver, calibrate, restore_observed
 from rover_lib.workshop.int8.quantize import convert
@@ -37,7 +37,7 @@ from rover_lib.workshop.int8.scheme import ENGINE, Scheme
 from rover_lib.workshop.judge.camera_use import look
 from rover_lib.workshop.judge.compare import Fidelity, fidelity
 from rover_lib.workshop.judge.pairs import CHANCE, compare_pairs, loses
-from rover_lib.workshop.recordings.samples import car_of, pick_evenly
+from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import Opened, load
 
 FP32, DRIVING = "FP32", (world, drives, loop, pilot, plan)  # the modules that a drive depends on
@@ -69,14 +69,16 @@ VERSIONS = {
 }
 
 
+@dataclass(frozen=True)
 class Driver:
-    """A module that drives, and is compared, as an artifact. size: of its picture; action_names, car: to compare."""
+    """A module that drives, and is compared, as an artifact. size: height and width of its picture."""
 
-    def __init__(
-        self, module: Any, size: tuple[int, int], rate_hz: float, config: ActConfig | None = None, car: Any = None
-    ):
-        self.module, self.size, self.rate_hz, self.car = module, size, rate_hz, car
-        self.chunk, self.action_names = (config.chunk, config.action_names) if config else (0, ())
+    module: Any
+    size: tuple[int, int]
+    rate_hz: float
+    chunk: int
+    action_names: tuple[str, ...]
+    car = Car()
 
     @torch.inference_mode()
     def predict_unclipped(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -108,19 +110,17 @@ def degraded(opened: Opened, calibration: Any, version: Version) -> nn.Module:
     return convert(prepared, config, scheme).eval()
 
 
-def errors_of(report: Fidelity, version: str, per_ms_pct: Mapping[str, float | None]) -> dict[str, dict[str, float]]:
-    """Return every measure of a version by action, in its unit."""
-    found, reference = report.summary(version), report.reference.astype(np.float64)
+def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Return every measure of a version by action, in its unit. moved_pct: of FP32's `Looking`."""
+    found, reference, errors = report.summary(version), report.reference.astype(np.float64), {}
     spread = np.abs(reference - reference.mean(0)).mean((0, 1))
-    errors: dict[str, dict[str, float]] = {}
     for i, action in enumerate(report.action_names):
-        mae_pct, moved = found[f"{action}_mae_pct"], per_ms_pct[action]
         errors[action] = {
-            "range_pct": mae_pct,
+            "range_pct": found[f"{action}_mae_pct"],
             "spread_pct": 100 * report.errors(version)[..., i].mean() / spread[i],
             "worst_tenth_pct": found[f"{action}_worst_tenth_pct"],
-            "first_steps_pct": float(np.mean(found[f"{action}_mae_per_step_pct"][:FIRST_STEPS])),
-            **({"delay_ms": mae_pct / moved} if moved else {}),
+            "first_steps_pct": np.mean(found[f"{action}_mae_per_step_pct"][:FIRST_STEPS]),
+            "delay_ms": 100 * found[f"{action}_mae_pct"] / moved_pct[action]["by_100_ms"],
         }
     return errors
 
@@ -128,21 +128,22 @@ def errors_of(report: Fidelity, version: str, per_ms_pct: Mapping[str, float | N
 def prepare(checkpoint: Path, episodes: Path, folder: Path) -> None:
     """Write every version's module, and what it errs on held-out frames, to `folder`."""
     opened = load(checkpoint, episodes)
-    config, car = opened.checkpoint.config, car_of(opened.recordings.samples)
-    calibration = calibrate(opened.checkpoint, pick_evenly(opened.parts.calibration, CALIBRATION))
-    modules: dict[str, Any] = {FP32: ACT(config, opened.checkpoint.weights)}
-    modules |= {label: degraded(opened, calibration, each) for label, each in VERSIONS.items()}
-    modules = {label: torch.jit.trace(m, example_inputs(config), check_trace=False) for label, m in modules.items()}
-    (size,) = config.image_sizes
-    drivers = {label: Driver(module, size, config.rate_hz, config, car) for label, module in modules.items()}
-    samples, ranges = pick_evenly(opened.parts.held_out, HELD_OUT), opened.recordings.action_range()
+    config, parts = opened.checkpoint.config, opened.parts
+    calibration = calibrate(opened.checkpoint, pick_evenly(parts.calibration, CALIBRATION))
+    made: dict[str, Any] = {FP32: ACT(config, opened.checkpoint.weights)}
+    made |= {label: degraded(opened, calibration, each) for label, each in VERSIONS.items()}
+    shape = {"size": config.image_sizes[0], "rate_hz": config.rate_hz, "chunk": config.chunk}
+    shape |= {"action_names": config.action_names}
+    drivers = {}
+    for label, module in made.items():
+        traced = torch.jit.trace(module, example_inputs(config), check_trace=False)
+        torch.jit.save(traced, folder / f"{label}.pt")
+        drivers[label] = Driver(traced, **shape)
+    samples, ranges = pick_evenly(parts.held_out, HELD_OUT), opened.recordings.action_range()
     report = fidelity(drivers[FP32], {label: drivers[label] for label in VERSIONS}, samples, ranges)
-    per_ms_pct = look(drivers[FP32], report, opened.parts.held_out).per_ms_pct
-    errors = {label: errors_of(report, label, per_ms_pct) for label in VERSIONS}
-    for label, module in modules.items():
-        torch.jit.save(module, folder / f"{label}.pt")
-    described = {"size": size, "rate_hz": config.rate_hz, "per_ms_pct": per_ms_pct, "errors": errors}
-    (folder / "described.json").write_text(json.dumps(plain(described)))
+    moved_pct = look(drivers[FP32], report, parts.held_out).moved_pct
+    errors = {label: errors_of(report, label, moved_pct) for label in VERSIONS}
+    (folder / "described.json").write_text(json.dumps(plain({"shape": shape, "errors": errors})))
 
 
 def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
@@ -154,17 +155,15 @@ def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     made_of |= {"frames": [CALIBRATION, HELD_OUT], "torch": torch.__version__}
     folder = cache_folder("judging", key_of(made_of), lambda new: prepare(checkpoint, episodes, new))
     described = json.loads((folder / "described.json").read_text())
-    drivers = {}
-    for label in (FP32, *VERSIONS):
-        module = torch.jit.load(folder / f"{label}.pt")
-        drivers[label] = Driver(module, described["size"], described["rate_hz"])
+    labels = FP32, *VERSIONS
+    drivers = {label: Driver(torch.jit.load(folder / f"{label}.pt"), **described["shape"]) for label in labels}
     how = {"drive": settings, "pushes": PUSHES, "latency": LATENCY_S, **made_of}
     hit = drive_all(drivers, Settings.of(settings), cache_root() / f"drives-{key_of(how, *DRIVING)}.jsonl")
     rows = []
-    for label in VERSIONS:
+    for label, errors in described["errors"].items():
         pairs = compare_pairs(hit[FP32], hit[label])
         row = {"policy": run.name, "version": label, "fp32_hits": sum(hit[FP32]), "hits": sum(hit[label]), **pairs}
-        rows.append(row | {"loses": loses(pairs), "errors": described["errors"][label]})
+        rows.append(row | {"loses": loses(pairs), "errors": errors})
     return rows
 
 
@@ -186,36 +185,28 @@ def drive_all(drivers: Mapping[str, Driver], settings: Settings, path: Path) -> 
 def roc(rows: Sequence[Mapping[str, Any]], measure: str, actions: Sequence[str]) -> dict[str, Any]:
     """Return how well a measure's worse action tells versions that lose from those that do not.
 
-    auc: of two versions, one of each kind, how often the loser has the larger error. limit: the largest that lets no
-    loser pass. refused: of the others, how many it refuses.
+    auc: of two versions, one of each kind, how often the loser has the larger error. least_of_losers: any limit below
+    it lets no loser pass; refused: of the others, how many have at least that.
     """
-    found = {True: [], False: []}
+    found = {True: list[float](), False: list[float]()}
     for row in rows:
-        found[row["loses"]].append(max(row["errors"][action].get(measure, 0.0) for action in actions))
+        found[row["loses"]].append(max(row["errors"][action][measure] for action in actions))
     losers, others = np.array(found[True]), np.array(found[False])
-    larger = (losers[:, None] > others) + 0.5 * (losers[:, None] == others)
-    limit = float(losers.min())
-    return {"auc": float(larger.mean()), "least_of_losers": limit, "refused": int((others >= limit).sum())}
+    auc = (losers[:, None] > others).mean() + 0.5 * (losers[:, None] == others).mean()
+    return {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
 
 
-def main(output: Path, episodes: Path, runs: Sequence[Path]) -> None:
+def main(output: Path, episodes: Path, *runs: Path) -> None:
     """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
     rows = [row for run in runs for row in judge(run, episodes)]
-    actions = list(rows[0]["errors"])
-    curves = {measure: roc(rows, measure, actions) for measure in rows[0]["errors"][actions[0]]}
-    curves |= {"steering_range_pct": roc(rows, "range_pct", actions[:1])}
-    curves |= {"steering_delay_ms": roc(rows, "delay_ms", actions[:1])}
-    lost = sum(row["loses"] for row in rows)
-    metrics = {"pairs": len(rows), "lose": lost, "measures": curves, "rows": rows}
+    steering, *others = rows[0]["errors"]
+    measures = {measure: roc(rows, measure, (steering, *others)) for measure in rows[0]["errors"][steering]}
+    measures |= {f"{steering}_{measure}": roc(rows, measure, [steering]) for measure in ("range_pct", "delay_ms")}
     given = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S, "chance": CHANCE}
     given |= {"versions": {label: asdict(each) for label, each in VERSIONS.items()}, "drive": params()["drive"]}
-    write_stage(output, "judging", params=given, metrics=metrics)
-    for measure, found in curves.items():
-        print(
-            f"{measure}: AUC {found['auc']:.3f}, least of losers {found['least_of_losers']:.3g}, "
-            f"refuses {found['refused']} of {len(rows) - lost}"
-        )
+    metrics = {"pairs": len(rows), "lose": sum(row["loses"] for row in rows), "measures": measures, "rows": rows}
+    print(json.dumps(write_stage(output, "judging", params=given, metrics=metrics)["metrics"]["measures"], indent=1))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), [Path(run) for run in sys.argv[3:]])
+    main(*map(Path, sys.argv[1:]))

@@ -3,8 +3,9 @@
     seen = look(fp32, report)
     for warning in seen.warnings(): ...
 
-The policy's state is its last action. So for each frame it plans twice more: with the state of another frame, and with
-the picture of another frame. The plans of a policy that only copies change with the state and not with the picture.
+The policy's state is its last action. So some frames are planned once more with the picture of another frame, which
+hardly moves the plans of a policy that copies its state, and with their own picture a tick earlier: errors are told in
+ms of such a delay.
 """
 
 from collections.abc import Sequence
@@ -20,39 +21,34 @@ from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
 
-FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size
-OLDER_FRAMES = 48  # each is planned once more: plans of neighbours differ little, so it takes more of them
-WAYS = ("by_picture", "by_state", "apart")  # another frame's picture, another frame's state, both
+FRAMES = 48  # each is planned twice more, in FP32 only: a minute for a policy of full size
+WAYS = ("by_picture", "apart", "by_100_ms")  # another frame's picture, its state too; the own picture so much older
 
 
 @dataclass(frozen=True)
 class Looking:
     """How much plans change, as a mean over frames and steps, in % of the recorded range: by action, then by WAYS.
 
-    None for an action that is not judged. per_ms_pct: by action, for each ms that the picture is older; None for one
-    that hardly follows the camera, or if no frame has an earlier one.
+    None for an action that is not judged. by_100_ms is 0 for one that hardly follows the camera, or if no frame has an
+    earlier one.
     """
 
     frames: int
     moved_pct: dict[str, dict[str, float] | None]
-    per_ms_pct: dict[str, float | None]
 
     def summary(self) -> dict[str, Any]:
         """Return the changes as `<action>_<way>_pct`, for compare.json."""
         summary: dict[str, Any] = {"frames": self.frames}
         for action, moved in self.moved_pct.items():
             summary |= {f"{action}_{way}_pct": moved[way] if moved else None for way in WAYS}
-            summary[f"{action}_per_ms_pct"] = self.per_ms_pct[action]
         return summary
 
     def table(self) -> Table:
         """Return the changes as a table for people."""
         rows = []
         for action, moved in self.moved_pct.items():
-            per_ms = self.per_ms_pct[action]
-            delayed = f"{per_ms:.4f} %" if per_ms else "does not move"
-            rows.append((action, *(format_pct(moved[way] if moved else None).strip() for way in WAYS), delayed))
-        return Table(("a plan moves by", "another picture", "another state", "both", "each ms of delay"), rows)
+            rows.append((action, *(format_pct(moved[way] if moved else None).strip() for way in WAYS)))
+        return Table(("a plan moves by", "another picture", "another state too", "100 ms of delay"), rows)
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
@@ -77,33 +73,23 @@ def look(
     if len(rows) < 2:
         raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
     others = np.roll(rows, len(rows) // 2).tolist()
-    moved: list[tuple[np.ndarray, ...]] = []
+    known = {(s.episode, s.row): s for s in recorded}
+    moved: list[list[np.ndarray]] = []
+    older = [np.zeros(len(report.action_names))]
     for row, other in progress(list(zip(rows, others, strict=True)), desc="swapping", total=len(rows)):
-        sample, another, plan = report.samples[row], report.samples[other], report.reference[row].astype(np.float64)
-        by_picture = policy.predict_chunk(another.frame_bgr(), sample.state)
-        by_state = policy.predict_chunk(sample.frame_bgr(), another.state)
-        moved.append(tuple(np.abs(p - plan).mean(axis=0) for p in (by_picture, by_state, report.reference[other])))
-    means = np.mean(moved, axis=0)  # (ways, actions)
-    per_ms = _moved_per_ms(policy, report, recorded)
-    moved_pct: dict[str, dict[str, float] | None] = {}
-    per_ms_pct: dict[str, float | None] = {}
-    for i, action in enumerate(report.action_names):
-        pct = report.pct(action)
-        moved = moved_pct[action] = None if pct is None else dict(zip(WAYS, (means[:, i] * pct).tolist(), strict=True))
-        followed = moved and pct and follows(moved["by_picture"], moved["apart"])
-        per_ms_pct[action] = float(per_ms[i] * pct) if followed and per_ms is not None and per_ms[i] > 0 else None
-    return Looking(len(rows), moved_pct, per_ms_pct)
-
-
-def _moved_per_ms(policy: Any, report: Fidelity, recorded: Sequence[Any]) -> np.ndarray | None:
-    """Return how far a plan moves for each ms that its picture is older and the state the same, (A,); None: unknown."""
-    known, age_ms = {(s.episode, s.row): s for s in recorded}, 0.0
-    moved = np.zeros(len(report.action_names))
-    for row in pick_evenly(range(len(report.samples)), OLDER_FRAMES):
-        sample = report.samples[row]
-        before = known.get((sample.episode, sample.row - 1)) if known else None
+        sample, plan = report.samples[row], report.reference[row].astype(np.float64)
+        by_picture = policy.predict_chunk(report.samples[other].frame_bgr(), sample.state)
+        moved.append([np.abs(each - plan).mean(0) for each in (by_picture, report.reference[other])])
+        before = known and known.get((sample.episode, sample.row - 1))
         if before and sample.time_s > before.time_s:
-            age_ms += 1e3 * (sample.time_s - before.time_s)
-            older = policy.predict_chunk(before.frame_bgr(), sample.state)
-            moved += np.abs(older.astype(np.float64) - report.reference[row]).mean(0)
-    return moved / age_ms if age_ms else None
+            late = policy.predict_chunk(before.frame_bgr(), sample.state)
+            older.append(np.abs(late - plan).mean(0) / (sample.time_s - before.time_s))
+    means = np.vstack([np.mean(moved, axis=0), 0.1 * np.mean(older[1:] or older, axis=0)])  # (ways, actions)
+    moved_pct: dict[str, dict[str, float] | None] = {}
+    for i, action in enumerate(report.action_names):
+        if (pct := report.pct(action)) is None:
+            moved_pct[action] = None
+            continue
+        found = moved_pct[action] = dict(zip(WAYS, (means[:, i] * pct).tolist(), strict=True))
+        found["by_100_ms"] *= follows(found["by_picture"], found["apart"])
+    return Looking(len(rows), moved_pct)

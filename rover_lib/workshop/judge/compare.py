@@ -282,8 +282,8 @@ def errors_in_ms(compared: Mapping[str, Any], mode: str) -> dict[str, float | No
     for key, error_pct in found.items():
         if key.endswith("_mae_pct") and error_pct is not None:
             action = key.removesuffix("_mae_pct")
-            per_ms_pct = looking.get(f"{action}_per_ms_pct")
-            errors_ms[action] = error_pct / per_ms_pct if per_ms_pct else None
+            moved_pct = looking.get(f"{action}_by_100_ms_pct")
+            errors_ms[action] = 100 * error_pct / moved_pct if moved_pct else None
     return errors_ms
 
 

@@ -88,7 +88,7 @@ def test_an_error_is_also_the_delay_that_moves_the_plan_as_far():
     """A policy that always plans nearly the same was once 0.01 % off, and so passed every gate."""
     found = metrics_of(steering_mae_pct=0.01)
     assert compare.errors_in_ms(found, "static") == {"steering": None, "throttle": None}
-    found["looking"] = {"steering_per_ms_pct": 0.0002, "throttle_per_ms_pct": None}  # throttle does not follow
+    found["looking"] = {"steering_by_100_ms_pct": 0.02, "throttle_by_100_ms_pct": 0.0}  # throttle does not follow
     assert compare.errors_in_ms(found, "static")["steering"] == pytest.approx(50)
     rows = {r["gate"]: r["passed"] for r in compare.gates(found, LIMITS)}
     assert rows["static steering error, ms of delay"] is False
