@@ -26,6 +26,15 @@ EXPLAINED = {  # the modes, in words that need no other page
     "static": "***static* INT8**: all layers",
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
+MEASURES = {
+    "delay_ms": "ms of delay",
+    "range_pct": "% of the range",
+    "spread_pct": "% of the plans' spread",
+    "worst_tenth_pct": "% of the range, worst tenth of frames",
+    "first_steps_pct": "% of the range, first 8 steps",
+    "steering_range_pct": "steering alone, % of the range",
+    "steering_delay_ms": "steering alone, ms of delay",
+}
 BEST = "static"
 PLACE = re.compile(r"(<!-- table (\w+), by page_tables -->\n)(.*?)(<!-- end -->)", re.S)
 
@@ -160,6 +169,16 @@ def _learning(root: Path) -> list[Row]:
     return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
+def _judging(root: Path) -> list[Row]:
+    """How well each measure tells the versions of policies that lose worlds, the best first."""
+    measures = _metrics(root / "results" / "lab", "judging")["measures"]
+    rows = []
+    for name, found in sorted(measures.items(), key=lambda item: (item[1]["refused"], -item[1]["auc"])):
+        refused = f"{found['refused']} of {found['of']}"
+        rows.append((MEASURES[name], f"{found['auc']:.3f}", f"{found['least_of_losers']:.2g}", refused))
+    return [("error, of the worse action", "ROC area", "least of a loser", "others refused"), *rows]
+
+
 def _parameters(root: Path) -> list[Row]:
     """The notebooks' titles, and what papermill's -p sets; run_dir is in all of them."""
     rows: list[Row] = []
@@ -178,6 +197,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "channels": partial(_students, "channels"),
     "faster": partial(_students, "faster"),
     "learning": _learning,
+    "judging": _judging,
     "parameters": _parameters,
 }
 

@@ -19,7 +19,7 @@ from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
 RESULTS_OF = {"05_benchmark": "benchmark-*", "08_distill": "students"}  # the others' stages are their names
-OF_LABORATORY = ("faults*.json", "random.json", "mutants.json")  # in runs/, where make leaves them
+OF_LABORATORY = ("faults*.json", "random.json", "mutants.json", "judging.json")  # in runs/, where make leaves them
 LIMIT = 1_000_000  # bytes, of a committed notebook or JSON
 DIGITS = 6  # of each number: pages, notebooks and tests read four
 MANY_INPUTS = 40  # hashes of files; more of them are summed up in one
