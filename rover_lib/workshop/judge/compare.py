@@ -20,7 +20,7 @@ import torch
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.car.car import Car, this_car
-from rover_lib.onboard.errors import CarError, PolicyError
+from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import Affine
@@ -56,7 +56,7 @@ class Fidelity:
     """Chunks of every artifact on the same n frames.
 
     reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody drove;
-    is_pad: (n, C) bool, steps after the end of the recording; car: whose actions FP32 plans.
+    is_pad: (n, C) bool, steps after the end of the recording.
     """
 
     action_names: tuple[str, ...]
@@ -66,7 +66,6 @@ class Fidelity:
     chunks: dict[str, np.ndarray]
     recorded: np.ndarray | None
     is_pad: np.ndarray
-    car: Car
 
     def errors(self, mode: str) -> np.ndarray:
         """(n, C, A) float64 absolute difference to FP32, in units of the action."""
@@ -86,24 +85,15 @@ class Fidelity:
         pct = self.pct(action)
         return None if pct is None else errors * pct
 
-    def us(self, action: str) -> float:
-        """Microseconds of the car's pulse per unit of an action; NaN for an action that is no servo's."""
-        try:
-            return self.car.pwm.channel(action).us_per_unit
-        except CarError:
-            return math.nan
-
     def summary(self, mode: str) -> dict[str, Any]:
-        """Everything about one mode, keys by action name and unit; percentages of an action not judged are None."""
+        """Everything about one mode, by action, in % of the recorded range; of an action not judged it is None."""
         summary: dict[str, Any] = {}
         for i, action in enumerate(self.action_names):
-            e, us = self.errors(mode)[..., i], self.us(action)
+            e = self.errors(mode)[..., i]
             tenth = np.sort(e.mean(1))[-math.ceil(len(e) / 10) :]
             found = {"mae": e.mean(), "p95": np.quantile(e, 0.95), "max": e.max(), "worst_tenth": tenth.mean()}
             for name, error in (found | {"mae_per_step": e.mean(0)}).items():
                 summary[f"{action}_{name}_pct"] = self.in_pct(error, action)
-            if math.isfinite(us):
-                summary |= {f"{action}_{name}_us": error * us for name, error in found.items()}
         return summary | self.recorded_error(self.chunks[mode])
 
     def recorded_error(self, chunks: np.ndarray) -> dict[str, float | None]:
@@ -213,7 +203,6 @@ def fidelity(
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
         recorded=np.stack([s.chunk for s in samples]) if recorded else None,
         is_pad=np.asarray(pads, bool),
-        car=reference.car,
     )
 
 
@@ -229,12 +218,9 @@ def metrics(
     own = {}
     for mode in ("fp32", *report.chunks):
         trial = (trials or {}).get(mode)
-        low, high = trial.wilson if trial else (None, None)
         own[mode] = {
             "hits": trial.hits if trial else None,
             "trials": trial.trials if trial else None,
-            "hits_wilson_low": low,
-            "hits_wilson_high": high,
             "size_mb": policies[mode].path.stat().st_size / 1e6,
         }
     fp32, modes = own.pop("fp32"), {}

@@ -80,7 +80,6 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "mode": mode,
             "size_mb": found["size_mb"],
             "times_smaller": compared["fp32"]["size_mb"] / found["size_mb"],
-            "latency_p50_ms": time.get("latency_p50_ms"),
             "time_ms": time.get(key),
             "times_faster": ratio(timed.get("fp32", {}).get(key), time.get(key)),
             "floor_ms": time.get("floor_ms"),
