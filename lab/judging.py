@@ -11,7 +11,7 @@ import copy
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,31 +41,17 @@ from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import Opened, load
 
 FP32, DRIVING = "FP32", (world, drives, loop, pilot, plan)  # the modules that a drive depends on
-WORLDS, PUSHES, LATENCY_S = 200, 4, 0.2
+WORLDS, PUSHES, LATENCY_S = 150, 4, 0.2
 CALIBRATION, HELD_OUT, FIRST_STEPS = 60, 120, 8
 
 
-@dataclass(frozen=True)
-class Version:
-    """How static INT8 is degraded. noise: of the weights, in their channel's standard deviation. ranges: a factor.
-
-    block: the only one whose weights are degraded; "" for all.
-    """
-
-    weight_bits: int = 8
-    activation_bits: int = 8
-    noise: float = 0.0
-    ranges: float = 1.0
-    block: str = ""
-
-
-VERSIONS = {
-    "INT8": Version(),
-    **{f"weights {bits}": Version(weight_bits=bits) for bits in (7, 6, 5, 4, 3)},
-    **{f"activations {bits}": Version(activation_bits=bits) for bits in (7, 6, 5, 4, 3)},
-    "noise of weights": Version(noise=0.3),
-    "ranges": Version(ranges=0.3),
-    "one block": Version(weight_bits=2, block="backbone.layer3"),
+VERSIONS: dict[str, dict[str, Any]] = {  # arguments of `degraded`
+    "INT8": {},
+    **{f"weights {bits}": {"weight_bits": bits} for bits in (7, 6, 5, 4, 3)},
+    **{f"activations {bits}": {"activation_bits": bits} for bits in (7, 6, 5, 4, 3)},
+    "noise of weights": {"noise": 0.3},
+    "ranges": {"ranges": 0.3},
+    "one block": {"weight_bits": 2, "block": "backbone.layer3"},
 }
 
 
@@ -89,40 +75,48 @@ class Driver:
         return self.predict_unclipped(frame_bgr, state).clip(*action_limits(self.action_names, self.car))
 
 
-def degraded(opened: Opened, calibration: Any, version: Version) -> nn.Module:
-    """Return static INT8, its ranges those of all calibration frames, degraded; the kernels are those of the rover.
+def degraded(
+    opened: Opened, calibration: Any, weight_bits: int = 8, activation_bits: int = 8, noise: float = 0.0,
+    ranges: float = 1.0, block: str = "",
+) -> nn.Module:  # fmt: skip
+    """Return static INT8 with all calibration frames' ranges, degraded, on the kernels of the rover.
 
     Fewer bits are fewer steps of the same INT8: weights are rounded beforehand, activations get a larger scale.
+    noise: of weights, in their channel's standard deviation. ranges: a factor. block: only its weights are degraded.
     """
     config, scheme, rng = opened.checkpoint.config, Scheme(smooth=calibration.smooth), torch.Generator().manual_seed(0)
     prepared = restore_observed(opened.checkpoint, scheme, calibration)
     for name, m in prepared.named_modules():
         if isinstance(m, RangeObserver):
-            m.quant_max = 2 ** (version.activation_bits - 1) - 1
+            m.quant_max = 2 ** (activation_bits - 1) - 1
             m.quant_min = -m.quant_max - 1
-            m.min_val *= version.ranges
-            m.max_val *= version.ranges
-        elif isinstance(m, nn.Conv2d) and version.block in ("", block_of(name)):
+            m.min_val.mul_(ranges)
+            m.max_val.mul_(ranges)
+        elif isinstance(m, nn.Conv2d) and block in ("", block_of(name)):
             weight = m.weight.detach().flatten(1)
-            weight = weight + version.noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
-            step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (version.weight_bits - 1) - 1)
+            weight = weight + noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
+            step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (weight_bits - 1) - 1)
             m.weight = nn.Parameter(((weight / step).round() * step).view_as(m.weight), requires_grad=False)
     return convert(prepared, config, scheme).eval()
 
 
-def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return every measure of a version by action, in its unit. moved_pct: of FP32's `Looking`."""
-    found, reference, errors = report.summary(version), report.reference.astype(np.float64), {}
+def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, float]:
+    """Return every measure of a version, of the worse action if it is none of the plan. moved_pct: of FP32's look."""
+    found, reference = report.summary(version), report.reference.astype(np.float64)
     spread = np.abs(reference - reference.mean(0)).mean((0, 1))
-    for i, action in enumerate(report.action_names):
-        errors[action] = {
-            "range_pct": found[f"{action}_mae_pct"],
-            "spread_pct": 100 * report.errors(version)[..., i].mean() / spread[i],
-            "worst_tenth_pct": found[f"{action}_worst_tenth_pct"],
-            "first_steps_pct": np.mean(found[f"{action}_mae_per_step_pct"][:FIRST_STEPS]),
-            "delay_ms": 100 * found[f"{action}_mae_pct"] / moved_pct[action]["by_100_ms"],
-        }
-    return errors
+    names, by_ms = report.action_names, {name: moved["by_100_ms"] / 100 for name, moved in moved_pct.items()}
+    mae_pct = {name: found[f"{name}_mae_pct"] for name in names}
+    return {
+        "range_pct": max(mae_pct.values()),
+        "spread_pct": max(100 * report.errors(version).mean((0, 1)) / spread),
+        "first_steps_pct": max(np.mean(found[f"{name}_mae_per_step_pct"][:FIRST_STEPS]) for name in names),
+        "steering_range_pct": mae_pct["steering"],
+        "steering_delay_ms": mae_pct["steering"] / by_ms["steering"],
+        "worse_action_delay_ms": max(mae_pct[name] / by_ms[name] for name in names),
+        "delay_ms": sum(mae_pct.values()) / sum(by_ms.values()),
+        "worst_tenth_pct": found["worst_tenth_pct"],
+        "worst_tenth_delay_ms": found["worst_tenth_pct"] / sum(by_ms.values()),
+    }
 
 
 def prepare(checkpoint: Path, episodes: Path, folder: Path) -> None:
@@ -131,9 +125,9 @@ def prepare(checkpoint: Path, episodes: Path, folder: Path) -> None:
     config, parts = opened.checkpoint.config, opened.parts
     calibration = calibrate(opened.checkpoint, pick_evenly(parts.calibration, CALIBRATION))
     made: dict[str, Any] = {FP32: ACT(config, opened.checkpoint.weights)}
-    made |= {label: degraded(opened, calibration, each) for label, each in VERSIONS.items()}
-    shape = {"size": config.image_sizes[0], "rate_hz": config.rate_hz, "chunk": config.chunk}
-    shape |= {"action_names": config.action_names}
+    made |= {label: degraded(opened, calibration, **each) for label, each in VERSIONS.items()}
+    shape: dict[str, Any] = {"size": config.image_sizes[0], "rate_hz": config.rate_hz, "chunk": config.chunk}
+    shape["action_names"] = config.action_names
     drivers = {}
     for label, module in made.items():
         traced = torch.jit.trace(module, example_inputs(config), check_trace=False)
@@ -151,8 +145,8 @@ def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     torch.backends.quantized.engine = ENGINE
     checkpoint, settings = run / "best_model.pth", params()["drive"]
-    made_of = {"checkpoint": sha256_of(checkpoint), "versions": [asdict(each) for each in VERSIONS.values()]}
-    made_of |= {"frames": [CALIBRATION, HELD_OUT], "torch": torch.__version__}
+    made_of: dict[str, Any] = {"checkpoint": sha256_of(checkpoint), "versions": VERSIONS, "torch": torch.__version__}
+    made_of |= {"frames": [CALIBRATION, HELD_OUT]}
     folder = cache_folder("judging", key_of(made_of), lambda new: prepare(checkpoint, episodes, new))
     described = json.loads((folder / "described.json").read_text())
     labels = FP32, *VERSIONS
@@ -172,8 +166,8 @@ def drive_all(drivers: Mapping[str, Driver], settings: Settings, path: Path) -> 
     kept = {(row["version"], row["seed"]): row["hit"] for row in read_rows(path)}
     seeds = range(SEED, SEED + WORLDS)
     for seed in seeds:
-        missing = [label for label in drivers if (label, seed) not in kept]
-        drawn = World(seed, PUSHES) if missing else None  # to draw it takes a third of a drive's time
+        if missing := [label for label in drivers if (label, seed) not in kept]:
+            drawn = World(seed, PUSHES)  # once for all, as that takes a third of a drive's time
         for label in missing:
             own = copy.copy(drawn)
             own.trajectory = [own.state]
@@ -182,16 +176,13 @@ def drive_all(drivers: Mapping[str, Driver], settings: Settings, path: Path) -> 
     return {label: [kept[label, seed] for seed in seeds] for label in drivers}
 
 
-def roc(rows: Sequence[Mapping[str, Any]], measure: str, actions: Sequence[str]) -> dict[str, Any]:
-    """Return how well a measure's worse action tells versions that lose from those that do not.
+def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
+    """Return how well a measure tells versions that lose from those that do not.
 
     auc: of two versions, one of each kind, how often the loser has the larger error. least_of_losers: any limit below
     it lets no loser pass; refused: of the others, how many have at least that.
     """
-    found = {True: list[float](), False: list[float]()}
-    for row in rows:
-        found[row["loses"]].append(max(row["errors"][action][measure] for action in actions))
-    losers, others = np.array(found[True]), np.array(found[False])
+    losers, others = (np.array([r["errors"][measure] for r in rows if r["loses"] is kind]) for kind in (True, False))
     auc = (losers[:, None] > others).mean() + 0.5 * (losers[:, None] == others).mean()
     return {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
 
@@ -199,13 +190,13 @@ def roc(rows: Sequence[Mapping[str, Any]], measure: str, actions: Sequence[str])
 def main(output: Path, episodes: Path, *runs: Path) -> None:
     """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
     rows = [row for run in runs for row in judge(run, episodes)]
-    steering, *others = rows[0]["errors"]
-    measures = {measure: roc(rows, measure, (steering, *others)) for measure in rows[0]["errors"][steering]}
-    measures |= {f"{steering}_{measure}": roc(rows, measure, [steering]) for measure in ("range_pct", "delay_ms")}
-    given = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S, "chance": CHANCE}
-    given |= {"versions": {label: asdict(each) for label, each in VERSIONS.items()}, "drive": params()["drive"]}
+    measures = {measure: roc(rows, measure) for measure in rows[0]["errors"]}
+    given: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
+    given |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"]}
+    inputs = {f"{run.name}/best_model.pth": sha256_of(run / "best_model.pth") for run in runs}
     metrics = {"pairs": len(rows), "lose": sum(row["loses"] for row in rows), "measures": measures, "rows": rows}
-    print(json.dumps(write_stage(output, "judging", params=given, metrics=metrics)["metrics"]["measures"], indent=1))
+    write_stage(output, "judging", params=given, metrics=metrics, inputs=inputs)
+    print(json.dumps(plain(measures), indent=1))
 
 
 if __name__ == "__main__":

@@ -26,15 +26,6 @@ EXPLAINED = {  # the modes, in words that need no other page
     "static": "***static* INT8**: all layers",
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
-MEASURES = {
-    "delay_ms": "ms of delay",
-    "range_pct": "% of the range",
-    "spread_pct": "% of the plans' spread",
-    "worst_tenth_pct": "% of the range, worst tenth of frames",
-    "first_steps_pct": "% of the range, first 8 steps",
-    "steering_range_pct": "steering alone, % of the range",
-    "steering_delay_ms": "steering alone, ms of delay",
-}
 BEST = "static"
 PLACE = re.compile(r"(<!-- table (\w+), by page_tables -->\n)(.*?)(<!-- end -->)", re.S)
 
@@ -170,13 +161,13 @@ def _learning(root: Path) -> list[Row]:
 
 
 def _judging(root: Path) -> list[Row]:
-    """How well each measure tells the versions of policies that lose worlds, the best first."""
+    """How well each measure tells the versions of policies that lose worlds from the others, the best first."""
     measures = _metrics(root / "results" / "lab", "judging")["measures"]
-    rows = []
-    for name, found in sorted(measures.items(), key=lambda item: (item[1]["refused"], -item[1]["auc"])):
-        refused = f"{found['refused']} of {found['of']}"
-        rows.append((MEASURES[name], f"{found['auc']:.3f}", f"{found['least_of_losers']:.2g}", refused))
-    return [("error, of the worse action", "ROC area", "least of a loser", "others refused"), *rows]
+    rows: list[Row] = [("error", "area", "least of losers", "others above")]
+    for name, found in sorted(measures.items(), key=lambda item: -item[1]["auc"]):
+        words = name.replace("_ms", ", ms").replace("_pct", ", %").replace("_", " ")
+        rows.append((words, f"{found['auc']:.2f}", f"{found['least_of_losers']:.3g}", str(found["refused"])))
+    return rows
 
 
 def _parameters(root: Path) -> list[Row]:

@@ -107,10 +107,8 @@ class Chooser:
     def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
         """The same on usual and on odd frames, of the kinds that there are."""
         errors, kinds = self.errors(module), {"usual": ~self.is_odd, "odd": self.is_odd}
-        ones = torch.ones(len(errors))
-        return {
-            name: mae_pct(errors[kind], ones[kind], self.action_range) for name, kind in kinds.items() if kind.any()
-        }
+        there = {name: kind for name, kind in kinds.items() if kind.any()}
+        return {name: mae_pct(errors[kind], kind[kind].float(), self.action_range) for name, kind in there.items()}
 
     def observer(
         self, scheme: Scheme, observers: Sequence[str] = OBSERVERS, progress: Progress = silent
@@ -213,10 +211,10 @@ class Chooser:
             trial = step(*last["float_blocks"], block)
             if _worst(trial) < _worst(last):
                 steps.append(trial)
-        static, last = steps[0], steps[-1]
-        if blocks is None and len(steps) > 1 and _worst(last) > MIXED_PAYS * _worst(static):
-            what = f"{', '.join(last['float_blocks'])} in float: {_worst(static):.3f} to {_worst(last):.3f} %"
-            self.warnings.append(f"mixed gains nothing by {what}")
+        before, after = _worst(steps[0]), _worst(steps[-1])
+        if blocks is None and len(steps) > 1 and after > MIXED_PAYS * before:
+            in_float = ", ".join(steps[-1]["float_blocks"])
+            self.warnings.append(f"mixed gains nothing by {in_float} in float: {before:.3f} to {after:.3f} %")
             steps = steps[:1]
         return replace(best, float_blocks=tuple(steps[-1]["float_blocks"])), steps
 

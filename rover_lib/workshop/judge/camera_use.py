@@ -1,6 +1,6 @@
 """Check whether a policy uses its camera, or only repeats its last action, which is right most of the time.
 
-    seen = look(fp32, report)
+    seen = look(fp32, report, split.held_out)
     for warning in seen.warnings(): ...
 
 The policy's state is its last action. So some frames are planned once more with the picture of another frame, which
@@ -61,21 +61,18 @@ class Looking:
         return [f"{action} hardly follows the camera" for action in blind]
 
 
-def look(
-    policy: Any, report: Fidelity, recorded: Sequence[Any] = (), frames: int = FRAMES, progress: Progress = silent
-) -> Looking:
+def look(policy: Any, report: Fidelity, recorded: Sequence[Any] = (), progress: Progress = silent) -> Looking:
     """Swap pictures and states between the frames of a comparison whose reference is `policy`.
 
     Each frame is swapped with the one half of all frames away, which is from another drive if there are several.
     recorded: all samples of these drives, for the picture before each. Raises PolicyError for fewer than two frames.
     """
-    rows = pick_evenly(range(len(report.samples)), frames)
+    rows = pick_evenly(range(len(report.samples)), FRAMES)
     if len(rows) < 2:
         raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
     others = np.roll(rows, len(rows) // 2).tolist()
     known = {(s.episode, s.row): s for s in recorded}
-    moved: list[list[np.ndarray]] = []
-    older = [np.zeros(len(report.action_names))]
+    moved, older = list[list[np.ndarray]](), [np.zeros(len(report.action_names))]
     for row, other in progress(list(zip(rows, others, strict=True)), desc="swapping", total=len(rows)):
         sample, plan = report.samples[row], report.reference[row].astype(np.float64)
         by_picture = policy.predict_chunk(report.samples[other].frame_bgr(), sample.state)
@@ -87,9 +84,8 @@ def look(
     means = np.vstack([np.mean(moved, axis=0), 0.1 * np.mean(older[1:] or older, axis=0)])  # (ways, actions)
     moved_pct: dict[str, dict[str, float] | None] = {}
     for i, action in enumerate(report.action_names):
-        if (pct := report.pct(action)) is None:
-            moved_pct[action] = None
-            continue
-        found = moved_pct[action] = dict(zip(WAYS, (means[:, i] * pct).tolist(), strict=True))
+        pct = report.pct(action)
+        found = dict(zip(WAYS, (means[:, i] * (pct or 0)).tolist(), strict=True))
         found["by_100_ms"] *= follows(found["by_picture"], found["apart"])
+        moved_pct[action] = None if pct is None else found
     return Looking(len(rows), moved_pct)

@@ -17,7 +17,7 @@ from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import advice
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.advice import CALLED, Names, Stages, count, error_pct, gate_in_words
-from rover_lib.workshop.judge.compare import GATED, MODES, WORLDS_LOST, errors_in_ms, gate, gates, hits_needed
+from rover_lib.workshop.judge.compare import GATED, MODES, WORLDS_LOST, error_ms, gate, gates, hits_needed
 from rover_lib.workshop.judge.pairs import pairs_in_words
 
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
@@ -85,7 +85,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "floor_ms": time.get("floor_ms"),
             "instructions_g": counted.get(f"policy_{mode}", {}).get("instructions_g"),
             "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in found.items() if k.endswith("_mae_pct")},
-            "error_ms": None if mode == "fp32" else judge.worst(errors_in_ms(compared, mode)),
+            "error_ms": None if mode == "fp32" else error_ms(compared, mode),
             "recorded_pct": judge.worst(v for k, v in found.items() if k.endswith("_vs_recorded_pct")),
             "hits": found["hits"],
             "trials": found["trials"],
@@ -186,7 +186,7 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
     errors = [f"{action} {e:.2f} %" for action, e in best["errors_pct"].items() if e is not None]
     differs = f": it differs from FP32 by {', '.join(errors)} of the recorded range" if errors else ""
     if best["error_ms"] is not None:
-        differs += f", and moves the plan as much as {best['error_ms']:.0f} ms of delay do"
+        differs += f", and in the worst tenth of frames as much as {best['error_ms']:.0f} ms of delay"
     lines = [f"It keeps every gate{differs}."]
     if best["recorded_pct"] is not None:
         own = "FP32's own plans are up to {:.2f} % off the driver's, its {:.2f} %."

@@ -91,7 +91,7 @@ def test_a_throttle_that_misses_its_gate_is_healed_by_mixed(demo):
     assert any("image_project clips 7.0 %" in line for line in judged["cautions"])
     demo["quantize"]["modes"]["static"]["scheme"]["observer"] = "frames"  # it clips on purpose
     assert not any("clips" in line for line in judge(demo)["cautions"])
-    assert "throttle error" in because(judged, "static")
+    assert "error, % of the recorded range: 2.8" in because(judged, "static")
 
 
 def test_a_mixed_beside_a_static_that_keeps_its_gates_is_not_worth_its_time(demo):
