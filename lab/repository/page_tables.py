@@ -160,6 +160,16 @@ def _learning(root: Path) -> list[Row]:
     return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
+def _judging(root: Path) -> list[Row]:
+    """How well each measure tells the versions of policies that lose worlds from the others, the best first."""
+    measures = _metrics(root / "results" / "lab", "judging")["measures"]
+    rows: list[Row] = [("error", "area", "least of losers", "others above")]
+    for name, found in sorted(measures.items(), key=lambda item: -item[1]["auc"]):
+        words = name.replace("_ms", ", ms").replace("_pct", ", %").replace("_", " ")
+        rows.append((words, f"{found['auc']:.2f}", f"{found['least_of_losers']:.3g}", str(found["refused"])))
+    return rows
+
+
 def _parameters(root: Path) -> list[Row]:
     """The notebooks' titles, and what papermill's -p sets; run_dir is in all of them."""
     rows: list[Row] = []
@@ -178,6 +188,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "channels": partial(_students, "channels"),
     "faster": partial(_students, "faster"),
     "learning": _learning,
+    "judging": _judging,
     "parameters": _parameters,
 }
 
