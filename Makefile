@@ -38,7 +38,7 @@ help:
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
 	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the"
-	@echo "                                            notebooks, the JSON behind them into results/, the tables into pages"
+	@echo "                                            notebooks, the JSON behind them into results/, pictures, the tables"
 
 # ensurepip is called on its own because venv hides why it failed. If it fails (a full disk, no bundled wheels), the
 # pip of $(PYTHON) installs pip into the environment. An unfinished environment without pip gets one this way too.
@@ -133,6 +133,7 @@ notebooks-open: $(READY)
 
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish
+	$(VENV)/bin/python -m lab.repository.film
 	$(VENV)/bin/python -m lab.repository.page_tables
 
 # The pages, and all that they link to. A link to anything else fails the build.

@@ -14,7 +14,8 @@ from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
-from rover_lib.workshop.judge.compare import GATED, gate
+from rover_lib.workshop.judge.compare import GATED, WORLDS_LOST, worlds_lost
+from rover_lib.workshop.judge.pairs import compare_pairs
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
@@ -42,9 +43,9 @@ def measure_latencies(
         raise TrainingError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
     if not latencies_ms or worlds < 1:
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
-    limit = p["gates"]["hits_lost_at_150_ms"]
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
-    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit": limit}
+    limit_pct = p["gates"]["worlds_lost_pct"]
+    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     settings, hows = Settings.of(p["drive"]), list[How]()
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
@@ -53,7 +54,7 @@ def measure_latencies(
             hows.append((ms, count, replace(settings, compensate=False)))
     drives = _drive_all(artifact, hows, worlds, progress)
     rows = [_row(how, driven) for how, driven in zip(hows, drives, strict=True)]
-    metrics = {"rows": rows, "gates": gates(rows, limit)}
+    metrics = {"rows": rows, "gates": gates(rows, limit_pct)}
     return write_stage(artifact.with_name("drive.json"), "drive", params=given, metrics=metrics, inputs=inputs)
 
 
@@ -76,7 +77,6 @@ def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
     row["compensate"] = settings.compensate
     outcomes = [d.outcome for d in driven]
     row |= count_hits(outcomes)
-    del row["missed"]
     row |= {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
     ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
@@ -84,23 +84,39 @@ def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
     return row
 
 
-def gates(rows: Sequence[Mapping[str, Any]], limit: int) -> list[dict[str, Any]]:
-    """Judge how many hits are lost at 150 ms, compensated, compared with 0 ms. rows: of drive.json."""
-    hits = {r["latency_ms"]: r["hits"] for r in rows if r["compensate"] and not r["pushes"]}
-    lost = hits[0.0] - hits[JUDGED_MS] if {0.0, JUDGED_MS} <= set(hits) else None
-    return [gate(f"{GATED} hits lost at {JUDGED_MS:g} ms", lost, "<=", limit)]
+def gates(rows: Sequence[Mapping[str, Any]], limit_pct: float) -> list[dict[str, Any]]:
+    """Judge the worlds lost at 150 ms, compensated, against the same at 0 ms. rows: of drive.json."""
+    missed = {r["latency_ms"]: r["missed"] for r in rows if r["compensate"] and not r["pushes"]}
+    pairs, worlds = None, rows[0]["trials"]
+    if {0.0, JUDGED_MS} <= set(missed):
+        seeds = range(SEED, SEED + worlds)
+        pairs = compare_pairs(*([seed not in missed[ms] for seed in seeds] for ms in (0.0, JUDGED_MS)))
+    return [worlds_lost(f"{GATED} at {JUDGED_MS:g} ms: {WORLDS_LOST}", pairs, worlds, limit_pct)]
+
+
+def _how(row: Mapping[str, Any]) -> str:
+    how = f"{row['pushes']} pushes" if row["pushes"] else "left alone"
+    return how if row["compensate"] else f"{how}, not compensated"
+
+
+def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
+    """Return the rows of drive.json as plots.hits draws them, over the latency in ms."""
+    found: dict[str, list[tuple[float, Mapping[str, Any]]]] = {}
+    for row in content["metrics"]["rows"]:
+        found.setdefault(_how(row), []).append((row["latency_ms"], row))
+    return found
 
 
 def table(content: Mapping[str, Any]) -> Table:
     """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
-        how = [f"{r['pushes']} pushes"] if r["pushes"] else ["left alone"]
-        how += [] if r["compensate"] else ["not compensated"]
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
         hits = f"{r['hits']} of {r['trials']}"
-        rows.append((", ".join(how), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
-    verdict = {True: "pass", False: "FAIL", None: "not measured"}
-    gates = content["metrics"]["gates"]
-    notes = [f"{g['gate']}: {g['found']}, at most {g['limit']}: {verdict[g['passed']]}" for g in gates]
+        rows.append((_how(r), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
+    gates, notes = content["metrics"]["gates"], []
+    for g in gates:
+        found = "not measured" if g["found"] is None else f"{g['found']:.3g}"
+        verdict = {True: "pass", False: "FAIL", None: "not shown"}[g["passed"]]
+        notes.append(f"{g['gate']}: {found}, at most {g['limit']}: {verdict}")
     return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows, notes=notes)

@@ -50,7 +50,7 @@ HALF_A_TICK_S = 0.5 / RATE_HZ
 JUDGED_FRAMES = 2  # held-out frames of old episodes; two are enough, as worlds judge here
 CHECKPOINT, EPISODES, ARTIFACT = "best_model.pth", "episodes", "policy_static.pt"
 JUDGING = ("worlds", "other_worlds")
-HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red thing that is no balloon"}
+HOW = {PUSHED: "pushed", ALONE: "left alone", DECOY: "beside a red decoy"}
 DRIVES_FILE = "drives.jsonl"
 
 
@@ -268,6 +268,15 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         gate(f"hits of {GATED_WORLDS} lost when left alone", lost, "<=", 0),
         gate("chance that demonstrations do as well when pushed, by a sign test", by_chance, "<=", CHANCE),
     ]
+
+
+def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
+    """Return how the pushed car hits as plots.hits draws it, over the seconds of a human, for each way to learn on."""
+    before, *policies = content["metrics"]["policies"]
+    found = {policy["arm"]: [(0.0, before["pushed"])] for policy in policies}
+    for policy in policies:
+        found[policy["arm"]].append((policy["human_s"], policy["pushed"]))
+    return found
 
 
 def table(content: Mapping[str, Any]) -> Table:

@@ -1,7 +1,8 @@
 """For nbval, which runs the notebooks here under pytest.
 
-`make demo` has just run the same cells on the whole demo; what is left to prove is that the committed notebooks run in
-order and still print what they must. So they run in a folder of their own, on a few frames and worlds.
+`make demo` has just run the same cells on the whole demo; what is left to prove is that
+the committed notebooks run in order and still print what they must. So they run in a
+folder of their own, on a few frames and worlds.
 """
 
 import os
@@ -34,8 +35,8 @@ def pytest_collection_modifyitems(items):
             continue
         if "parameters" in cell.metadata.get("tags", []):
             cell.source = with_few(cell.source)
-        # Count every cell as run: nbval takes a missing execution count for a cell whose output is not to be trusted,
-        # and the committed notebooks have no counts, because they would change with every publication.
+        # Count every cell as run: nbval trusts no output of a cell without a count, and
+        # committed notebooks have none: they would change with each publication.
         if cell.get("execution_count") is None:
             cell.execution_count = 0
 
@@ -44,5 +45,7 @@ def with_few(parameters: str) -> str:
     """A parameters cell whose literals are those of FEW."""
     lines = []
     for name, literal, _ in LINE.findall(parameters):
-        lines.append(f"{name} = {FEW[name]!r}" if name in FEW else f"{name} = {literal}")
+        lines.append(
+            f"{name} = {FEW[name]!r}" if name in FEW else f"{name} = {literal}"
+        )
     return "\n".join(lines)

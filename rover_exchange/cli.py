@@ -87,17 +87,15 @@ def open_browser(url: str) -> None:
 @click.argument("file", type=PathTo("flight log"))
 @click.option("-o", "--output", type=Output(), help="The figure to write [default: FILE.png].")
 @LOG_DRIVE
-@click.option("--video", type=Output(), help="A film of the drive: .mp4, or .webp for a page.")
-@click.option("--mcap", type=Output(), help="The drive for Foxglove or Rerun, with its pictures if it was recorded.")
+@click.option("--video", type=Output(), help="A film of the drive, .mp4.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; draw only with -o.")
-def log(file: Path, output: Path | None, drive: int, video: Path | None, mcap: Path | None, as_json: bool) -> None:
+def log(file: Path, output: Path | None, drive: int, video: Path | None, as_json: bool) -> None:
     """Summarize the flight log FILE of `rover drive`, and draw it.
 
     Older parts of the same log (FILE.1, FILE.2, ...) are read with it. The figure needs a workstation.
 
     --video makes a film of the drive instead: its pictures with the planned path, the commands and the servo pulses.
-    It needs the pictures that `rover drive --record` has kept. --mcap writes the log, with the pictures if there are
-    any, for viewers of MCAP files.
+    It needs the pictures that `rover drive --record` has kept.
     """
     flight = sum_up(file, drive, as_json)
     if video:
@@ -105,12 +103,7 @@ def log(file: Path, output: Path | None, drive: int, video: Path | None, mcap: P
 
         count = write_film(video, flight, terminal_bar())
         click.echo(f"drawn: {video}, {count} pictures, {video.stat().st_size / 1e6:.2f} MB", err=as_json)
-    if mcap:
-        from rover_exchange.mcap_log import write_mcap
-
-        counts = ", ".join(f"{count} of {topic}" for topic, count in write_mcap(mcap, flight).items())
-        click.echo(f"written: {mcap}, {counts}, {mcap.stat().st_size / 1e6:.2f} MB", err=as_json)
-    if output or not (as_json or video or mcap):
+    if output or not (as_json or video):
         output = output or file.with_name(f"{file.name}.png")
         _draw(flight, output)
         click.echo(f"drawn: {output}", err=as_json)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, cast
 
 import av
 import cv2
@@ -25,40 +24,25 @@ FULL_THROTTLE = 0.25  # the throttle that fills the bar
 WHO = {"M": "the human drives", "A": "the policy drives", "S": "stopped"}
 GREEN_BGR = (113, 204, 46)
 INK, BAR, FILL, PIN = (232, 232, 232), (42, 47, 52), (59, 143, 212), (255, 255, 255)
-
-
-class Format(NamedTuple):
-    """rate_hz: pictures per second. width: of the film, even. options: of the codec. container: of the file."""
-
-    rate_hz: int
-    width: int
-    codec: str
-    options: dict[str, str]
-    container: dict[str, str]
-
-
-FORMATS = {
-    ".mp4": Format(30, 640, "libx264", {"crf": "23"}, {"movflags": "+faststart"}),
-    ".webp": Format(5, 400, "libwebp_anim", {"quality": "50"}, {"loop": "0"}),  # small enough for a page
-}
+RATE_HZ = 30
 
 
 def write_film(path: Path, flight: Flight, progress: Progress = silent) -> int:
-    """Write a film of a drive, .mp4 or .webp, at its own pace, and return how many pictures it has.
+    """Write a film of a drive, an .mp4, at its own pace, and return how many pictures it has.
 
-    Raises RoverError for another kind of file, or if every picture is damaged; RoverError and EpisodeError as
+    Raises RoverError for another ending, or if every picture is damaged; RoverError and EpisodeError as
     moments_of.
     """
-    if path.suffix not in FORMATS:
-        raise RoverError(f"{path}: a film ends in {' or '.join(FORMATS)}", found=path.suffix or "no ending")
-    form, moments = FORMATS[path.suffix], moments_of(flight)
+    if path.suffix != ".mp4":
+        raise RoverError(f"{path}: a film ends in .mp4", found=path.suffix or "no ending")
+    moments = moments_of(flight)
     count = 0
     stream: VideoStream | None = None
     with atomic_path(path) as temporary:
-        with av.open(str(temporary), "w", options=form.container) as container:
-            for picture in _pictures(flight, moments, form, progress):
+        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
+            for picture in _pictures(flight, moments, progress):
                 if stream is None:
-                    stream = cast(VideoStream, container.add_stream(form.codec, form.rate_hz, options=form.options))
+                    stream = container.add_stream("libx264", RATE_HZ, options={"crf": "23"})
                     stream.height, stream.width = picture.shape[:2]
                     stream.pix_fmt = "yuv420p"  # what browsers play
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
@@ -70,19 +54,19 @@ def write_film(path: Path, flight: Flight, progress: Progress = silent) -> int:
     return count
 
 
-def _pictures(flight: Flight, moments: list[Moment], form: Format, progress: Progress) -> Iterator[np.ndarray]:
-    """Yield (h, w, 3) uint8 RGB, even sides, all of one size, for each time step whose picture is whole."""
+def _pictures(flight: Flight, moments: list[Moment], progress: Progress) -> Iterator[np.ndarray]:
+    """Yield (h, WIDTH, 3) uint8 RGB, even sides, all of one size, for each time step whose picture is whole."""
     times_s, step_s = np.array([m.t_s for m in moments]), (flight.period_ms or PERIOD_MS) / 1000
     height: int | None = None
-    for at_s in progress(np.arange(times_s[0], times_s[-1] + 1e-9, 1 / form.rate_hz), desc="drawing"):
+    for at_s in progress(np.arange(times_s[0], times_s[-1] + 1e-9, 1 / RATE_HZ), desc="drawing"):
         moment = moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
         try:
             frame = read_jpeg(moment.frame)
         except (OSError, CameraError):
             continue
         picture = draw_moment(moment, frame, flight.car, step_s)
-        height = height or round(form.width * picture.shape[0] / picture.shape[1] / 2) * 2
-        yield cv2.resize(picture, (form.width, height), interpolation=cv2.INTER_AREA)
+        height = height or len(picture)
+        yield cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
 
 
 def draw_moment(moment: Moment, frame_bgr: np.ndarray, car: Car, step_s: float) -> np.ndarray:

@@ -16,6 +16,8 @@ import click
 import pytest
 import yaml
 
+from rover_lib.workshop.run import run
+
 ROOT = Path(__file__).parents[1]
 OTHERS = [ROOT / folder / "README.md" for folder in ("ansible", "firmware", "lab")]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *OTHERS])
@@ -97,6 +99,16 @@ def test_every_block_of_code_is_parsed():
             for node in ast.walk(ast.parse(block)) if language == "python" else ():
                 for name in node.names if isinstance(node, ast.ImportFrom) else ():
                     assert hasattr(import_module(node.module), name.name) or find_spec(f"{node.module}.{name.name}")
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_api_run(demo_run, tmp_path, monkeypatch):
+    """All but the notebooks: tests/notebooks has these."""
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "demo").symlink_to(demo_run)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run, "_execute", lambda source, folder, *how: shutil.copy(source, folder))
+    exec("".join(re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "api.md").read_text(), re.M | re.S)), {})
 
 
 @pytest.mark.slow

@@ -110,11 +110,13 @@ class EmulatedArduino:
         transmitter: tuple[float, float] = (0.0, 0.0),
         ready: bool = False,
         nice: int = 0,
+        car: Car | None = None,
     ):
         """every_pulse: whether pulses() returns each pulse, or only those that differ from the one before.
 
-        transmitter: its pulses from the start on, with this_car()'s periods. ready: see ready(). nice: scheduling
-        priority, for root. Raises RoverError as build() does, and if the program does not start.
+        transmitter: its pulses from the start on. ready: see ready(). nice: scheduling priority, for root. car: whose
+        transmitter it is, of which the board does not know yet; None: this_car(), which its EEPROM has kept. Raises
+        RoverError as build() does, and if the program does not start.
         """
         built = build()
         # The program makes this link, and removes it even if the present process was killed.
@@ -122,9 +124,9 @@ class EmulatedArduino:
         self._reading = threading.Lock()
         self._rest = b""
         options = ["--link", self.port, "--log", "all" if every_pulse else "changes", "--reset-on-open"]
-        car = this_car()
+        options += ["--eeprom", "" if car else eeprom_of(this_car()).hex()]
+        car = car or this_car()
         options += ["--boot-ms", f"{BOOT_S * 1000:.0f}", "--periods", str(car.numbers[0]), str(car.numbers[4])]
-        options += ["--eeprom", eeprom_of(car).hex()]
         command = built.program, built.firmware, *options
         self._process = Child("the emulated Arduino", *command, error=RoverError, talks=True)
         self.pid = self._process.pid

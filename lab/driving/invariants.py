@@ -107,9 +107,9 @@ def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
     checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
-    checks += (_stuck, _supplied)
     with_pad, with_receiver = (_armed_at_rest, _pad_lost), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
-    for check in (*(with_pad if seen.gamepad else with_receiver), *checks, _answered, _in_time):
+    more = (_answered, _in_time, _stuck, _supplied)
+    for check in (*(with_pad if seen.gamepad else with_receiver), *checks, *more):
         if (what := check(run)) is not None:
             yield f"{check.__name__[1:]}: {what}"
 

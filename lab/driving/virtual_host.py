@@ -239,10 +239,11 @@ class Eyes:
             return  # the last: pictures have become late, and the next one is still on its way
         self._seen_ms = seen_ms
         content_ms = seen_ms if lens.frozen_ms is None else lens.frozen_ms
-        standing = lens.stands_ms is not None and lens.frozen_ms is None
-        shown_ms = min(content_ms, lens.stands_ms) if standing else content_ms
+        shown_ms, stands_ms = content_ms, lens.stands_ms if lens.frozen_ms is None else None
+        if stands_ms is not None:
+            shown_ms = min(content_ms, stands_ms)
         scene = scenery()[round(shown_ms / FRAME_MS) % len(scenery())]
-        if standing:
+        if stands_ms is not None:
             scene = cv2.add(scene, np.roll(NOISE, world.now_ms, 1))
         if lens.black:
             scene = (scene - scene.min()) // 64 + world.now_ms % 2

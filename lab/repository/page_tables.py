@@ -14,6 +14,7 @@ from typing import Any
 
 import nbformat
 
+from balloon_world.learn import HOW
 from rover_lib.onboard.care.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
@@ -150,14 +151,23 @@ def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
     conditions = {key: value["trials"] for key, value in policies[0].items() if isinstance(value, dict)}
-    words = {"alone": "left alone", "decoy": "beside a red decoy"}
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
         return (name, f"{policy['human_s']:.0f}", *(str(policy[how]["hits"]) for how in conditions))
 
-    hits = (f"{words.get(how, how)}: hits of {trials}" for how, trials in conditions.items())
+    hits = (f"{HOW[how]}: hits of {trials}" for how, trials in conditions.items())
     return [("policy", "seconds by a human", *hits), *map(row, policies)]
+
+
+def _judging(root: Path) -> list[Row]:
+    """How well each measure tells the versions of policies that lose worlds from the others, the best first."""
+    measures = _metrics(root / "results" / "lab", "judging")["measures"]
+    rows: list[Row] = [("error", "area", "least of losers", "others above")]
+    for name, found in sorted(measures.items(), key=lambda item: -item[1]["auc"]):
+        words = name.replace("_ms", ", ms").replace("_pct", ", %").replace("_", " ")
+        rows.append((words, f"{found['auc']:.2f}", f"{found['least_of_losers']:.3g}", str(found["refused"])))
+    return rows
 
 
 def _parameters(root: Path) -> list[Row]:
@@ -178,6 +188,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "channels": partial(_students, "channels"),
     "faster": partial(_students, "faster"),
     "learning": _learning,
+    "judging": _judging,
     "parameters": _parameters,
 }
 

@@ -1,9 +1,9 @@
-"""Put what runs showed into the repository: outputs into its notebooks, and the JSON behind them into results/.
+"""Put what runs showed into the repository: outputs into its notebooks, the JSON behind them into results/, pictures.
 
     python -m lab.repository.publish       # what `make notebooks` does
 
 results/<run>/<stage>.json is what the run left, less paths of this machine, the hashes of every recorded frame, and the
-digits of a number after its sixth. What quotes a number reads it there.
+digits of a number after its sixth. What quotes a number reads it there. A picture has the hash of the JSON behind it.
 """
 
 import hashlib
@@ -13,13 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.run.run import NAMES, NOTEBOOKS
 
 RESULTS_OF = {"05_benchmark": "benchmark-*", "08_distill": "students"}  # the others' stages are their names
-OF_LABORATORY = ("faults*.json", "random.json", "mutants.json", "strange.json")  # in runs/, where make leaves them
+OF_LABORATORY = (
+    "faults*.json",
+    "random.json",
+    "mutants.json",
+    "strange.json",
+    "judging.json",
+)  # where make leaves them
+PICTURES = {"sensitivity": ("03_sensitivity", "quantize"), "worst_frames": ("04_worst_frames", "compare")}  # of figures
 LIMIT = 1_000_000  # bytes, of a committed notebook or JSON
 DIGITS = 6  # of each number: pages, notebooks and tests read four
 MANY_INPUTS = 40  # hashes of files; more of them are summed up in one
@@ -53,7 +62,25 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
     for target, text in texts.items():
         with atomic_path(target) as temporary:
             temporary.write_text(text)
-    return list(texts)
+    pictures = []
+    for name, (figure, stage) in PICTURES.items():
+        pictures.append(root / "pictures" / f"{name}.png")
+        stored = root / "results" / "demo" / f"{stage}.json"
+        store_picture(runs_dir / "demo" / "figures" / f"{figure}.png", pictures[-1], stored)
+    return [*texts, *pictures]
+
+
+def store_picture(figure: Path, target: Path, shown: Path) -> None:
+    """Store a run's figure in 256 colours, which says what JSON it shows."""
+    about = PngInfo()
+    about.add_text("Source", source_of(shown))
+    with Image.open(figure) as drawn, atomic_path(target) as temporary:
+        drawn.convert("RGB").quantize(256).save(temporary, "png", optimize=True, pnginfo=about)
+
+
+def source_of(shown: Path) -> str:
+    """Return what a picture's metadata says of the JSON that it shows: its place in results/, and its SHA-256."""
+    return f"{shown.parent.name}/{shown.name} {sha256_of(shown)}"
 
 
 def _of_notebook(name: str, run_dir: Path, root: Path) -> dict[Path, str]:

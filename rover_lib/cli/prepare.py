@@ -123,7 +123,9 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
-def export(run_dir: Path, onnx: bool, card: bool) -> None:
+@click.option("--license", help="For the card, such as apache-2.0 [default: the checkpoint's, if it names one].")
+@click.option("--base-model", metavar="USER/NAME", help="For the card: the FP32 policy on the Hub [default: likewise].")
+def export(run_dir: Path, onnx: bool, card: bool, **about: str | None) -> None:
     """Write the policies of the run in RUN_DIR for another engine, or for others to use.
 
     --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md.
@@ -133,7 +135,7 @@ def export(run_dir: Path, onnx: bool, card: bool) -> None:
     if card:
         from rover_lib.workshop.run.run_report import write_card
 
-        click.echo(f"written: {write_card(run_dir)}")
+        click.echo(f"written: {write_card(run_dir, **about)}")
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 

@@ -166,7 +166,7 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: An
     """Check all that driving needs (camera, Arduino, ARTIFACT, power, disk), and say what to do.
 
     Nothing is armed. Exit code 1 if anything that driving needs fails; warnings do not count. With --receiver it asks
-    you to move a stick and to switch the transmitter off: do that once.
+    you to steer and to switch the transmitter off: do that once.
     """
     from rover_lib.onboard.car.host import default_log
     from rover_lib.onboard.care import doctor as checking
@@ -192,7 +192,7 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: An
 @click.option("--wheelbase-m", type=float, help="Distance between the axles [default: the balloon world's].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, force: bool, **more: Any) -> None:
-    """Guide a human with the transmitter through both sticks, measure the pulses, and write them as car.yml.
+    """Guide a human through steering and throttle, measure the pulses, and write them as car.yml.
 
     Take the wheels off the ground and unplug the motor first. Ctrl-C leaves everything as it was.
     """

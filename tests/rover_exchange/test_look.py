@@ -1,8 +1,6 @@
-"""A past drive as a figure, as a film, and as MCAP, from its flight log and the pictures recorded with it."""
+"""A past drive as a figure and as a film, from its flight log and the pictures recorded with it."""
 
-import base64
 import json
-from datetime import datetime
 from pathlib import Path
 
 import av
@@ -10,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from command import rover
-from PIL import Image
 
 from rover_exchange import film
 from rover_exchange.flight import flight_figure
@@ -102,63 +99,22 @@ def test_the_path_and_the_bars_are_of_the_moment_and_of_its_car(tmp_path):
 @pytest.mark.slow
 def test_a_film_has_the_drives_pace_and_pictures(tmp_path):
     log = drive(tmp_path)
-    for ending in ("mp4", "webp"):
-        done = rover("log", log, "--video", tmp_path / f"out.{ending}")
-        assert done.exit_code == 0 and not (tmp_path / "flight.log.png").exists(), done.output
+    done = rover("log", log, "--video", tmp_path / "out.mp4")
+    assert done.exit_code == 0 and not (tmp_path / "flight.log.png").exists(), done.output
     with av.open(str(tmp_path / "out.mp4")) as container:
         images = [image.to_ndarray(format="rgb24") for image in container.decode(video=0)]
     assert len(images) == 58 and images[0].shape == (360 + film.PANEL, 640, 3)
     means = [image[5:60].mean() for image in images]  # above the horizon: each picture is lighter than the one before
     assert abs(means[0] - 30) < 4 and 115 < means[-1] < 129 and np.all(np.diff(means) > -1)
-    with Image.open(tmp_path / "out.webp") as webp:
-        assert webp.n_frames == 10 and webp.width == 400 and webp.info["loop"] == 0
 
 
 @pytest.mark.parametrize(
-    ("made", "output", "word"), [({}, "out.avi", ".mp4 or .webp"), ({"recorded": False}, "out.mp4", "--record")]
+    ("made", "output", "word"), [({}, "out.avi", "ends in .mp4"), ({"recorded": False}, "out.mp4", "--record")]
 )
 def test_what_makes_no_film_leaves_nothing(tmp_path, made, output, word):
     done = rover("log", drive(tmp_path, **made), "--video", tmp_path / output)
     assert done.exit_code == 1 and word in done.output, done.output
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(("out", ".out"))]
-
-
-# ---- MCAP
-
-
-def read_mcap(path):
-    """By topic, [(log time in seconds since the drive's start, content)]."""
-    reading = pytest.importorskip("mcap.reader", reason="needs the package mcap, of the extra workshop")
-    found = {}
-    with path.open("rb") as file:
-        reader = reading.make_reader(file)
-        (metadata,) = reader.iter_metadata()
-        start_s = datetime.fromisoformat(json.loads(metadata.metadata["start"])).timestamp()
-        for schema, channel, message in reader.iter_messages():
-            row = json.loads(message.data)
-            assert channel.message_encoding == "json"
-            assert row.keys() >= json.loads(schema.data)["properties"].keys()
-            found.setdefault(channel.topic, []).append((message.log_time / 1e9 - start_s, row))
-    return found
-
-
-def test_mcap_has_each_message_at_its_time(tmp_path):
-    path, episode = drive(tmp_path), tmp_path / "episodes" / "episode_1"
-    flight = read_log(path)
-    (episode / "frames" / "frame_000003.jpg").write_bytes(b"\xff\xd8 no picture")
-    (episode / "frames" / "frame_000004.jpg").unlink()
-    done = rover("log", path, "--mcap", tmp_path / "out.mcap")
-    assert done.exit_code == 0 and "60 of tick" in done.output and "18 of camera" in done.output, done.output
-    found = read_mcap(tmp_path / "out.mcap")
-    for k, (t_s, row) in enumerate(found["/tick"]):
-        assert t_s == pytest.approx(flight.ticks["t_s"][k], abs=2e-6)
-        for name in Tick._fields:
-            value = flight.ticks[name][k]
-            assert row[name] == (str(value) if isinstance(value, str) else pytest.approx(float(value))), name
-    assert [row["message"] for _, row in found["/event"]] == [e.text for e in flight.events]
-    for k, (t_s, row) in zip([k for k in range(20) if k not in (3, 4)], found["/camera"], strict=True):
-        assert t_s == pytest.approx(k / PICTURES_HZ + 0.01, abs=2e-6)
-        assert base64.b64decode(row["data"]) == (episode / "frames" / f"frame_{k:06d}.jpg").read_bytes()
 
 
 # ---- the figure

@@ -19,8 +19,8 @@ def test_html_and_text_say_the_same():
 def test_gates_have_a_verdict_each():
     limits = (("static throttle_mae_pct", 0.14, 1), ("static hits lost", 3, 2), ("static instructions_g", None, 1))
     table = plots.gates([gate(name, found, "<=", limit) for name, found, limit in limits])
-    assert [row[-1] for row in table.rows] == ["kept", "MISSED", "not measured"]
-    assert table.caption == "1 of 3 promises kept, 1 missed, 1 not measured"
+    assert [row[-1] for row in table.rows] == ["kept", "MISSED", "not shown"]
+    assert table.caption == "1 of 3 promises kept, 1 missed, 1 not shown"
 
 
 def test_a_sentence_leaves_no_figure_and_takes_an_old_one_away(tmp_path):

@@ -47,28 +47,28 @@ def measure(
     positive: str | None = None,
     **more: Any,
 ) -> Car:
-    """Lead a human through the ends and centres of both sticks; return the measured car.
+    """Lead a human through the ends and centres of steering and throttle; return the measured car.
 
     ask: tells the human what to do, and returns when it is done. notify: is told what was measured. positive: the side
     that positive steering turns to; None: that of the longer pulse. more: `name`, `camera` and `wheelbase_m` of
     car.yml. Raises CarError if the values do not make a car; LinkError like the link.
     """
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
-    ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of both sticks.")
+    ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of it.")
     _find(link, sleep)
     steering_us, throttle_us, *periods_us = _hold(link, "at rest", sleep)
     notify(f"at rest: {steering_us} and {throttle_us} us, with periods of {periods_us[0]} and {periods_us[1]} us")
     ends = {}
     for where, stick in (
-        ("left", "Move the steering stick fully to the left"),
-        ("right", "Move the steering stick fully to the right"),
-        ("forward", "Let go of it, and push the throttle fully forward"),
-        ("back", "Pull the throttle fully back (leave it at rest if this car has no reverse)"),
+        ("left", "Steer fully to the left"),
+        ("right", "Steer fully to the right"),
+        ("forward", "Let go of it, and give throttle fully forward (stick or trigger)"),
+        ("back", "Give throttle fully back (leave it at rest if this car has no reverse)"),
     ):
         ask(f"{stick}, and hold it there.")
         ends[where] = _hold(link, f"with the stick {where}", sleep)[where in ("forward", "back")]
         notify(f"{where}: {ends[where]} us")
-    ask("Let go of both sticks.")
+    ask("Let go of steering and throttle.")
     fast = periods_us[1] < PERIOD_MIN_US
     if fast:
         ends["forward"] = min(ends["forward"], FAST_PULSE_MAX_US)  # which the firmware takes for full throttle

@@ -14,7 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -47,6 +49,16 @@ NEAR_S = 600.0  # a time stamp further from a clock than this does not come from
 
 Read = tuple[bytes | np.ndarray, float | None]  # a JPEG or a decoded picture, and its time stamp if there is one
 Reader = Generator[Read, None, None]
+
+
+class CameraKind(Protocol):
+    """A kind of camera. An entry point of the group `rover_lib.cameras` names its class, and `--camera` that name."""
+
+    def read(self, source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
+        """Yield each picture as it comes, and its time by time.monotonic() or None, until `closing` is set.
+
+        source: what --camera says, NAME or NAME:MORE. size: (width, height) to ask for. Raises CameraError.
+        """
 
 
 def size_like(width: int, height: int) -> tuple[int, int]:
@@ -87,8 +99,8 @@ class Frame:
 class Camera:
     """A source of frames, open inside its context; a thread reads it and keeps only the newest frame.
 
-    source: a number or /dev/videoN (V4L2), csi (see csi.py), or a FIFO of JPEGs. size: (width, height) to request from
-    a camera. rate_hz: to request. Any thread may call any method.
+    source: a number or /dev/videoN (V4L2), csi (see csi.py), a FIFO of JPEGs, or a CameraKind's name. size: (width,
+    height) to request from a camera. rate_hz: to request. Any thread may call any method.
     """
 
     def __init__(
@@ -246,6 +258,8 @@ def path_of(source: str) -> Path:
 def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
     if is_csi(source):
         return read_csi(source, size, rate_hz, closing)
+    for kind in entry_points(group="rover_lib.cameras", name=source.partition(":")[0]):
+        return kind.load()().read(source, size, rate_hz, closing)
     path = path_of(source)
     try:
         mode = path.stat().st_mode

@@ -182,7 +182,7 @@ def _transmitter(link: ServoLink) -> Check:
     found = f"steering {steering_us} us, throttle {throttle_us} us"
     rests = abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
     found += "" if rests else ": arming will be refused"
-    return warn_unless(rests, "transmitter", found, "let go of the throttle stick")
+    return warn_unless(rests, "transmitter", found, "let go of the throttle")
 
 
 def receiver(port: str, ask: Callable[[str], object]) -> Iterator[Check]:
@@ -191,12 +191,12 @@ def receiver(port: str, ask: Callable[[str], object]) -> Iterator[Check]:
     ask: tells the human what to do, and returns when it is done. Nothing is armed. Raises LinkError like ServoLink.
     """
     with ServoLink(port) as link:
-        ask("Jack up the car. Switch the transmitter on, and let go of both sticks.")
+        ask("Jack up the car. Switch the transmitter on, and let go of it.")
         check = _transmitter(link)
         yield check
         if check.verdict != "ok":
             return
-        ask("Move the steering stick far to both sides, and let go of it.")
+        ask("Steer far to both sides, and let go.")
         seen = _soon(link, lambda status: status.missing == "-", RITUAL_S)
         if seen.missing != "-":
             yield Check("arming", "fail", "the receiver's pulses did not show it", link.remedy(seen.missing))

@@ -7,7 +7,7 @@ from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.errors import DriveFault
 
 DRIVEN = 0.02  # throttle above which a car must move; the least of the recordings is 0.027
-EVERY_S = 0.1  # between two pictures that are looked at; each takes 0.1 ms
+EVERY_S = 0.1  # between two pictures that are looked at; each takes 0.2 ms
 GAP_S = 0.25  # at most this is counted for a picture: nobody knows what the car did in a longer gap
 ROWS = 90  # of a picture that are looked at
 CELLS = 32, 30  # across and down

@@ -88,7 +88,8 @@ def read_lerobot(folder: Path) -> Contents:
             sees_state=numbers is not None,
             action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
         )
-    return config, weights, {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": notes}
+    report = {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": notes}
+    return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
 
 
 def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:

@@ -35,7 +35,8 @@ FLOAT_PER_INT8 = 4.2
 # Min-max clips nothing that calibration saw. On a few frames others often seem a little better, and on frames of other
 # episodes they were up to twice as bad. So what clips more must have less than this times the error:
 CLIPPING_PAYS = 0.8
-SENSITIVITY_FRAMES = 24  # of the choosing frames: they only order the blocks, which are then tried on all
+SENSITIVITY_FRAMES = 16  # of the choosing frames: they only order the blocks, which are then tried on all
+MIXED_PAYS = 0.9  # mixed must have less than this times the error of static, or it is static
 USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are odd frames
 # Where odd frames are far above the others in every tensor, widening one range mends nothing while the next one clips.
 # So all but the odd frames are also tried with every range wider, by these shares:
@@ -106,10 +107,8 @@ class Chooser:
     def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
         """The same on usual and on odd frames, of the kinds that there are."""
         errors, kinds = self.errors(module), {"usual": ~self.is_odd, "odd": self.is_odd}
-        ones = torch.ones(len(errors))
-        return {
-            name: mae_pct(errors[kind], ones[kind], self.action_range) for name, kind in kinds.items() if kind.any()
-        }
+        there = {name: kind for name, kind in kinds.items() if kind.any()}
+        return {name: mae_pct(errors[kind], kind[kind].float(), self.action_range) for name, kind in there.items()}
 
     def observer(
         self, scheme: Scheme, observers: Sequence[str] = OBSERVERS, progress: Progress = silent
@@ -188,8 +187,9 @@ class Chooser:
 
         Blocks are tried in the order of squared error taken per instruction added. One that costs more than is left of
         `max_cost_pct` of static's instructions, or that does not help the worse action, stays INT8. blocks: leave these
-        in float instead, whatever they cost. Returns the mixed scheme and its steps {float_blocks, cost_pct,
-        <action>_mae_pct}, static first, the best last. Raises ArtifactError for an unknown block.
+        in float instead, whatever they cost. Blocks that gain nothing stay INT8, with a warning. Returns the mixed
+        scheme and its steps {float_blocks, cost_pct, <action>_mae_pct}, static first, the best last. Raises
+        ArtifactError for an unknown block.
         """
         graph, costs = self._observed(scheme), float_costs_pct(self.checkpoint)
         best = replace(scheme, mode="mixed", float_blocks=())
@@ -211,6 +211,11 @@ class Chooser:
             trial = step(*last["float_blocks"], block)
             if _worst(trial) < _worst(last):
                 steps.append(trial)
+        before, after = _worst(steps[0]), _worst(steps[-1])
+        if blocks is None and len(steps) > 1 and after > MIXED_PAYS * before:
+            in_float = ", ".join(steps[-1]["float_blocks"])
+            self.warnings.append(f"mixed gains nothing by {in_float} in float: {before:.3f} to {after:.3f} %")
+            steps = steps[:1]
         return replace(best, float_blocks=tuple(steps[-1]["float_blocks"])), steps
 
 

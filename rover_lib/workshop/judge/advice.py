@@ -15,10 +15,7 @@ from rover_lib.workshop.judge.compare import GATED
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
 PHRASES = {  # what people call the parts of a gate's name
-    "of_spread_pct": "error, % of how much the plans vary",
     "mae_pct": "error, % of the recorded range",
-    "accuracy_loss_pct": "largest error, % of the recorded range, as the original promised",
-    "hits lost, p": "chance that a policy as good as FP32 loses as many balloons to it",
     "hits": "balloons hit",
     "simd_g": "SIMD instructions, 10^9",
     "instructions_g": "instructions, 10^9",
@@ -105,10 +102,8 @@ def list_remedies(
 ) -> list[str]:
     """Say what to do about a gate that FP32 or static INT8 misses, the cheapest remedy first: remedies.txt."""
     key, quantized = gate.partition(" ")[2], stages["quantize"]
-    action = key.removesuffix("_mae_pct").removesuffix("_of_spread_pct")
-    alone = {block: errors.get(f"{action}_mae_pct") for block, errors in quantized.get("sensitivity", {}).items()}
-    judged = {block: error for block, error in alone.items() if error is not None}
-    worst = [w for w in stages["compare"].get("worst", []) if (w["mode"], w["action"]) == (GATED, action)]
+    alone = {block: judge.worst(errors) or 0.0 for block, errors in quantized.get("sensitivity", {}).items()}
+    worst = [w for w in stages["compare"].get("worst", []) if w["mode"] == GATED]
     return _lines(
         "remedies.txt",
         gate=gate,
@@ -117,7 +112,7 @@ def list_remedies(
         mixed=rows.get("mixed", {}),
         most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
         odd=quantized.get("odd"),
-        worst_block=max(judged.items(), key=lambda item: item[1], default=None),
+        worst_block=max(alone.items(), key=lambda item: item[1], default=None),
         episodes=list(dict.fromkeys(str(w["episode"]) for w in worst if w["episode"])),
     )
 

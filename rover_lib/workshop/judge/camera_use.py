@@ -1,12 +1,14 @@
 """Check whether a policy uses its camera, or only repeats its last action, which is right most of the time.
 
-    seen = look(fp32, report)
+    seen = look(fp32, report, split.held_out)
     for warning in seen.warnings(): ...
 
-The policy's state is its last action. So for each frame it plans twice more: with the state of another frame, and with
-the picture of another frame. The plans of a policy that only copies change with the state and not with the picture.
+The policy's state is its last action. So some frames are planned once more with the picture of another frame, which
+hardly moves the plans of a policy that copies its state, and with their own picture a tick earlier: errors are told in
+ms of such a delay.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,15 +21,16 @@ from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import pick_evenly
 
-FRAMES = 24  # each is planned twice more, in FP32 only: half a minute for a policy of full size
-WAYS = ("by_picture", "by_state", "apart")  # another frame's picture, another frame's state, both
+FRAMES = 48  # each is planned twice more, in FP32 only: a minute for a policy of full size
+WAYS = ("by_picture", "apart", "by_100_ms")  # another frame's picture, its state too; the own picture so much older
 
 
 @dataclass(frozen=True)
 class Looking:
     """How much plans change, as a mean over frames and steps, in % of the recorded range: by action, then by WAYS.
 
-    None for an action that is not judged.
+    None for an action that is not judged. by_100_ms is 0 for one that hardly follows the camera, or if no frame has an
+    earlier one.
     """
 
     frames: int
@@ -45,7 +48,7 @@ class Looking:
         rows = []
         for action, moved in self.moved_pct.items():
             rows.append((action, *(format_pct(moved[way] if moved else None).strip() for way in WAYS)))
-        return Table(("a plan moves by", "another picture", "another state", "both"), rows)
+        return Table(("a plan moves by", "another picture", "another state too", "100 ms of delay"), rows)
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
@@ -58,25 +61,31 @@ class Looking:
         return [f"{action} hardly follows the camera" for action in blind]
 
 
-def look(policy: Any, report: Fidelity, frames: int = FRAMES, progress: Progress = silent) -> Looking:
+def look(policy: Any, report: Fidelity, recorded: Sequence[Any] = (), progress: Progress = silent) -> Looking:
     """Swap pictures and states between the frames of a comparison whose reference is `policy`.
 
-    Each frame is swapped with the one half of all frames away, which is from another drive if there are several. Raises
-    PolicyError for fewer than two frames.
+    Each frame is swapped with the one half of all frames away, which is from another drive if there are several.
+    recorded: all samples of these drives, for the picture before each. Raises PolicyError for fewer than two frames.
     """
-    rows = pick_evenly(range(len(report.samples)), frames)
+    rows = pick_evenly(range(len(report.samples)), FRAMES)
     if len(rows) < 2:
         raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
     others = np.roll(rows, len(rows) // 2).tolist()
-    moved: list[tuple[np.ndarray, ...]] = []
+    known = {(s.episode, s.row): s for s in recorded}
+    moved, older = list[list[np.ndarray]](), [np.zeros(len(report.action_names))]
     for row, other in progress(list(zip(rows, others, strict=True)), desc="swapping", total=len(rows)):
-        sample, another, plan = report.samples[row], report.samples[other], report.reference[row].astype(np.float64)
-        by_picture = policy.predict_chunk(another.frame_bgr(), sample.state)
-        by_state = policy.predict_chunk(sample.frame_bgr(), another.state)
-        moved.append(tuple(np.abs(p - plan).mean(axis=0) for p in (by_picture, by_state, report.reference[other])))
-    means = np.mean(moved, axis=0)  # (ways, actions)
+        sample, plan = report.samples[row], report.reference[row].astype(np.float64)
+        by_picture = policy.predict_chunk(report.samples[other].frame_bgr(), sample.state)
+        moved.append([np.abs(each - plan).mean(0) for each in (by_picture, report.reference[other])])
+        before = known and known.get((sample.episode, sample.row - 1))
+        if before and sample.time_s > before.time_s:
+            late = policy.predict_chunk(before.frame_bgr(), sample.state)
+            older.append(np.abs(late - plan).mean(0) / (sample.time_s - before.time_s))
+    means = np.vstack([np.mean(moved, axis=0), 0.1 * np.mean(older[1:] or older, axis=0)])  # (ways, actions)
     moved_pct: dict[str, dict[str, float] | None] = {}
     for i, action in enumerate(report.action_names):
         pct = report.pct(action)
-        moved_pct[action] = None if pct is None else dict(zip(WAYS, (means[:, i] * pct).tolist(), strict=True))
+        found = dict(zip(WAYS, (means[:, i] * (pct or 0)).tolist(), strict=True))
+        found["by_100_ms"] *= follows(found["by_picture"], found["apart"])
+        moved_pct[action] = None if pct is None else found
     return Looking(len(rows), moved_pct)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 Z = 1.959963984540054  # of 95 %
+CHANCE = 0.05  # of the exact test's p: below it, a loss is not chance
 
 
 def sign_test(only_one: int, only_other: int) -> float:
@@ -60,6 +61,11 @@ def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, An
         "loss_high": worlds * high,
         "least_loss": math.ceil(worlds * Z**2 / (worlds + Z**2)),
     }
+
+
+def loses(pairs: Mapping[str, Any]) -> bool:
+    """Whether the second policy hits fewer worlds than the first, beyond chance. pairs: of `compare_pairs`."""
+    return pairs["only_first"] > pairs["only_second"] and pairs["p"] < CHANCE
 
 
 def pairs_in_words(pairs: Mapping[str, Any], worlds: int) -> str:

@@ -17,7 +17,7 @@ from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import advice
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.advice import CALLED, Names, Stages, count, error_pct, gate_in_words
-from rover_lib.workshop.judge.compare import GATED, MODES, gate, gates, hits_needed
+from rover_lib.workshop.judge.compare import GATED, MODES, WORLDS_LOST, error_ms, gate, gates, hits_needed
 from rover_lib.workshop.judge.pairs import pairs_in_words
 
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
@@ -75,37 +75,32 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
     rows = {}
     for mode, found in all_found.items():
         time = timed.get(mode, {})
+        judged = [] if mode == "fp32" else gates(compared, params["gates"], mode)
         rows[mode] = {
             "mode": mode,
             "size_mb": found["size_mb"],
             "times_smaller": compared["fp32"]["size_mb"] / found["size_mb"],
-            "latency_p50_ms": time.get("latency_p50_ms"),
-            "latency_p95_ms": time.get("latency_p95_ms"),
             "time_ms": time.get(key),
             "times_faster": ratio(timed.get("fp32", {}).get(key), time.get(key)),
             "floor_ms": time.get("floor_ms"),
             "instructions_g": counted.get(f"policy_{mode}", {}).get("instructions_g"),
             "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in found.items() if k.endswith("_mae_pct")},
+            "error_ms": None if mode == "fp32" else error_ms(compared, mode),
+            "recorded_pct": judge.worst(v for k, v in found.items() if k.endswith("_vs_recorded_pct")),
             "hits": found["hits"],
             "trials": found["trials"],
             "pairs": found.get("pairs"),
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
-            "missed_gates": [] if mode == "fp32" else _list_missed(compared, params["gates"], mode),
+            "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in judged),
+            "missed_gates": [
+                {**r, "words": gate_in_words(r["gate"])} for r in judged if r["passed"] is False and mode in r["gate"]
+            ],
         }
     static, mixed = rows.get("static"), rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
         # It does the same work and some of it in float: its shorter time is chance.
         mixed |= {key: static[key] for key in ("time_ms", "times_faster")}
     return rows
-
-
-def _list_missed(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str) -> list[dict[str, Any]]:
-    """Return the gates that a mode misses, each once: the original's are left out where our own is missed too."""
-    rows = [r for r in gates(compared, limits, mode) if r["passed"] is False and r["gate"].startswith(f"{mode} ")]
-    keys = " ".join(r["gate"] for r in rows)
-    doubled = {"accuracy_loss_pct": "_mae_pct", "model_size_mb": " size_mb"}
-    rows = [r for r in rows if doubled.get(r["gate"].partition(" ")[2], "no gate") not in keys]
-    return [{**r, "words": gate_in_words(r["gate"])} for r in rows]
 
 
 def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
@@ -190,11 +185,17 @@ def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
         return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
     errors = [f"{action} {e:.2f} %" for action, e in best["errors_pct"].items() if e is not None]
     differs = f": it differs from FP32 by {', '.join(errors)} of the recorded range" if errors else ""
+    if best["error_ms"] is not None:
+        differs += f", and in the worst tenth of frames as much as {best['error_ms']:.0f} ms of delay"
     lines = [f"It keeps every gate{differs}."]
-    if best["trials"]:
-        lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
+    if best["recorded_pct"] is not None:
+        own = "FP32's own plans are up to {:.2f} % off the driver's, its {:.2f} %."
+        lines.append(own.format(fp32["recorded_pct"], best["recorded_pct"]))
     if best["pairs"]:
+        lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
         lines.append(pairs_in_words(best["pairs"], best["trials"]))
+    by = "The worlds decided" if best["worlds_decide"] else "Errors on recordings decided, by limits set by driving"
+    lines.append(f"{by}.")
     size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
     if best["instructions_g"] and fp32["instructions_g"]:
         size += f", and {fp32['instructions_g'] / best['instructions_g']:.1f} times fewer instructions ({COUNTED})"

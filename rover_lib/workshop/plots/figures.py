@@ -77,7 +77,7 @@ def _judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
 
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
-    """Draw each mode's mean error against FP32 at each step of the plan, in % of the recorded range and as pulse."""
+    """Draw each mode's mean error against FP32 at each step of the plan, in % of the recorded range."""
     actions, steps = report.action_names, report.reference.shape[1]
     if all(report.pct(action) is None for action in actions):
         return Note("no action changes in these recordings: nothing is judged")
@@ -85,7 +85,7 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     times_s = np.arange(steps) / rate_hz
     for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
         ax.set_title(action)
-        if (pct := report.pct(action)) is None:
+        if report.pct(action) is None:
             text = "never changes in these\nrecordings: not judged"
             ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes, fontsize=11)
             ax.set_axis_off()
@@ -93,10 +93,6 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
         for mode in report.chunks:
             ax.plot(times_s, report.in_pct(report.errors(mode)[..., i].mean(0), action), **line_of(mode))
         ax.set(xlabel=AHEAD, ylabel="mean error (% of the recorded range)", ylim=(0, None))
-        us = report.us(action) / pct
-        if np.isfinite(us):
-            other = ax.secondary_yaxis("right", functions=(lambda p, u=us: p * u, lambda e, u=us: e / u))
-            other.set_ylabel("the same as pulse (us)")
     legend_below(fig, next(ax for ax in fields if ax.get_lines()), 5)
     return fig
 

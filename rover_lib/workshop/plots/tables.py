@@ -6,7 +6,7 @@ from typing import Any
 from rover_lib.workshop.judge.verdict import gate_in_words
 from rover_lib.workshop.notebook_table import Table
 
-KEPT = {True: "kept", False: "MISSED", None: "not measured"}
+KEPT = {True: "kept", False: "MISSED", None: "not shown"}
 
 
 def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -17,7 +17,7 @@ def gates(rows: Sequence[Mapping[str, Any]]) -> Table:
     kept, missed, unknown = (sum(row["passed"] is passed for row in rows) for passed in (True, False, None))
     caption = f"{kept} of {len(rows)} promises kept"
     caption += f", {missed} missed" if missed else ""
-    caption += f", {unknown} not measured" if unknown else ""
+    caption += f", {unknown} not shown" if unknown else ""
     cells = [(gate_in_words(row["gate"]), _limit(row), _shown(row["found"]), KEPT[row["passed"]]) for row in rows]
     return Table(("gate", "promised", "found", "verdict"), tuple(cells), caption)
 

@@ -36,9 +36,9 @@ from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared
-CHOOSING_FRAMES = 16  # choose the observer and the mixed blocks, and check an export
-# Odd frames need more: ranges chosen on 16 were half as bad again on others. The 64 also tell what share is odd.
-ODD_CHOOSING_FRAMES = 64
+# Ranges and blocks chosen on 16 frames were up to twice as bad on others. The 64 also tell what share is odd.
+CHOOSING_FRAMES = 64
+EXPORT_FRAMES = 16  # of these check an export
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Recipe:
 def prepare_chooser(
     checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
 ) -> Chooser:
-    """A chooser on this many frames that calibration has not seen; on more, and odd ones, if calibration met any."""
+    """A chooser on this many frames that calibration has not seen, and on odd ones, if calibration met any."""
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    few = pick_evenly(parts.choosing or parts.calibration, ODD_CHOOSING_FRAMES if odd else frames)
+    few = pick_evenly(parts.choosing or parts.calibration, frames)
     return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
@@ -107,7 +107,7 @@ def make_artifact(
     and warnings. Raises ArtifactError.
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
-    samples = pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES)
+    samples = pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES)
     chosen, note = recipe.choose(parts.calibration)
     calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
     scheme = recipe.scheme
@@ -156,7 +156,7 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     run_dir = Path(run_dir)
     again = open_run(run_dir, progress)
     checkpoint, parts = again.checkpoint, again.parts
-    exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, CHOOSING_FRAMES))
+    exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES))
     drives = Drives.of(parts)
     stage = read_stage(run_dir / "quantize.json", "quantize")
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup, escape
 
@@ -139,9 +140,10 @@ def _worth(judged: Mapping[str, Any]) -> list[str]:
     return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
-def write_card(run_dir: Path | str) -> Path:
+def write_card(run_dir: Path | str, **given: str | None) -> Path:
     """Write README.md, a model card for the Hub, into a run's folder; return its path.
 
+    given: license and base_model of the Hub's metadata; without them a LeRobot checkpoint's own, if it has any.
     Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
     """
     folder = Path(run_dir)
@@ -151,7 +153,11 @@ def write_card(run_dir: Path | str) -> Path:
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
     header, *rows = columns(judged)
     recordings = load["recordings"]
+    known = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
+    hub = {key: value for key, value in known.items() if value}
+    hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
     values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
+    values["hub"] = yaml.safe_dump(hub) if hub else ""
     path.write_text(_pages(escaped=False).get_template("card.md").render(values))
     return path
 

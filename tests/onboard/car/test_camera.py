@@ -57,6 +57,28 @@ def test_what_cannot_be_read_is_said(tmp_path, monkeypatch):
     os.close(fd)
 
 
+SHED = """
+import numpy as np
+
+class Shed:
+    def read(self, source, size, rate_hz, closing):
+        while not closing.wait(1 / rate_hz):
+            yield np.full((size[1], size[0], 3), len(source), np.uint8), None
+"""
+
+
+def test_a_kind_of_camera_of_another_package_is_found_by_its_name(tmp_path, monkeypatch):
+    about = tmp_path / "shed-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Name: shed\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[rover_lib.cameras]\nshed = shed:Shed\n")
+    (tmp_path / "shed.py").write_text(SHED)
+    monkeypatch.syspath_prepend(tmp_path)
+    with Camera("shed:7", size=SIZE) as camera:
+        image = camera.wait(0, 1.0).image
+    assert image.shape == (90, 160, 3) and (image == len("shed:7")).all()
+
+
 def test_a_camera_that_is_frozen_but_for_a_strip_is_frozen():
     """A strip of 5 % lies in one or two rows or columns of the blocks that are compared; it drove on."""
     rng = np.random.default_rng(0)

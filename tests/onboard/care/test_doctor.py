@@ -160,7 +160,7 @@ def test_a_human_is_led_through_the_receiver(monkeypatch, wiggled, without_trans
     now = {"missing": "w", "receiver": RESTING}
 
     def ask(text):
-        if "steering stick" in text:
+        if "both sides" in text:
             now["missing"] = wiggled
         if "transmitter off" in text:
             now.update(missing="s", receiver=without_transmitter)

@@ -42,12 +42,12 @@ def looked(policy, count=10, action_range=RANGE):
 def test_how_far_a_plan_moves():
     """Of ten frames each is swapped with the one five away."""
     found = looked(Known(looks=0.4, copies=0.6))
-    assert found.moved_pct["steering"] == pytest.approx({"by_picture": 2, "by_state": 3, "apart": 5})
+    assert found.moved_pct["steering"] == pytest.approx({"by_picture": 2, "apart": 5, "by_100_ms": 0})
     summary = found.summary()
-    assert summary["frames"] == 10 and summary["throttle_by_state_pct"] == pytest.approx(15)
-    assert found.warnings() == [] and "15.00 %" in str(found.table())
+    assert summary["frames"] == 10 and summary["throttle_by_picture_pct"] == pytest.approx(10)
+    assert found.warnings() == [] and "10.00 %" in str(found.table())
     policy = Known(1, 1)
-    assert looked(policy, 200).frames == FRAMES and policy.asked == 2 * FRAMES  # it is cheap
+    assert looked(policy, 200).frames == FRAMES and policy.asked == FRAMES  # it is cheap
     with pytest.raises(PolicyError):
         looked(policy, 1)  # one frame cannot be swapped
 
@@ -65,6 +65,27 @@ def test_how_far_a_plan_moves():
 def test_what_must_be_known_before_it_drives(policy, says):
     warnings = looked(policy).warnings()
     assert len(warnings) == (says is not None) and (says is None or says in warnings[0])
+
+
+class Turns(Known):
+    """Follows the picture with its steering alone."""
+
+    def __init__(self):
+        super().__init__(looks=np.array([0.4, 0]), copies=0)
+
+
+def test_how_far_a_plan_moves_if_its_picture_is_older():
+    """The k-th frame shows k: a picture that is 33 ms older moves steering by 0.004, which is 0.4 % of its range."""
+    samples = [
+        SimpleNamespace(
+            frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8), state=np.zeros(2), episode="a", row=k, time_s=k / 30
+        )
+        for k in range(60)
+    ]
+    found = look(Turns(), fidelity(Turns(), {}, samples[1::2], RANGE), samples)
+    assert found.summary()["steering_by_100_ms_pct"] == pytest.approx(3 * 0.4)
+    assert found.summary()["throttle_by_100_ms_pct"] == 0
+    assert looked(Turns()).moved_pct["steering"]["by_100_ms"] == 0  # no older picture is known
 
 
 def test_an_action_that_never_changes_is_not_judged():

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rover_lib.onboard.car.car import Car
 from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.judge.guesses import LEAST_EPISODES, against_guesses
 
@@ -37,7 +36,6 @@ def judge(plan, episodes=6, action_range=RANGE, rise=200):
         chunks={},
         recorded=np.stack([s.chunk for s in samples]),
         is_pad=np.stack([s.is_pad for s in samples]),
-        car=Car(),
     )
     return against_guesses(report, [s for e in range(10, 14) for s in drive(e, rise=rise)])
 

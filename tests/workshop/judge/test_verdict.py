@@ -91,14 +91,14 @@ def test_a_throttle_that_misses_its_gate_is_healed_by_mixed(demo):
     demo["quantize"]["clipped"] = {"layer": "image_project", "clipped_pct": 7.0}
     judged = judge(demo)
     (failed,) = judged["failed"]
-    assert judged["deploy"] == "mixed" and (failed["found"], failed["limit"]) == (2.8, 1.0)
+    assert judged["deploy"] == "mixed" and (failed["found"], failed["limit"]) == (2.8, PARAMS["gates"]["error_pct"])
     worst = [w["episode"] for w in demo["compare"]["worst"] if (w["mode"], w["action"]) == ("static", "throttle")]
     for part in ("Mixed fixes it", "encoder.0.attention", "head: 2.50 %", worst[0]):
         assert part in "\n".join(failed["remedies"])
     assert any("image_project clips 7.0 %" in line for line in judged["cautions"])
     demo["quantize"]["modes"]["static"]["scheme"]["observer"] = "frames"  # it clips on purpose
     assert not any("clips" in line for line in judge(demo)["cautions"])
-    assert "throttle error" in because(judged, "static")
+    assert "error, % of the recorded range: 2.8" in because(judged, "static")
 
 
 def test_a_mixed_beside_a_static_that_keeps_its_gates_is_not_worth_its_time(demo):
@@ -181,7 +181,7 @@ def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):
     assert [row["gate"] for row in judged["failed"]] == ["static floor_ms"] and judged["deploy"] == "static"
     demo["compare"]["modes"]["static"]["size_mb"] = 120.0
     failed, _ = judge(demo)["failed"]  # not once more by the original's limit
-    assert failed["limit"] == PARAMS["gates"]["size_full_mb"]
+    assert failed["limit"] == PARAMS["gates"]["size_mb"]["static"]
     assert "--size 64x36 --name mine-small" in failed["remedies"][0]
 
 

@@ -8,6 +8,7 @@ from html import unescape
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
@@ -118,6 +119,10 @@ def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
         text = report.write_card(run_dir).read_text()
     assert text.startswith("---\nlibrary_name: lerobot\n") and content["headline"] in text
     assert f"`rover drive {content['artifact']}`" in text and all(line in text for line in content["cautions"])
+    assert "license" not in text  # none is invented
+    text = report.write_card(run_dir, license="mit\n---", base_model="me/act").read_text()
+    head = yaml.safe_load(text.split("\n---\n")[0])
+    assert head["license"] == "mit\n---" and head["base_model_relation"] == "quantized"
     (run_dir / "README.md").write_text("mine")
     with pytest.raises(RoverError, match="is not a card"):
         report.write_card(run_dir)
