@@ -20,6 +20,7 @@ from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.names import read_as_car, settle_names
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -215,7 +216,7 @@ def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[st
     """Return the state's own names; the user's names of the actions if it has none, or the same as the actions."""
     own = _names(features[STATE])
     if own and not (said and own == _names(features[ACTION])):
-        return own
+        return (read_as_car(own) or own) if said else own
     (size,) = features[STATE]["shape"]
     if said and size != len(said):  # such numbers are not actions, and their names matter nowhere
         return tuple(f"state_{i}" for i in range(size))
@@ -227,7 +228,8 @@ def _name_numbers(
 ) -> tuple[tuple[str, ...], tuple[int, ...]]:
     """Return the names of a feature's numbers, and their columns: [steering, throttle] for a car, else as they lie."""
     (size,) = features[key]["shape"]
-    names = said or _names(features[key])
+    own = _names(features[key])
+    names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
     if not names:
         example = ACTION_NAMES if size == len(ACTION_NAMES) else [f"joint_{i}" for i in range(1, size + 1)]
         remedy = f"name them in the order of the numbers: --action-names {','.join(example)}"
