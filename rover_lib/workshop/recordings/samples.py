@@ -65,6 +65,7 @@ class Layout:
     state_order: tuple[int, ...] = (0, 1)
     action_order: tuple[int, ...] = (0, 1)
     image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
+    has_state: bool = True  # else no state is recorded, and it is the last action
 
     def words(self) -> str:
         """Describe the layout in one line, in which users should recognise their own car."""
@@ -75,6 +76,8 @@ class Layout:
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
         state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
+        if not self.has_state:
+            state = f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
 

@@ -74,8 +74,8 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (info(codebase_version="v2.1"), "LeRobot's own convert_dataset_v21_to_v30"),
-        (info(codebase_version="v4.0"), "only v3"),
+        (info(codebase_version="v1.6"), "only v2 and v3"),
+        (info(codebase_version="v4.0"), "only v2 and v3"),
         (info(fps=0), "frames per second"),
         ("[" * 100_000, "JSON"),
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
@@ -84,9 +84,9 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
         (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
-        (features(action=TWO | {"names": {"steering": 1, "throttle": 0}}), "'action' does not name its 2 numbers"),
+        (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
-        (features(), "has no meta/tasks.parquet"),
+        (features(), "has no meta/episodes"),
         (features(**{"observation.images.x/../../../outside": info()["features"]["action"]}), "plain features"),
         (features(**{f"f{i}": TWO for i in range(40_000)}), "plain features"),
         (info(data_path="../elsewhere/{chunk_index}"), "plain features"),
@@ -241,11 +241,11 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
 @pytest.mark.parametrize(
     ("kind", "file", "damage", "says"),
     [
-        ("image", DATA, lambda p: p.unlink(), "has no data/*/*.parquet"),
-        ("image", EPISODES_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "LeRobot cannot read it"),
+        ("image", DATA, lambda p: p.unlink(), "has no data/chunk-000/file-000.parquet"),
+        ("image", EPISODES_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be read"),
         ("video", VIDEO_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be decoded"),
         # what LeRobot accepts without a word
-        ("image", EPISODES_AT, column("dataset_to_index", 33), "belong together"),
+        ("image", EPISODES_AT, column("length", 33), "belong together"),
         ("image", DATA, column("frame_index", 1), "belong together"),
         ("image", DATA, column("timestamp", 2.0), "frames come at another rate"),
         ("image", DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "neither PNG nor JPEG"),
