@@ -20,7 +20,7 @@ from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.names import read_as_car, settle_names
+from rover_lib.workshop.recordings.names import flat_names, read_as_car, settle_names
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -244,14 +244,10 @@ def _name_numbers(
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names in a feature, a list, or a list under one word; () if there are none."""
-    names = feature.get("names")
-    if isinstance(names, dict) and len(names) == 1:
-        return _names({"names": next(iter(names.values()))})  # {"motors": [...]}
-    if isinstance(names, list) and names and all(isinstance(n, str) for n in names):
-        bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
-        return bare if set(bare) == set(ACTION_NAMES) else tuple(names)
-    return ()
+    """Return the names of a feature's numbers; () if there are none."""
+    names = flat_names(feature.get("names"))
+    bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
+    return bare if set(bare) == set(ACTION_NAMES) else names
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:

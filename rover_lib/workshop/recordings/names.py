@@ -1,7 +1,8 @@
 """What the names of actions mean: the car's own names, other people's words for the same, or another robot's."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording.episode import CHANNELS
@@ -11,6 +12,17 @@ OTHER_WORDS = {
     "steering": {"steering", "steer", "angle", "angular", "turn", "yaw", "rudder"},
     "throttle": {"throttle", "gas", "speed", "linear", "accelerator", "acceleration", "forward"},
 }
+
+
+def flat_names(names: Any) -> tuple[str, ...]:
+    """Return the names in a list, in a list of a list, or in either under one word; () if there are none."""
+    if isinstance(names, Mapping) and len(names) == 1:
+        return flat_names(next(iter(names.values())))  # {"motors": [...]}
+    if not isinstance(names, (list, tuple)) or not names:
+        return ()
+    if len(names) == 1 and isinstance(names[0], (list, tuple)):
+        return flat_names(names[0])
+    return tuple(names) if all(isinstance(name, str) for name in names) else ()
 
 
 def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
