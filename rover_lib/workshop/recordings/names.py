@@ -1,7 +1,8 @@
 """What the names of actions mean: the car's own names, other people's words for the same, or another robot's."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording.episode import CHANNELS
@@ -11,6 +12,19 @@ OTHER_WORDS = {
     "steering": {"steering", "steer", "angle", "angular", "turn", "yaw", "rudder"},
     "throttle": {"throttle", "gas", "speed", "linear", "accelerator", "acceleration", "forward"},
 }
+
+
+def flat_names(names: Any, depth: int = 4) -> tuple[str, ...]:
+    """Return the names in a list, in lists of lists, under words, or with each one's number; () if there are none."""
+    if isinstance(names, Mapping) and sorted(map(repr, names.values())) == sorted(map(repr, range(len(names)))):
+        return tuple(sorted(names, key=names.__getitem__))  # {"throttle": 0, "steering": 1}
+    parts = list(names.values()) if isinstance(names, Mapping) else names
+    if not isinstance(parts, (list, tuple)) or not depth:
+        return ()
+    if all(isinstance(part, str) for part in parts):
+        return () if isinstance(names, Mapping) else tuple(parts)
+    flat = [flat_names(part, depth - 1) for part in parts]  # {"motors": [...]}, [["throttle", "steering"]]
+    return tuple(name for part in flat for name in part) if all(flat) else ()
 
 
 def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
