@@ -59,7 +59,7 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
             return simplejpeg.decode_jpeg(data, colours, **scale)
         except ValueError as error:
             return simplejpeg.decode_jpeg(_check_only_filler(data, error), colours, strict=False, **scale)
-    except ValueError as error:
+    except (ValueError, KeyError) as error:  # KeyError: a header without colours
         raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
 
 

@@ -28,6 +28,7 @@ from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.names import flat_names, read_as_car, settle_names
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
@@ -60,6 +61,7 @@ STATE, ACTION = "observation.state", "action"
 ALSO = {STATE: "state", ACTION: "actions"}  # openpi's words for the same
 NUMBERS = ("timestamp", "frame_index", "episode_index", "index")
 TASK = "task_index"
+STATS = "meta/episodes_stats.jsonl"  # of version 2.1
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
 REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
 DRIVEN_BY = "driven_by"  # who drove where nobody intervened
@@ -201,6 +203,8 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
             )
             torn = {row for row in rows if any(camera.is_torn(row) for camera in cameras.values())}
     faults.add(root, "broken_jpeg", "pictures that are torn or damaged", len(torn))
+    if str(info["codebase_version"]).startswith("v2.1") and not (root / STATS).exists():
+        faults.add(root / STATS, "no_statistics", f"{STATS} is missing: LeRobot's converter to version 3 would fail")
     tasks = _read_tasks(root)
     episodes = []
     for entry in progress(entries, desc="reading episodes", total=len(entries)):
@@ -209,7 +213,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     last = {e.samples[-1].frame_path: e.samples[-1] for e in episodes}
     for sample in last.values():  # the last picture of each file, because a file that was cut lacks its end
         sample.frame_bgr()
-    return Recordings(root, tuple(episodes), faults.listed(), source, layout)
+    return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source, layout)
 
 
 def _read_export(root: Path, episodes: int, marked: bool, faults: Faults) -> tuple[list[str], Car]:
@@ -269,7 +273,9 @@ def _layout(
     features = info["features"]
     keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
-        raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
+        raise EpisodeError(
+            f"{root}: has no camera", found=quote_all(features) or "nothing", remedy="record one that sees"
+        )
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names or len(set(names)) < len(names):

@@ -20,7 +20,10 @@ LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times", "reverse_on_a_car_without")
+REPAIRED = (
+    *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
+    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
+)
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 

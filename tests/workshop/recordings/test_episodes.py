@@ -32,12 +32,16 @@ def throttle_at(t_s):
 
 
 def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
-    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
+    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them.
+
+    Its name's last two digits choose the drive: the same drive twice is left out.
+    """
+    later_s = 0.717 * int(name[-2:])
     folder = root / name
     with EpisodeWriter(folder, About("hit red balloon"), resolution=(32, 18)) as writer:
         for i in range(round((frames / 30 + 0.2) / 0.033)):
             t_s = i * 0.033
-            pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
+            pulses = PWM.pulses(steering_at(t_s + later_s), throttle_at(t_s + later_s))
             writer.control(start_s + t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
         for i in range(frames):
             writer.frame(start_s + 0.1 + i / 30, FRAME)

@@ -98,7 +98,9 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
 
 def test_a_folder_of_datasets_is_recognised(tmp_path):
     written(tmp_path / "a", info())
-    assert "give one LeRobotDataset" in refused(tmp_path)
+    assert f"a folder of 1 LeRobotDatasets, not our recordings; give one of them, such as {tmp_path / 'a'}" in refused(
+        tmp_path
+    )
 
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
