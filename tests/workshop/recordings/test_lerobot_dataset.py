@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import replace
 
+import hostile
 import numpy as np
 import pyarrow
 import pytest
@@ -262,6 +263,119 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
     root = copied(kind)
     damage(root / file)
     assert says in refused(root)
+
+
+# ---- what others write in another way ------------------------------------------------------------------------------
+
+
+def table(path, change):
+    parquet.write_table(change(parquet.read_table(path)), path)
+
+
+def language(root):
+    """A column of LeRobot 0.6, whose type 0.4 does not know."""
+    said = [[{"role": "assistant", "content": "drive"}]] * 33
+    table(root / DATA, lambda t: t.append_column("language_persistent", pyarrow.array(said)))
+    more = {"language_persistent": {"dtype": "language", "shape": [1], "names": None}}
+    edit(root / "meta/info.json", lambda c: c["features"].update(more))
+
+
+def openpi(root):
+    words = {"action": "actions", "observation.state": "state", CAM: "image"}
+    table(root / DATA, lambda t: t.rename_columns([words.get(c, c) for c in t.column_names]))
+    edit(root / "meta/info.json", lambda c: c.update(features={words.get(k, k): v for k, v in c["features"].items()}))
+
+
+def leftovers(root):
+    """A Mac's, Windows', notebooks', and a copy beside the file."""
+    for name in ("._file-000.parquet", ".DS_Store", "Thumbs.db", "desktop.ini", "file-000 (1).parquet"):
+        for folder in ("data/chunk-000", "meta/episodes/chunk-000", "data/.ipynb_checkpoints", "meta"):
+            (root / folder).mkdir(exist_ok=True)
+            (root / folder / name).write_bytes(b"\0\5\26\7" + bytes(60))
+
+
+def version_2(root):
+    """As LeRobot of early 2025 wrote it, and without the statistics that its converter needs."""
+    rows, episodes = parquet.read_table(root / DATA), parquet.read_table(root / EPISODES_AT).to_pylist()
+    for i, episode in enumerate(episodes):
+        part = rows.slice(episode["dataset_from_index"], episode["length"])
+        parquet.write_table(part, root / f"data/chunk-000/episode_{i:06d}.parquet")
+    for name, keys in (("episodes", ("episode_index", "length")), ("tasks", ("task_index", "task"))):
+        told = (
+            episodes
+            if name == "episodes"
+            else [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
+        )
+        lines = [json.dumps({key: row[key] for key in keys}) for row in told]
+        (root / f"meta/{name}.jsonl").write_text("\n".join(lines) + "\n")
+    path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    edit(root / "meta/info.json", lambda c: c.update(codebase_version="v2.1", data_path=path))
+
+
+def tasks_in_a_column(root):
+    words = [f"hit the {i}. balloon" for i in range(EPISODES)]
+    parquet.write_table(pyarrow.table({"task_index": range(EPISODES), "task": words}), root / "meta/tasks.parquet")
+
+
+OTHERS_WAYS = [
+    (language, set()),
+    (lambda root: table(root / DATA, lambda t: t.append_column("__index_level_0__", pyarrow.array(range(33)))), set()),
+    (tasks_in_a_column, set()),
+    (leftovers, set()),
+    (openpi, set()),
+    (lambda root: column("dataset_to_index", 10, 2)(root / EPISODES_AT), {"scrambled_index"}),
+    (version_2, {"no_statistics"}),
+    (lambda root: edit(root / "meta/info.json", lambda c: c["features"]["action"].update(names=[[*CAR]])), set()),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("change", "faults"), OTHERS_WAYS)
+def test_what_others_write_in_another_way_is_read_the_same(datasets, copied, change, faults):
+    root, right = copied(), load_recordings(datasets(), CHUNK)
+    change(root)
+    found = load_recordings(root, CHUNK)
+    assert {fault.kind for fault in found.faults} == faults
+    assert [e.label for e in found.episodes] == [e.label for e in right.episodes]
+    for ours, theirs in zip(found.samples, right.samples, strict=True):
+        assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk, theirs.chunk)
+        assert np.array_equal(ours.frame_bgr(), theirs.frame_bgr())
+
+
+@pytest.mark.slow
+def test_without_a_state_it_is_the_last_action(copied):
+    root = copied()
+    column("observation.state")(root / DATA)
+    edit(root / "meta/info.json", lambda c: c["features"].pop("observation.state"))
+    recordings = load_recordings(root, CHUNK)
+    assert "state: none recorded, taken as the last action" in recordings.layout.words()
+    for episode in recordings.episodes:
+        states = [s.state.tolist() for s in episode.samples]
+        assert states == [[0, 0], *(s.chunk[0].tolist() for s in episode.samples[:-1])]
+
+
+@pytest.mark.slow
+def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
+    """PIL and OpenCV make a picture of a torn one; a dataset merged with itself judges what it has calibrated."""
+    root = copied()
+    whole = hostile.jpeg(hostile.scene(size=SIZE[::-1]))
+    pictures = [hostile.jpeg(hostile.scene(seed, SIZE[::-1])) for seed in range(32)] + [hostile.cut(whole)]
+
+    def change(t):
+        at = t.column_names.index(CAM)
+        column = pyarrow.array([{"bytes": data, "path": None} for data in pictures], t.schema.field(CAM).type)
+        actions = t.column("action").to_pylist()
+        actions[10:20] = actions[:10]
+        t = t.set_column(
+            t.column_names.index("action"), "action", pyarrow.array(actions, t.schema.field("action").type)
+        )
+        return t.set_column(at, CAM, column)
+
+    pictures[10:20] = pictures[:10]
+    table(root / DATA, change)
+    recordings = load_recordings(root, CHUNK)
+    assert {fault.kind: fault.count for fault in recordings.faults} == {"broken_jpeg": 1, "copy": 1}
+    assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
 
 
 def edit(path, change):
