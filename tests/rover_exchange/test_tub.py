@@ -155,6 +155,17 @@ def test_what_is_broken_is_counted(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_folder_of_tubs_is_named_with_a_command_that_works(tmp_path):
+    for i in range(2):
+        tub(tmp_path / f"tubs/tub_{i}", records(20))
+    refusal = CliRunner().invoke(main, ["export-dataset", str(tmp_path / "tubs"), str(tmp_path / "out")])
+    assert refusal.exit_code == 1 and "a folder of 2 donkeycar tubs" in refusal.output
+    words = refusal.output.partition("; rover ")[2].partition(",")[0].replace("OUT", str(tmp_path / "out")).split()
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.output
+
+
+@pytest.mark.slow
 def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatch):
     from rover_lib.workshop.recordings.episodes import load_recordings
 

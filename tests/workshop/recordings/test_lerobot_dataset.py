@@ -3,8 +3,10 @@
 import functools
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import hostile
 import numpy as np
@@ -340,6 +342,72 @@ def test_what_others_write_in_another_way_is_read_the_same(datasets, copied, cha
     for ours, theirs in zip(found.samples, right.samples, strict=True):
         assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk, theirs.chunk)
         assert np.array_equal(ours.frame_bgr(), theirs.frame_bgr())
+
+
+def named(**names):
+    def change(root):
+        said = {"action": names["action"], "observation.state": names["state"]}
+        edit(root / "meta/info.json", lambda c: [c["features"][key].update(names=said[key]) for key in said])
+
+    return change
+
+
+def second_camera(root):
+    table(root / DATA, lambda t: t.append_column("observation.images.left", t.column(CAM)))
+    edit(root / "meta/info.json", lambda c: c["features"].update({"observation.images.left": c["features"][CAM]}))
+
+
+def other_key(root):
+    edit(root / "meta/info.json", lambda c: c["features"].update(act=c["features"].pop("action")))
+
+
+def as_printed(message, root, whole):
+    """Do what a refusal's remedy says, and return what is to be read then."""
+    if given := re.search(r"--action-names ([a-z_0-9]+,[a-z_0-9]+)", message.partition(";")[2]):
+        return Source.of(root, given[1])
+    if "--camera NAME" in message:
+        return Source.of(root, camera=re.search(r"found (\w+),", message)[1])
+    if found := re.search(r"such as (.+)$", message):
+        return Path(found[1])
+    if "name its column 'action'" in message:
+        edit(root / "meta/info.json", lambda c: c["features"].update(action=c["features"].pop("act")))
+    elif "correct the rate" in message:
+        edit(root / "meta/info.json", lambda c: c.update(fps=FPS))
+    else:
+        assert message.endswith("copy the whole dataset again")
+        shutil.rmtree(root)
+        shutil.copytree(whole, root)
+    return root
+
+
+TRIGGERS = [
+    (named(action=None, state=None), (0, 1)),
+    (named(action=[*SWAPPED], state=None), (1, 0)),
+    (named(action=None, state=[[*SWAPPED]]), (1, 0)),
+    (named(action=["Throttle", "Steering"], state=["Throttle", "Steering"]), (1, 0)),
+    (named(action=["linear.vel", "angular.vel"], state=["linear.vel", "angular.vel"]), (1, 0)),
+    (second_camera, (0, 1)),
+    (other_key, (0, 1)),
+    (lambda root: edit(root / "meta/info.json", lambda c: c.update(fps=30)), (0, 1)),
+    (lambda root: (root / DATA).unlink(), (0, 1)),
+    (lambda root: (root / EPISODES_AT).write_bytes(b"PAR1"), (0, 1)),
+    (column("length", 33), (0, 1)),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("trigger", "order"), TRIGGERS)
+def test_the_printed_remedy_works_on_what_it_is_printed_for(datasets, copied, trigger, order):
+    root = copied()
+    trigger(root / EPISODES_AT if trigger is TRIGGERS[-1][0] else root)
+    recordings = load_recordings(as_printed(refused(root), root, datasets()), CHUNK)
+    assert recordings.layout.action_order == order and len(recordings.samples) == 33
+
+
+@pytest.mark.slow
+def test_one_of_a_folder_of_datasets_can_be_given_as_printed(copied, tmp_path):
+    copied()
+    assert len(load_recordings(as_printed(refused(tmp_path), tmp_path, None), CHUNK).samples) == 33
 
 
 @pytest.mark.slow
