@@ -66,7 +66,6 @@ INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a h
 REPORT = "rover_export.json"  # beside a dataset of our own; of each episode it says:
 DRIVEN_BY = "driven_by"  # who drove where nobody intervened
 CAR = "car"  # and of them all, the content of their car.yml
-COPY_AGAIN = "copy the whole dataset again"
 UNEVEN = 0.1  # the time between two frames may differ by this share
 JPEG = b"\xff\xd8"
 OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-000-checkpoint.parquet"
@@ -74,7 +73,7 @@ OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-
 
 def _broken(what: str, found: object = None) -> EpisodeError:
     """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
-    return EpisodeError(f"{what}: a broken dataset", found=found, remedy=COPY_AGAIN)
+    return EpisodeError(f"{what}: a broken dataset", found=found, remedy="copy the whole dataset again")
 
 
 def is_dataset(root: Path) -> bool:
@@ -94,18 +93,18 @@ class _Camera:
     paths: Sequence[Path]
     places: Sequence[Any]
 
-    def encoded(self, row: int) -> bytes | None:
-        """The bytes of a picture in a table; None if there are none, or it is in a video."""
+    def encoded(self, row: int) -> bytes:
+        """The bytes of a picture in a table; none if there is none, or it is in a video."""
         if isinstance(self.places[row], float):
-            return None
+            return b""
         group, within = self.places[row]
-        return (_row_group(self.paths[row], group, self.key)[within].as_py() or {}).get("bytes")
+        return (_row_group(self.paths[row], group, self.key)[within].as_py() or {}).get("bytes") or b""
 
     def is_torn(self, row: int) -> bool:
         """Whether a picture is a torn JPEG, of which most decoders make a picture."""
+        data = self.encoded(row)
         try:
-            data = self.encoded(row)
-            return bool(data and data.startswith(JPEG) and not check_jpeg(data))
+            return data.startswith(JPEG) and not check_jpeg(data)
         except CameraError:
             return True
 
@@ -194,14 +193,15 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
         with limited_memory(3 * sum(path.stat().st_size for path in files)):
             columns = _columns(files, info["features"], layout)
             starts = _check_frames(root, info["fps"], entries, columns, faults)
-            cameras = {name: _camera(root, info, key, size, entries, columns) for name, (key, size) in keys.items()}
+            cameras = {
+                name: _camera(root, info, key, size, entries, columns["timestamp"])
+                for name, (key, size) in keys.items()
+            }
             drivers, car = _read_export(root, len(starts), INTERVENTION in columns, faults)
             _check_numbers(root, columns, layout, car)
-            # LeRobot itself writes PNG; others' pictures are of one kind.
-            rows = range(
-                len(columns["index"]) if any((c.encoded(0) or b"").startswith(JPEG) for c in cameras.values()) else 0
-            )
-            torn = {row for row in rows if any(camera.is_torn(row) for camera in cameras.values())}
+            # A camera's pictures are of one kind, and a torn PNG is never decoded.
+            in_jpeg = [camera for camera in cameras.values() if camera.encoded(0).startswith(JPEG)]
+            torn = {row for camera in in_jpeg for row in range(len(columns["index"])) if camera.is_torn(row)}
     faults.add(root, "broken_jpeg", "pictures that are torn or damaged", len(torn))
     if str(info["codebase_version"]).startswith("v2.1") and not (root / STATS).exists():
         faults.add(root / STATS, "no_statistics", f"{STATS} is missing: LeRobot's converter to version 3 would fail")
@@ -317,7 +317,11 @@ def _name_numbers(
     own = _names(features[key])
     names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
     if not names:
-        remedy = f"name them in the order of the numbers: --action-names {_example_of_names(features, key, size)}"
+        examples = [_names(features.get(ACTION if key == STATE else STATE, {}))]  # the others' order, if they have one
+        if len(examples[0]) != size:
+            # Of a car both orders: the user must not just copy one.
+            examples = [ACTION_NAMES, ACTION_NAMES[::-1]] if size == 2 else [[f"joint_{i}" for i in range(1, size + 1)]]
+        remedy = f"name them in the order of the numbers: --action-names {', or '.join(map(','.join, examples))}"
         found = quote(features[key].get("names"))
         raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
     if len(names) != size or len(set(names)) != size:
@@ -326,16 +330,6 @@ def _name_numbers(
     if set(names) == set(ACTION_NAMES):
         return ACTION_NAMES, tuple(names.index(name) for name in ACTION_NAMES)
     return names, tuple(range(size))
-
-
-def _example_of_names(features: Mapping[str, Any], key: str, size: int) -> str:
-    """The order of the other numbers' names, else both orders of a car's: the user must not just copy one."""
-    other = _names(features.get(ACTION if key == STATE else STATE, {}))
-    if len(other) == size:
-        return ",".join(other)
-    if size == len(ACTION_NAMES):
-        return f"{','.join(ACTION_NAMES)}, or {','.join(reversed(ACTION_NAMES))}"
-    return ",".join(f"joint_{i}" for i in range(1, size + 1))
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
@@ -387,11 +381,9 @@ def _entry(root: Path, info: Mapping[str, Any], row: Mapping[str, Any]) -> _Entr
     videos = {}
     for key, feature in info["features"].items():
         if feature.get("dtype") == "video":
-            ends_s = (
-                row.get(f"videos/{key}/from_timestamp", 0.0),
-                row.get(f"videos/{key}/to_timestamp", length / info["fps"]),
-            )
-            videos[key] = path_of("video_path", f"videos/{key}", video_key=key), *ends_s
+            file, first_s = f"videos/{key}", row.get(f"videos/{key}/from_timestamp", 0.0)
+            last_s = row.get(f"videos/{key}/to_timestamp", length / info["fps"])
+            videos[key] = path_of("video_path", file, video_key=key), first_s, last_s
     ends = row.get("dataset_from_index"), row.get("dataset_to_index")
     return _Entry(number, length, ends, path_of("data_path", "data"), videos)
 
@@ -440,27 +432,25 @@ def _check_files(
             raise _broken(f"{root}: has no {path.relative_to(root)}")
         check_inside(root, path)
         refuse_pointer(path, EpisodeError)
-    read = {*NUMBERS, STATE, ACTION, TASK, INTERVENTION, *cameras}
-    used = {feature.get("column", name) for name, feature in features.items() if name in read}
-    used -= {name for name, feature in features.items() if feature.get("dtype") == "video"}
+    used = {*_keys(features).values(), *(key for key in cameras if features[key]["dtype"] == "image")}
     for path in files:
         with _as_episode_error(f"{path}: cannot be read"):
-            there = check_table(path)
-        if missing := ({*NUMBERS} | used) - {*there}:
-            what = f"{path}: its columns are not those of {INFO}"
-            raise _broken(what, quote_all(sorted(missing)))
+            missing = used - {*check_table(path)}
+        if missing:
+            raise _broken(f"{path}: its columns are not those of {INFO}", quote_all(sorted(missing)))
     return files
 
 
+def _keys(features: Mapping[str, Any]) -> dict[str, str]:
+    """The columns of numbers that are read, by LeRobot's keys of them."""
+    others = [key for key in (STATE, ACTION, TASK, INTERVENTION) if key in features]
+    return {key: key for key in NUMBERS} | {key: features[key].get("column", key) for key in others}
+
+
 def _camera(
-    root: Path,
-    info: Mapping[str, Any],
-    key: str,
-    size: tuple[int, int],
-    entries: Sequence[_Entry],
-    columns: Mapping[str, np.ndarray],
+    root: Path, info: Mapping[str, Any], key: str, size: tuple[int, int], entries: Sequence[_Entry], times_s: np.ndarray
 ) -> _Camera:
-    """Find each row's picture of a camera."""
+    """Find each row's picture of a camera. times_s: each row's in its episode."""
     from pyarrow import parquet
 
     paths: list[Path] = []
@@ -468,16 +458,14 @@ def _camera(
     if info["features"][key]["dtype"] == "video":
         _check_videos(root, info["fps"], key, size, entries)
         for entry in entries:
-            path, first_s, _ = entry.videos[key]
-            paths += [path] * entry.length
-            places += [first_s] * entry.length
-        return _Camera(key, size, paths, (np.array(places) + columns["timestamp"]).tolist())
+            paths += [entry.videos[key][0]] * entry.length
+            places += [entry.videos[key][1]] * entry.length
+        return _Camera(key, size, paths, (np.array(places) + times_s).tolist())
     for path in dict.fromkeys(entry.data for entry in entries):
         table = parquet.read_metadata(path)
+        paths += [path] * table.num_rows
         for group in range(table.num_row_groups):
-            count = table.row_group(group).num_rows
-            paths += [path] * count
-            places += [(group, within) for within in range(count)]
+            places += [(group, within) for within in range(table.row_group(group).num_rows)]
     return _Camera(key, size, paths, places)
 
 
@@ -518,12 +506,7 @@ def _columns(files: Sequence[Path], features: Mapping[str, Any], layout: Layout)
     """All frames' numbers, in their order: state (n, S) and action (n, A) float32 by the layout's names, and times."""
     from pyarrow import parquet
 
-    keys = {
-        key: features[key].get("column", key)
-        for key in (*NUMBERS, TASK, ACTION, STATE, INTERVENTION)
-        if key in features
-    }
-    keys |= {key: key for key in NUMBERS}
+    keys = _keys(features)
     tables = [parquet.ParquetFile(path).read(columns=list(keys.values())) for path in files]
     columns = {
         key: np.concatenate([_numbers(table.column(column)) for table in tables]) for key, column in keys.items()
