@@ -29,7 +29,7 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.controls import Faults
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.names import flat_names, read_as_car, settle_names
+from rover_lib.workshop.recordings.names import ACTION, STATE, name_actions, name_states
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -57,7 +57,6 @@ MOST_FEATURES = 200  # an arm with six cameras has 20
 PICTURE_PIXELS = 4608 * 2592  # at most: a Pi camera's largest
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 TOLERANCE_S = 1e-4  # LeRobot's, between a frame's time and that of a picture in its video
-STATE, ACTION = "observation.state", "action"
 ALSO = {STATE: "state", ACTION: "actions"}  # openpi's words for the same
 NUMBERS = ("timestamp", "frame_index", "episode_index", "index")
 TASK = "task_index"
@@ -291,52 +290,11 @@ def _layout(
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"record one, or name its column '{key}'")
     sizes = {name: size for name, (_, size) in cameras.items()}
-    actions, action_order = _name_numbers(root, features, ACTION, source.action_names)
+    actions, action_order = name_actions(root, features, source.action_names)
     states, state_order, has_state = actions, action_order, STATE in features
     if has_state:
-        states, state_order = _name_numbers(root, features, STATE, _state_names(features, source.action_names))
+        states, state_order = name_states(root, features, source.action_names)
     return Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state), cameras
-
-
-def _state_names(features: Mapping[str, Any], said: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the state's own names; the user's names of the actions if it has none, or the same as the actions."""
-    own = _names(features[STATE])
-    if own and not (said and own == _names(features[ACTION])):
-        return (read_as_car(own) or own) if said else own
-    (size,) = features[STATE]["shape"]
-    if said and size != len(said):  # such numbers are not actions, and their names matter nowhere
-        return tuple(f"state_{i}" for i in range(size))
-    return said
-
-
-def _name_numbers(
-    root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]
-) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Return the names of a feature's numbers, and their columns: [steering, throttle] for a car, else as they lie."""
-    (size,) = features[key]["shape"]
-    own = _names(features[key])
-    names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
-    if not names:
-        examples = [_names(features.get(ACTION if key == STATE else STATE, {}))]  # the others' order, if they have one
-        if len(examples[0]) != size:
-            # Of a car both orders: the user must not just copy one.
-            examples = [ACTION_NAMES, ACTION_NAMES[::-1]] if size == 2 else [[f"joint_{i}" for i in range(1, size + 1)]]
-        remedy = f"name them in the order of the numbers: --action-names {', or '.join(map(','.join, examples))}"
-        found = quote(features[key].get("names"))
-        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
-    if len(names) != size or len(set(names)) != size:
-        what = f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}"
-        raise EpisodeError(what, remedy="name each once: --action-names with commas between")
-    if set(names) == set(ACTION_NAMES):
-        return ACTION_NAMES, tuple(names.index(name) for name in ACTION_NAMES)
-    return names, tuple(range(size))
-
-
-def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of a feature's numbers; () if there are none."""
-    names = flat_names(feature.get("names"))
-    bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
-    return bare if set(bare) == set(ACTION_NAMES) else names
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:

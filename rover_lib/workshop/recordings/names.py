@@ -2,12 +2,15 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.errors import EpisodeError, RoverError
 from rover_lib.onboard.recording.episode import CHANNELS
-from rover_lib.workshop.untrusted import quote_all
+from rover_lib.workshop.untrusted import quote, quote_all
 
+STATE, ACTION = "observation.state", "action"
+Named = tuple[tuple[str, ...], tuple[int, ...]]  # names and their columns: a car's [steering, throttle], or as they lie
 OTHER_WORDS = {
     "steering": {"steering", "steer", "angle", "angular", "turn", "yaw", "rudder"},
     "throttle": {"throttle", "gas", "speed", "linear", "accelerator", "acceleration", "forward"},
@@ -52,3 +55,47 @@ def settle_names(
     if meant and meant != own and not said:
         raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=f"if they are, say {say}")
     return said or own
+
+
+def name_actions(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
+    """Return a dataset's names of its actions, or those `said` by the user, as `Named` has them."""
+    return _name_numbers(root, features, ACTION, said)
+
+
+def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
+    """The same of its states: the user's names of the actions if they have none, or the same as the actions."""
+    own = _names(features[STATE])
+    (size,) = features[STATE]["shape"]
+    if own and not (said and own == _names(features[ACTION])):
+        said = (read_as_car(own) or own) if said else own
+    elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
+        said = tuple(f"state_{i}" for i in range(size))
+    return _name_numbers(root, features, STATE, said)
+
+
+def _name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
+    (size,) = features[key]["shape"]
+    own = _names(features[key])
+    names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
+    if not names:
+        # The other numbers' order, if they have one.
+        examples: list[Sequence[str]] = [_names(features.get(ACTION if key == STATE else STATE, {}))]
+        if len(examples[0]) != size:
+            # Of a car both orders: the user must not just copy one.
+            examples = [CHANNELS, CHANNELS[::-1]] if size == 2 else [[f"joint_{i}" for i in range(1, size + 1)]]
+        remedy = f"name them in the order of the numbers: --action-names {', or '.join(map(','.join, examples))}"
+        found = quote(features[key].get("names"))
+        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
+    if len(names) != size or len(set(names)) != size:
+        what = f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}"
+        raise EpisodeError(what, remedy="name each once: --action-names with commas between")
+    if set(names) == set(CHANNELS):
+        return CHANNELS, tuple(names.index(name) for name in CHANNELS)
+    return names, tuple(range(size))
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of a feature's numbers; () if there are none."""
+    names = flat_names(feature.get("names"))
+    bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
+    return bare if set(bare) == set(CHANNELS) else names
