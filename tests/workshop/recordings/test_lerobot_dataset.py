@@ -99,13 +99,6 @@ def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
     assert says in refused(written(tmp_path, content))
 
 
-def test_a_folder_of_datasets_is_recognised(tmp_path):
-    written(tmp_path / "a", info())
-    assert f"a folder of 1 LeRobotDatasets, not our recordings; give one of them, such as {tmp_path / 'a'}" in refused(
-        tmp_path
-    )
-
-
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
     assert "has no camera 'left', found front" in refused(Source.of(written(tmp_path, info()), camera="left"))
     assert "once each" in refused(Source.of(tmp_path, camera="front,front"))
