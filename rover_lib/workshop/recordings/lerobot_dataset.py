@@ -4,7 +4,6 @@ What its numbers mean is read from the names of its features, or said by the use
 meta/ names and columns that are used are read, so what Macs, pandas, notebooks and annotators leave there does no harm.
 """
 
-import functools
 import io
 import json
 import re
@@ -82,22 +81,20 @@ def is_dataset(root: Path) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """One camera. size: (height, width). paths, places: each row's file, and where in it its picture is.
+    """One camera. size: (height, width). paths: each row's file. times_s: when its picture is shown in a video.
 
-    A place is seconds in a video, or a table's group of rows and the row in it.
+    rows: else all rows, from which Hugging Face's library reads one picture without its table's others.
     """
 
     key: str
     size: tuple[int, int]
     paths: Sequence[Path]
-    places: Sequence[Any]
+    times_s: Sequence[float] = ()
+    rows: Any = None
 
     def encoded(self, row: int) -> bytes:
         """The bytes of a picture in a table; none if there is none, or it is in a video."""
-        if isinstance(self.places[row], float):
-            return b""
-        group, within = self.places[row]
-        return (_row_group(self.paths[row], group, self.key)[within].as_py() or {}).get("bytes") or b""
+        return ((self.rows[row][self.key] if self.rows else None) or {}).get("bytes") or b""
 
     def is_torn(self, row: int) -> bool:
         """Whether a picture is a torn JPEG, of which most decoders make a picture."""
@@ -110,12 +107,12 @@ class _Camera:
     def read_bgr(self, row: int) -> np.ndarray:
         """Read a picture, (h, w, 3) uint8 BGR. Raises EpisodeError, CameraError and what decoders raise."""
         where = f"{self.paths[row]}: its frame {row} of '{self.key}'"
-        if isinstance(self.places[row], float):
+        if not self.rows:
             from lerobot.datasets.video_utils import decode_video_frames
 
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torchvision warns of the decoder
-                shown = decode_video_frames(self.paths[row], [self.places[row]], TOLERANCE_S, BACKEND)[0]
+                shown = decode_video_frames(self.paths[row], [self.times_s[row]], TOLERANCE_S, BACKEND)[0]
             # (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
             rgb = (shown * 255).round().byte().permute(1, 2, 0).numpy()
         else:
@@ -127,13 +124,6 @@ class _Camera:
         if rgb.shape != (*self.size, 3):
             raise _broken(f"{where} has another shape than {self.size} in {INFO}", rgb.shape)
         return np.ascontiguousarray(rgb[..., ::-1])
-
-
-@functools.lru_cache(maxsize=4)  # frames are read in turn, by at most four threads
-def _row_group(path: Path, number: int, column: str) -> Any:
-    from pyarrow import parquet
-
-    return parquet.ParquetFile(path).read_row_group(number, columns=[column]).column(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,22 +399,19 @@ def _camera(
     root: Path, info: Mapping[str, Any], key: str, size: tuple[int, int], entries: Sequence[_Entry], times_s: np.ndarray
 ) -> _Camera:
     """Find each row's picture of a camera. times_s: each row's in its episode."""
-    from pyarrow import parquet
-
-    paths: list[Path] = []
-    places: list[Any] = []
     if info["features"][key]["dtype"] == "video":
         _check_videos(root, info["fps"], key, size, entries)
-        for entry in entries:
-            paths += [entry.videos[key][0]] * entry.length
-            places += [entry.videos[key][1]] * entry.length
-        return _Camera(key, size, paths, (np.array(places) + times_s).tolist())
-    for path in dict.fromkeys(entry.data for entry in entries):
-        table = parquet.read_metadata(path)
-        paths += [path] * table.num_rows
-        for group in range(table.num_row_groups):
-            places += [(group, within) for within in range(table.row_group(group).num_rows)]
-    return _Camera(key, size, paths, places)
+        paths = [entry.videos[key][0] for entry in entries for _ in range(entry.length)]
+        first_s = [entry.videos[key][1] for entry in entries for _ in range(entry.length)]
+        return _Camera(key, size, paths, (np.array(first_s) + times_s).tolist())
+    from datasets import Dataset, Features, Image
+    from lerobot.utils.utils import SuppressProgressBars
+
+    paths = [entry.data for entry in entries for _ in range(entry.length)]
+    with SuppressProgressBars():
+        kept = Features({key: Image(decode=False)})
+        rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=kept)
+    return _Camera(key, size, paths, rows=rows)
 
 
 def _check_videos(root: Path, fps: float, key: str, size: tuple[int, int], entries: Sequence[_Entry]) -> None:
