@@ -248,6 +248,9 @@ def _read_info(root: Path) -> dict[str, Any]:
         right = False
     if not right or not is_number(fps, 0, 1000) or not fps:
         raise _broken(f"{path}: lacks frames per second, or plain features with a dtype and a shape", quote(fps))
+    if not features:
+        also = f", and {STATS} is missing" if version == "v2.1" and not (root / STATS).exists() else ""
+        raise _broken(f"{path}: names no features{also}")
     for key, other in ALSO.items():
         column = other if key not in features and other in features else key
         if column in features:
@@ -262,9 +265,7 @@ def _layout(
     features = info["features"]
     keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
-        raise EpisodeError(
-            f"{root}: has no camera", found=quote_all(features) or "nothing", remedy="record one that sees"
-        )
+        raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names or len(set(names)) < len(names):

@@ -80,6 +80,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (info(codebase_version="v1.6"), "only v2 and v3"),
         (info(codebase_version="v4.0"), "only v2 and v3"),
         (info(fps=0), "frames per second"),
+        (info(codebase_version="v2.1", features={}), "no features, and meta/episodes_stats.jsonl is missing"),
         ("[" * 100_000, "JSON"),
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (features(front=None), "has no camera"),
