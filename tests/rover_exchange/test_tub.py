@@ -157,10 +157,10 @@ def test_what_is_broken_is_counted(tmp_path):
 def test_a_folder_of_tubs_is_named_with_a_command_that_works(tmp_path):
     for i in range(2):
         tub(tmp_path / f"tubs/tub_{i}", records(20))
-    refusal = CliRunner().invoke(main, ["export-dataset", str(tmp_path / "tubs"), str(tmp_path / "out")])
+    refusal = rover("export-dataset", tmp_path / "tubs", tmp_path / "out")
     assert refusal.exit_code == 1 and "a folder of 2 donkeycar tubs" in refusal.output
     words = refusal.output.partition("; rover ")[2].partition(",")[0].replace("OUT", str(tmp_path / "out")).split()
-    done = CliRunner().invoke(main, words)
+    done = rover(*words)
     assert done.exit_code == 0, done.output
 
 
