@@ -66,7 +66,7 @@ class Run:
         self.state = _each_ms(pins, n, lambda e: ord(e.state) if e else 0)
         self.sick = _for_any(_each_ms(seen.sick, n, int) == 1, STOP_MS + 20)
         paused = np.zeros(n, bool)
-        for start, end in seen.pauses:
+        for start, end in [*seen.pauses, *((ms, ms + VALID_MS) for ms in seen.kills)]:
             paused[start:end] = True
         self.clean = ~self.sick & ~_for_any(paused, STOP_MS + 20)
         self.live = _each_ms(seen.hands, n, lambda h: h.receiver == LIVE)

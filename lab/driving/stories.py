@@ -288,6 +288,7 @@ def _raise(stage: Stage, h: Happening) -> None:
 def _kill(stage: Stage, h: Happening) -> None:
     if stage.process:
         stage.world.alive, stage.world.failing = False, Killed()
+        stage.world.seen.kills.append(stage.world.now_ms)
 
 
 _may("the operator says stop")(_to_process(lambda process: process.stop("signal")))

@@ -204,6 +204,7 @@ class Seen:
     log: list[tuple[int, str]] = field(default_factory=list)  # the flight log's events
     paused_ms: int = 0  # for how long the host's process was stopped in all
     pauses: list[tuple[int, int]] = field(default_factory=list)  # from when to when
+    kills: list[int] = field(default_factory=list)  # of the host's process: the firmware stops the car
     asked_most_ms: int = 2000  # how old a request may become
     plans: list[Planned] = field(default_factory=list)  # as they arrived
     frames: list[tuple[int, bool]] = field(default_factory=list)  # when each came, and whether it was black
