@@ -1,7 +1,7 @@
 """Count what a program executes on an emulated Cortex-A76, the core of a Raspberry Pi 5.
 
     core = prepare()
-    emulation = emulate_script(core, Path("predict.py"), [], folder)
+    emulation = emulate(core, [core.root / "bin/true"], folder)
     emulation.total(section=0)
 
 An arm64 Debian's Python runs with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
@@ -170,18 +170,17 @@ class Emulation:
         return int(more[0]), int(more[4] + 2 * more[3])
 
 
-def emulate_script(
-    core: Core, script: Path, arguments: Sequence[object], folder: Path, packages: Path | None, watch: str
-) -> Emulation:
-    """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
+def emulate_artifact(core: Core, given: Sequence[object], folder: Path, packages: Path | None, watch: str) -> Emulation:
+    """`emulate` guest/predict.py with what it is `given`, the Pi's wheels and rover_lib.
 
     packages: a folder of packages that come before the Pi's own on the path.
     """
     environment = _environment(core.root, folder)
-    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
+    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY]
     environment["PYTHONPATH"] = ":".join(map(str, places))
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
-    return emulate(core, [core.root / INTERPRETER, script, *arguments], folder, environment=environment, watch=watch)
+    command = [core.root / INTERPRETER, GUEST / "predict.py", *given]
+    return emulate(core, command, folder, environment=environment, watch=watch)
 
 
 def emulate(
