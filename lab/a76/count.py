@@ -30,11 +30,8 @@ def packages_of(artifact: Path) -> Path | None:
     if read_manifest(artifact)["engine"] != engines.ONNXRUNTIME:
         return None
     wheels = REQUIREMENTS["onnxruntime"]
-
-    def make(folder: Path) -> None:
-        fetch_wheels(folder, "--require-hashes", *FOR_GUEST, "--requirement", wheels)
-
-    return cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make)
+    key = key_of({"for": FOR_GUEST}, wheels)
+    return cache_folder("arm-onnxruntime", key, lambda folder: fetch_wheels(folder, wheels))
 
 
 class Counted(NamedTuple):
