@@ -7,6 +7,7 @@ The packages are those of this machine's own Debian (12 or 13), which mmdebstrap
 provision.yml must install.
 """
 
+import os
 from pathlib import Path
 
 from lab.debian import debian_sources, make_arm64
@@ -50,3 +51,4 @@ def _make(folder: Path) -> None:
     # emulation() has registered an emulator, which mmdebstrap would look for by a package of its own
     options = ("--mode=root", "--variant=required", "--skip=check/qemu", "--dpkgopt=force-unsafe-io")
     make_arm64(folder / "root", PACKAGES, *options, f"--customize-hook={hook}")
+    os.utime(folder / "root/var/lib/apt/lists", (0, 0))  # empty: whoever asks apt must not take it for fresh

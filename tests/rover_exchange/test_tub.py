@@ -113,6 +113,21 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
 
 
+@pytest.mark.parametrize(("off", "found"), [(0.0, {"hole_in_time"}), (0.3, {"stood_unrecorded"})])
+def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, off, found):
+    """donkeycar's default: indexes go on, and three real tubs fell into 305 to 1,300 pieces of three frames."""
+    rows, ms = records(80), 1_629_500_000_000
+    for i, row in enumerate(rows):
+        ms += 50 if i % 4 else 250
+        row.update({"_timestamp_ms": ms, "user/throttle": 0.3 if i else off})
+    recordings = read_tub(tub(tmp_path / "tub", rows), LEFT)
+    assert kinds(recordings).keys() == found
+    assert len(recordings.episodes) == (1 if off else 20)
+    if off:
+        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.3, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
+        assert "AUTO_RECORD_ON_THROTTLE" in recordings.faults[0].note
+
+
 def test_what_is_broken_is_counted(tmp_path):
     def lines(rows):
         texts = [json.dumps(row) for row in rows]
@@ -136,6 +151,17 @@ def test_what_is_broken_is_counted(tmp_path):
             (root / "manifest.json").write_text(manifest)
         with pytest.raises(EpisodeError, match=r"manifest\.json"):
             read_tub(root, LEFT)
+
+
+@pytest.mark.slow
+def test_a_folder_of_tubs_is_named_with_a_command_that_works(tmp_path):
+    for i in range(2):
+        tub(tmp_path / f"tubs/tub_{i}", records(20))
+    refusal = rover("export-dataset", tmp_path / "tubs", tmp_path / "out")
+    assert refusal.exit_code == 1 and "a folder of 2 donkeycar tubs" in refusal.output
+    words = refusal.output.partition("; rover ")[2].partition(",")[0].replace("OUT", str(tmp_path / "out")).split()
+    done = rover(*words)
+    assert done.exit_code == 0, done.output
 
 
 @pytest.mark.slow

@@ -12,8 +12,8 @@ GAP_S = 0.25  # at most this is counted for a picture: nobody knows what the car
 ROWS = 90  # of a picture that are looked at
 CELLS = 32, 30  # across and down
 # How far two pictures' cells differ (root mean square, of a mean of 100) if the car has moved between them. Those of a
-# standing car differ by up to 1, of a driving one by more than this at least every 0.7 s (results/lab/stuck.json).
-MOVED = 3.0
+# standing car differ by up to 3, of a driving one by more than this at least every 0.7 s (results/lab/stuck.json).
+MOVED = 3.5
 
 
 class Motion:

@@ -36,6 +36,7 @@ FIGURES = {  # of the run's folder, with what each shows
     "04_action_error": "How far each mode's plan is from FP32's, step by step",
     "04_worst_frames": "The frames on which static INT8 differs most from FP32",
     "03_sensitivity": "How much of the error each block causes",
+    "04_familiarity": "How unfamiliar each held-out drive is, of what stops the car, and the least familiar pictures",
 }
 
 

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import hostile
 import numpy as np
 import pytest
@@ -32,12 +33,16 @@ def throttle_at(t_s):
 
 
 def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
-    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them."""
+    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them.
+
+    Its name's last two digits choose the drive: the same drive twice is left out.
+    """
+    later_s = 0.717 * int(name[-2:])
     folder = root / name
     with EpisodeWriter(folder, About("hit red balloon"), resolution=(32, 18)) as writer:
         for i in range(round((frames / 30 + 0.2) / 0.033)):
             t_s = i * 0.033
-            pulses = PWM.pulses(steering_at(t_s), throttle_at(t_s))
+            pulses = PWM.pulses(steering_at(t_s + later_s), throttle_at(t_s + later_s))
             writer.control(start_s + t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
         for i in range(frames):
             writer.frame(start_s + 0.1 + i / 30, FRAME)
@@ -171,14 +176,82 @@ def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
     (folder / "frames/frame_000010.jpg").unlink()
     padded = folder / "frames/frame_000015.jpg"  # which is no damage
     padded.write_bytes(padded.read_bytes() + bytes(20))
+    torn = folder / "frames/frame_000025.jpg"  # and closed, so that OpenCV makes a picture of it
+    torn.write_bytes(hostile.cut(torn.read_bytes()))
     cut = folder / "frames/frame_000020.jpg"
     cut.write_bytes(cut.read_bytes()[:-40])
     (folder / "frames/frame_000030.jpg").write_bytes(b"")
     recordings = load(tmp_path)
-    assert kinds(recordings) == {"frame_missing": 1, "broken_jpeg": 2, "another_size": 1}
-    left = [s for k, s in enumerate(whole) if k not in (4, 9, 19, 29)]
+    assert kinds(recordings) == {"frame_missing": 1, "broken_jpeg": 3, "another_size": 1}
+    left = [s for k, s in enumerate(whole) if k not in (4, 9, 19, 24, 29)]
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in left]
     assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
+
+
+def as_another(folder, change):
+    """A copy of a recording, changed, under another name."""
+    copy = shutil.copytree(folder, folder.with_name("episode_20270101_000099"))
+    change(copy)
+
+
+def encoded_anew(folder):
+    for path in (folder / "frames").iterdir():
+        half = cv2.resize(cv2.imread(str(path)), None, fx=0.5, fy=0.5)
+        cv2.imwrite(str(path), half, [cv2.IMWRITE_JPEG_QUALITY, 40])
+
+
+COPIES = [
+    lambda folder: None,
+    encoded_anew,
+    lambda folder: edit(folder, lambda content: content["frame_samples"].pop(7)),
+    lambda folder: edit(folder, lambda content: content["frame_samples"].__delitem__(slice(20))),
+    lambda folder: edit(folder, lambda content: content["frame_samples"].__delitem__(slice(None, None, 2))),
+]
+
+
+@pytest.mark.parametrize("change", COPIES)
+def test_the_same_drive_again_is_left_out(tmp_path, change):
+    """Else what is held out also calibrates, as in a backup's folder."""
+    for second in range(3):
+        folder = record(tmp_path, f"episode_20260101_12000{second}", frames=60)
+    as_another(folder, change)
+    recordings = load(tmp_path)
+    assert [e.id[-2:] for e in recordings.episodes] == ["00", "01", "02"]
+    (fault,) = [f for f in recordings.faults if f.kind == "copy"]
+    assert fault.handled == "left out" and "the same drive as episode_20260101_120002" in fault.note
+
+
+def test_equal_actions_before_other_scenes_are_no_copy(tmp_path):
+    """As a keyboard makes them."""
+    as_another(
+        record(tmp_path),
+        lambda folder: [
+            cv2.imwrite(str(path), np.full((18, 32, 3), 90, np.uint8)) for path in (folder / "frames").iterdir()
+        ],
+    )
+    assert len(load(tmp_path).episodes) == 2
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("model_metadata.json", "DeepRacer"),
+        ("40_30_ab.jpg", "JetRacer"),
+        ("policy_best.ckpt", "the first ACT"),
+        ("episode_0.hdf5", "the first ACT"),
+        ("IMG/../driving_log.csv", "Udacity"),
+        ("drive.bag", "ROS bag"),
+        ("tub_1/manifest.json", "a folder of 1 donkeycar tubs, not our recordings; rover export-dataset"),
+        ("more/episode_1/episode_data.json", "a folder of 1 folders of recordings"),
+    ],
+)
+def test_what_others_bring_is_called_what_it_is(tmp_path, file, words):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    (tmp_path / file).with_name("catalog_0.catalog").touch()
+    with pytest.raises(EpisodeError, match=words) as e:
+        load(tmp_path)
+    assert "record again" not in str(e.value)
 
 
 NO_PULSES = [

@@ -18,7 +18,9 @@ from rover_lib.workshop.run.session import Opened
 
 @pytest.fixture
 def loaded(tiny):
-    parts = SimpleNamespace(calibration=tuple(memory_samples(4)), choosing=tuple(memory_samples(3, seed=1)))
+    parts = SimpleNamespace(
+        calibration=tuple(memory_samples(4)), choosing=tuple(memory_samples(3, seed=1)), held_out=()
+    )
     return Opened(tiny, None, parts)
 
 
@@ -35,7 +37,7 @@ def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibra
     unseen, action_range = tuple(memory_samples(5, seed=1)), {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
     recordings = SimpleNamespace(action_range=lambda: action_range)
     for choosing in (unseen, ()):  # of a single episode nothing is left
-        parts = SimpleNamespace(calibration=tuple(memory_samples(12)), choosing=choosing)
+        parts = SimpleNamespace(calibration=tuple(memory_samples(12)), choosing=choosing, held_out=())
         chooser = pipeline.prepare_chooser(tiny, Opened(tiny, recordings, parts), calibration, frames=3)
         expected = pick_evenly(choosing or parts.calibration, 3)
         states = [state.tolist() for state, _ in chooser.inputs]
