@@ -1,0 +1,107 @@
+"""Is a stuck car stopped, and no other? `python -m lab.driving.stuck OUTPUT RUN [RECORDINGS]`.
+
+The loop of `rover drive`, in virtual time, drives a policy through unseen balloon worlds: freely, and against a wall.
+Recordings are watched as they were driven.
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from balloon_world.drives import NoLog, TimedCar, everywhere
+from balloon_world.world import RATE_HZ, World
+from rover_lib.onboard.car.camera import Frame
+from rover_lib.onboard.drive.motion import EVERY_S, MOVED, Motion
+from rover_lib.onboard.drive.plan import OFF, Settings
+from rover_lib.onboard.errors import DriveFault
+from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.load import Policy
+from rover_lib.onboard.stage import write_stage
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import Sample
+
+SEED, LATENCY_S, WITHIN_S = 40_000, 0.15, 2.0
+NOISE = 3  # grey levels of the camera's, as balloon_world/car.py has
+
+
+class _Walled(World):
+    """A world with a wall that the car drives into at wall_s: from then on it stands, and its clock runs on."""
+
+    def __init__(self, seed: int, wall_s: float):
+        super().__init__(seed)
+        self._wall_s = wall_s
+
+    def step(self, steering: float, throttle: float, dt: float = 1 / RATE_HZ) -> None:
+        before = self.state
+        super().step(steering, throttle, dt)
+        if before.time_s >= self._wall_s:
+            self.state = replace(before, time_s=self.state.time_s, speed_mps=0.0)
+
+
+class _SeeingCar(TimedCar):
+    """A timed car whose camera shows the loop what is to be seen, with noise, ten times a second."""
+
+    _frame: Frame | None = None
+
+    def latest(self) -> Frame:
+        blind = super().latest()
+        if self._frame is None or blind.captured_s - self._frame.captured_s >= EVERY_S - 1e-6:
+            noise = np.random.default_rng(blind.number).integers(0, NOISE, (360, 640, 3), np.uint8)
+            self._frame = replace(blind, image=cv2.add(self.world.render(), noise))
+        return replace(blind, image=self._frame.image, captured_s=self._frame.captured_s)
+
+
+def drive_stuck(policy: Policy, asked: tuple[str, int]) -> tuple[str, float]:
+    """Drive once; return how it ended, and how long after the wall (s). asked: "good" or "wall", and the seed."""
+    kind, seed = asked
+    wall_s = 0.5 + (seed % 10) / 10 if kind == "wall" else 1e9
+    car, log = _SeeingCar(_Walled(seed, wall_s), policy, LATENCY_S), NoLog()
+    outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), log).outcome
+    return outcome, car.world.state.time_s - wall_s
+
+
+def watch_recording(samples: Sequence[Sample], stuck_s: float) -> dict[str, Any]:
+    """Watch what was recorded: whether a car would have been stopped, and its longest throttle without motion."""
+    motion, longest_s = Motion(stuck_s), 0.0
+    for i, sample in enumerate(samples):
+        try:
+            motion.watch(Frame(sample.frame_bgr(), sample.time_s, i, 0, 100.0, 40.0), float(sample.chunk[0, 1]))
+        except DriveFault:
+            return {"stopped": True, "longest_still_s": stuck_s}
+        longest_s = max(longest_s, motion.still_s)
+    return {"stopped": False, "longest_still_s": round(longest_s, 2)}
+
+
+def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 200) -> dict[str, Any]:
+    """Return the metrics of stage `stuck`. artifact: drives. recordings: a folder of recordings, or None."""
+    cv2.setNumThreads(1)
+    asked = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
+    found = dict(everywhere(artifact, asked, drive_stuck))
+    after_s = [s for key, (outcome, s) in sorted(found.items()) if key[0] == "wall" and outcome == "stopped"]
+    outcomes = [outcome for (kind, _), (outcome, _) in found.items() if kind == "good"]
+    metrics: dict[str, Any] = {
+        "walls": walls,
+        "walls_stopped_in_time": sum(s <= WITHIN_S for s in after_s),
+        "wall_to_stop_max_s": max(after_s, default=None),
+        "good_drives": good,
+        "good_stopped": outcomes.count("stopped"),
+        "good_hits": outcomes.count("hit"),
+        "moved_limit": MOVED,
+    }
+    if recordings:
+        stuck_s = params()["drive"]["stuck_s"]
+        for episode in load_recordings(recordings).episodes:
+            metrics[episode.path.name] = watch_recording(episode.samples, stuck_s)
+    return metrics
+
+
+if __name__ == "__main__":
+    output, run_dir, *more = map(Path, sys.argv[1:])
+    found = study(run_dir / "policy_static.pt", more[0] if more else None)
+    write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=found)
+    print(found)
