@@ -71,6 +71,7 @@ class TimedCar:
     """
 
     wanted_hz = RATE_HZ
+    draws = False  # whether latest() shows the loop what is to be seen; if not, no car looks stuck
 
     def __init__(self, world: World, policy: Any, latency_s: float):
         self.world, self.policy, self.stop = world, policy, threading.Event()
@@ -83,7 +84,7 @@ class TimedCar:
 
     def drive(self, settings: Settings, log: Any, watch: Watch | None = None) -> Driven:
         """Drive by the car's own loop until the world ends or `stop` is set."""
-        settings = replace(settings, stuck_s=0.0)  # its camera draws nothing for the loop
+        settings = settings if self.draws else replace(settings, stuck_s=0.0)
         pilot = WorldPilot(self, self._commanded, settings, self.policy.rate_hz, watch)
         try:
             drive(pilot, None, log, rate_hz=RATE_HZ, until=Until(stop=self.stop), clock=self.clock, sleep=self.sleep)

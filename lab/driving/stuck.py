@@ -46,6 +46,7 @@ class _Walled(World):
 class _SeeingCar(TimedCar):
     """A timed car whose camera shows the loop what is to be seen, with noise, ten times a second."""
 
+    draws = True
     _frame: Frame | None = None
 
     def latest(self) -> Frame:
