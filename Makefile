@@ -34,9 +34,9 @@ help:
 	@echo "make test                                   lint, tests and notebooks, on the demo's run"
 	@echo "make check-release                          what takes two hours and a quiet machine"
 	@echo "make mutants                                break lines of the safety path: tests and random drives must notice"
-	@echo "make count NAME=demo [PEERS=1]              count a run's instructions on an emulated Cortex-A76; NAME=full makes"
+	@echo "make count NAME=demo                        count a run's instructions on an emulated Cortex-A76; NAME=full makes"
 	@echo "                                            a policy of the real car's size, LEARNED=1 one that has learned to"
-	@echo "                                            drive (an hour or more), PEERS=1 adds other runtimes"
+	@echo "                                            drive (an hour or more)"
 	@echo "make notebooks                              put the demo's outputs, and runs/full's count and students, into the"
 	@echo "                                            notebooks, the JSON behind them into results/, pictures, the tables"
 
@@ -122,7 +122,7 @@ count: $(READY)
 	$(ROVER) world record runs/full/episodes --count $(if $(LEARNED),80,16) && \
 	$(ROVER) train runs/full/episodes runs/full/best_model.pth --size full $(if $(LEARNED),,--steps 24) && \
 	{ $(ROVER) run runs/full/best_model.pth runs/full/episodes --name full --samples 64 -p modes '[static]'; $(ROVER) export runs/full --onnx; }; }
-	$(LAB) arm 'runs/$(NAME)' $(if $(PEERS),--peers)
+	$(LAB) arm 'runs/$(NAME)'
 
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives

@@ -42,8 +42,7 @@ def drive(ctx: click.Context, **options: Any) -> None:
 
 @main.command()
 @click.argument("run_dir", type=FILE)
-@click.option("--peers", is_flag=True, help="Count ONNX Runtime and ExecuTorch beside them.")
-def arm(run_dir: Path, peers: bool) -> None:
+def arm(run_dir: Path) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of lab/params.yml hold. Needs Debian
@@ -55,10 +54,6 @@ def arm(run_dir: Path, peers: bool) -> None:
     from rover_lib.workshop.run.run import execute
 
     count_run(run_dir, progress=terminal_bar())
-    if peers:
-        from lab.a76.peers import count_peers
-
-        count_peers(run_dir, progress=terminal_bar())
     execute("06_arm", run_dir)
     click.echo(table(read_stage(run_dir / "arm.json", "arm")))
 

@@ -7,11 +7,9 @@ worlds than FP32 by more than chance loses; each measure is held against that. D
 same command continues after an interruption.
 """
 
-import copy
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +18,19 @@ import torch
 from torch import nn
 
 from balloon_world import drives, world
-from balloon_world.drives import SEED, append_row, drive_in, read_rows
+from balloon_world.drives import SEED, drive_in, drive_missing
 from balloon_world.world import World
-from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.policy.preprocess import prepare_frame
+from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import plain, sha256_of, write_stage
-from rover_lib.workshop.act import ACT, block_of, example_inputs
+from rover_lib.workshop.act import block_of
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
+from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.int8.observe import RangeObserver, calibrate, restore_observed
-from rover_lib.workshop.int8.quantize import convert
-from rover_lib.workshop.int8.scheme import ENGINE, Scheme
+from rover_lib.workshop.int8.quantize import QuantizedPolicy, convert
+from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.camera_use import look
 from rover_lib.workshop.judge.compare import Fidelity, fidelity
 from rover_lib.workshop.judge.pairs import CHANCE, compare_pairs, loses
@@ -43,7 +40,6 @@ from rover_lib.workshop.run.session import Opened, load
 FP32, DRIVING = "FP32", (world, drives, loop, pilot, plan)  # the modules that a drive depends on
 WORLDS, PUSHES, LATENCY_S = 150, 4, 0.2
 CALIBRATION, HELD_OUT, FIRST_STEPS = 60, 120, 8
-
 
 VERSIONS: dict[str, dict[str, Any]] = {  # arguments of `degraded`
     "INT8": {},
@@ -55,30 +51,10 @@ VERSIONS: dict[str, dict[str, Any]] = {  # arguments of `degraded`
 }
 
 
-@dataclass(frozen=True)
-class Driver:
-    """A module that drives, and is compared, as an artifact. size: height and width of its picture."""
-
-    module: Any
-    size: tuple[int, int]
-    rate_hz: float
-    chunk: int
-    action_names: tuple[str, ...]
-    car = Car()
-
-    @torch.inference_mode()
-    def predict_unclipped(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        frame = torch.from_numpy(prepare_frame(frame_bgr, *self.size))
-        return self.module(torch.from_numpy(np.asarray(state, np.float32))[None], frame)[0].numpy()
-
-    def predict_chunk(self, frame_bgr: np.ndarray, state: np.ndarray) -> np.ndarray:
-        return self.predict_unclipped(frame_bgr, state).clip(*action_limits(self.action_names, self.car))
-
-
 def degraded(
     opened: Opened, calibration: Any, weight_bits: int = 8, activation_bits: int = 8, noise: float = 0.0,
     ranges: float = 1.0, block: str = "",
-) -> nn.Module:  # fmt: skip
+) -> QuantizedPolicy:  # fmt: skip
     """Return static INT8 with all calibration frames' ranges, degraded, on the kernels of the rover.
 
     Fewer bits are fewer steps of the same INT8: weights are rounded beforehand, activations get a larger scale.
@@ -97,7 +73,7 @@ def degraded(
             weight = weight + noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
             step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (weight_bits - 1) - 1)
             m.weight = nn.Parameter(((weight / step).round() * step).view_as(m.weight), requires_grad=False)
-    return convert(prepared, config, scheme).eval()
+    return QuantizedPolicy(scheme, convert(prepared, config, scheme).eval(), {})
 
 
 def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, float]:
@@ -120,60 +96,48 @@ def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> d
 
 
 def prepare(checkpoint: Path, episodes: Path, folder: Path) -> None:
-    """Write every version's module, and what it errs on held-out frames, to `folder`."""
+    """Write every version's artifact, and what it errs on held-out frames, to `folder`."""
     opened = load(checkpoint, episodes)
-    config, parts = opened.checkpoint.config, opened.parts
+    parts, samples = opened.parts, pick_evenly(opened.parts.held_out, HELD_OUT)
     calibration = calibrate(opened.checkpoint, pick_evenly(parts.calibration, CALIBRATION))
-    made: dict[str, Any] = {FP32: ACT(config, opened.checkpoint.weights)}
-    made |= {label: degraded(opened, calibration, **each) for label, each in VERSIONS.items()}
-    shape: dict[str, Any] = {"size": config.image_sizes[0], "rate_hz": config.rate_hz, "chunk": config.chunk}
-    shape["action_names"] = config.action_names
-    drivers = {}
-    for label, module in made.items():
-        traced = torch.jit.trace(module, example_inputs(config), check_trace=False)
-        torch.jit.save(traced, folder / f"{label}.pt")
-        drivers[label] = Driver(traced, **shape)
-    samples, ranges = pick_evenly(parts.held_out, HELD_OUT), opened.recordings.action_range()
-    report = fidelity(drivers[FP32], {label: drivers[label] for label in VERSIONS}, samples, ranges)
-    moved_pct = look(drivers[FP32], report, parts.held_out).moved_pct
+    exporter, versions = Exporter(opened.checkpoint, samples[:1]), {}
+    exporter.export(exporter.float_policy, folder / f"{FP32}.pt")
+    for label, each in VERSIONS.items():
+        exporter.export(degraded(opened, calibration, **each), folder / f"{label}.pt", calibration)
+        versions[label] = load_policy(folder / f"{label}.pt", threads=1)
+    fp32 = load_policy(folder / f"{FP32}.pt", threads=1)
+    report = fidelity(fp32, versions, samples, opened.recordings.action_range())
+    moved_pct = look(fp32, report, parts.held_out).moved_pct
     errors = {label: errors_of(report, label, moved_pct) for label in VERSIONS}
-    (folder / "described.json").write_text(json.dumps(plain({"shape": shape, "errors": errors})))
+    (folder / "errors.json").write_text(json.dumps(plain(errors)))
 
 
 def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     """Return a row for each version of a policy: its pairs with FP32, and its errors. What was driven is kept."""
-    torch.set_num_threads(1)
-    torch.backends.quantized.engine = ENGINE
     checkpoint, settings = run / "best_model.pth", params()["drive"]
     made_of: dict[str, Any] = {"checkpoint": sha256_of(checkpoint), "versions": VERSIONS, "torch": torch.__version__}
     made_of |= {"frames": [CALIBRATION, HELD_OUT]}
-    folder = cache_folder("judging", key_of(made_of), lambda new: prepare(checkpoint, episodes, new))
-    described = json.loads((folder / "described.json").read_text())
-    labels = FP32, *VERSIONS
-    drivers = {label: Driver(torch.jit.load(folder / f"{label}.pt"), **described["shape"]) for label in labels}
+    folder = cache_folder("judged", key_of(made_of), lambda new: prepare(checkpoint, episodes, new))
     how = {"drive": settings, "pushes": PUSHES, "latency": LATENCY_S, **made_of}
-    hit = drive_all(drivers, Settings.of(settings), cache_root() / f"drives-{key_of(how, *DRIVING)}.jsonl")
+    path = cache_root() / f"drives-{key_of(how, *DRIVING)}.jsonl"
+    hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path) for label in (FP32, *VERSIONS)}
     rows = []
-    for label, errors in described["errors"].items():
+    for label, errors in json.loads((folder / "errors.json").read_text()).items():
         pairs = compare_pairs(hit[FP32], hit[label])
         row = {"policy": run.name, "version": label, "fp32_hits": sum(hit[FP32]), "hits": sum(hit[label]), **pairs}
         rows.append(row | {"loses": loses(pairs), "errors": errors})
     return rows
 
 
-def drive_all(drivers: Mapping[str, Driver], settings: Settings, path: Path) -> dict[str, list[bool]]:
-    """Drive everybody through the same worlds; return who hit which. path: keeps the drives; others are driven."""
-    kept = {(row["version"], row["seed"]): row["hit"] for row in read_rows(path)}
-    seeds = range(SEED, SEED + WORLDS)
-    for seed in seeds:
-        if missing := [label for label in drivers if (label, seed) not in kept]:
-            drawn = World(seed, PUSHES)  # once for all, as that takes a third of a drive's time
-        for label in missing:
-            own = copy.copy(drawn)
-            own.trajectory = [own.state]
-            kept[label, seed] = drive_in(drivers[label], own, LATENCY_S, settings).outcome == "hit"
-            append_row(path, {"version": label, "seed": seed, "hit": kept[label, seed]})
-    return {label: [kept[label, seed] for seed in seeds] for label in drivers}
+def hits(artifact: Path, settings: Settings, path: Path) -> list[bool]:
+    """Drive an artifact through the worlds; return which it hit. path: keeps the drives; others are driven."""
+
+    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, bool]:
+        return {"hit": drive_in(policy, World(asked[1], PUSHES), LATENCY_S, settings).outcome == "hit"}
+
+    asked = [(artifact.stem, SEED + i) for i in range(WORLDS)]
+    found = drive_missing(artifact, asked, one, path)
+    return [found[each]["hit"] for each in asked]
 
 
 def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:

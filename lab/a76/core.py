@@ -1,7 +1,7 @@
 """Count what a program executes on an emulated Cortex-A76, the core of a Raspberry Pi 5.
 
     core = prepare()
-    emulation = emulate_script(core, Path("predict.py"), [], folder)
+    emulation = emulate(core, [core.root / "bin/true"], folder)
     emulation.total(section=0)
 
 An arm64 Debian's Python runs with the wheels that a Pi gets (requirements_pi.txt), under QEMU's user emulation with a
@@ -11,7 +11,6 @@ records it, minus its translated code and the plugin's counters, which lie outsi
 
 import re
 import select
-import shutil
 import subprocess
 import sys
 from collections import defaultdict
@@ -96,7 +95,7 @@ def build_plugin() -> Path:
 
 def _make_userland(root: Path) -> None:
     make_arm64(root, GUEST_PACKAGES, "--mode=chrootless", "--variant=extract")
-    fetch_wheels(root / SITE, "--require-hashes", *FOR_GUEST, "--requirement", REQUIREMENTS)
+    fetch_wheels(root / SITE, REQUIREMENTS)
     # QEMU looks for every absolute path below this root first, so these stand before the host's own files.
     (root / "proc").mkdir()
     (root / "proc" / "cpuinfo").write_text("".join(CPUINFO.format(core=i) for i in range(CORES)))
@@ -110,16 +109,13 @@ def _make_userland(root: Path) -> None:
     run(*_qemu(root), *imports, error=RoverError, env=_environment(root, root))
 
 
-def fetch_wheels(folder: Path, *what: object) -> None:
-    """Fetch Python packages into a folder with uv, without installing them. Raises RoverError if they cannot be had.
-
-    what: all packages, as dependencies are not fetched, and further options of uv.
-    """
+def fetch_wheels(folder: Path, requirements: Path) -> None:
+    """Fetch the guest's Python packages into a folder with uv, without installing them. Raises RoverError."""
     beside = Path(sys.executable).with_name("uv")
-    uv = beside if beside.is_file() else shutil.which("uv") or "uv"
-    options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--target", folder]
-    remedy = f"pip install uv, and have the index within reach that has {' '.join(map(str, what))}"
-    run(uv, "pip", "install", *options, *what, error=RoverError, remedy=remedy)
+    uv = beside if beside.is_file() else "uv"
+    options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--require-hashes", *FOR_GUEST, "--target", folder]
+    remedy = f"pip install uv, and have the index within reach that has {requirements.name}"
+    run(uv, "pip", "install", *options, "--requirement", requirements, error=RoverError, remedy=remedy)
 
 
 def _qemu(root: Path) -> list[str]:
@@ -170,18 +166,17 @@ class Emulation:
         return int(more[0]), int(more[4] + 2 * more[3])
 
 
-def emulate_script(
-    core: Core, script: Path, arguments: Sequence[object], folder: Path, packages: Path | None, watch: str
-) -> Emulation:
-    """`emulate` a Python script of ours with the Pi's wheels, rover_lib and the modules beside guest/predict.py.
+def emulate_artifact(core: Core, given: Sequence[object], folder: Path, packages: Path | None, watch: str) -> Emulation:
+    """`emulate` guest/predict.py with what it is `given`, the Pi's wheels and rover_lib.
 
     packages: a folder of packages that come before the Pi's own on the path.
     """
     environment = _environment(core.root, folder)
-    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY, GUEST]
+    places = [*([packages] if packages else []), environment["PYTHONPATH"], REPOSITORY]
     environment["PYTHONPATH"] = ":".join(map(str, places))
     environment["PYTHONDONTWRITEBYTECODE"] = "1"  # keep the emulated Python's bytecode out of the checkout
-    return emulate(core, [core.root / INTERPRETER, script, *arguments], folder, environment=environment, watch=watch)
+    command = [core.root / INTERPRETER, GUEST / "predict.py", *given]
+    return emulate(core, command, folder, environment=environment, watch=watch)
 
 
 def emulate(

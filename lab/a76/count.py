@@ -5,13 +5,12 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lab.a76.core import FOR_GUEST, GUEST, Core, Emulation, emulate_script, fetch_wheels
+from lab.a76.core import FOR_GUEST, Core, Emulation, emulate_artifact, fetch_wheels
 from lab.a76.report import alone_of
 from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.artifact import engines
@@ -26,28 +25,13 @@ STEADY = 3  # the number of the first inference whose count is that of all later
 SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if nothing but SDOT ran
 
 
-@dataclass(frozen=True)
-class Guest:
-    """A script that runs an artifact in the emulated Pi. It takes guest/predict.py's arguments and leaves its files."""
-
-    script: Path = GUEST / "predict.py"
-    arguments: tuple[object, ...] = ()  # further arguments, after those of guest/predict.py
-    packages: Path | None = None  # come before the Pi's own on the path
-
-
-OURS = Guest()
-
-
-def guest_of(artifact: Path) -> Guest:
-    """Return what runs one of our artifacts. One for ONNX Runtime gets the packages of a Pi without torch."""
+def packages_of(artifact: Path) -> Path | None:
+    """Return what comes before the Pi's own packages: for an ONNX Runtime artifact, those of a Pi without torch."""
     if read_manifest(artifact)["engine"] != engines.ONNXRUNTIME:
-        return OURS
+        return None
     wheels = REQUIREMENTS["onnxruntime"]
-
-    def make(folder: Path) -> None:
-        fetch_wheels(folder, "--require-hashes", *FOR_GUEST, "--requirement", wheels)
-
-    return Guest(packages=cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), make))
+    key = key_of({"for": FOR_GUEST}, wheels)
+    return cache_folder("arm-onnxruntime", key, lambda folder: fetch_wheels(folder, wheels))
 
 
 class Counted(NamedTuple):
@@ -63,20 +47,20 @@ def count_artifact(
     manifest: dict[str, Any],
     samples: Sequence[Any],
     *,
-    guest: Guest = OURS,
+    packages: Path | None = None,
     counted: int = COUNTED,
 ) -> Counted:
     """Load an artifact in the emulated Pi, predict each sample, and count the first `counted` inferences one by one.
 
-    manifest: the policy's. samples: have frame_bgr() and state; if there are fewer than `counted`, at least STEADY,
-    they are repeated. Raises RoverError if it fails.
+    samples: have frame_bgr() and state; if there are fewer than `counted`, at least STEADY, they are repeated.
+    packages: of packages_of(). Raises RoverError if it fails.
     """
     with tempfile.TemporaryDirectory(prefix="rover-arm-") as scratch:
-        folder, observations = Path(scratch), Path(scratch) / "observations.npz"  # which guest/inferences.py explains
+        folder, observations = Path(scratch), Path(scratch) / "observations.npz"  # which guest/predict.py explains
         frames: dict[str, Any] = {f"frame_{i:04d}": sample.frame_bgr() for i, sample in enumerate(samples)}
         np.savez(observations, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
-        given = [artifact.resolve(), observations, folder, counted, *guest.arguments]
-        done = emulate_script(core, guest.script, given, folder, guest.packages, f"memory={STEADY}")
+        given = [artifact.resolve(), observations, folder, counted]
+        done = emulate_artifact(core, given, folder, packages, f"memory={STEADY}")
         return Counted(_row(done, folder, counted, manifest), np.load(folder / "chunks.npy"))
 
 
@@ -110,11 +94,12 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
     }
 
 
-def side_by_side(counts: Mapping[str, Callable[[], Counted]], what: str, progress: Progress) -> dict[str, Counted]:
-    """Count in several emulated machines, one for each of this machine's cores at a time. what: a label for the bar."""
+def side_by_side(counts: Mapping[str, Callable[[], Counted]], progress: Progress) -> dict[str, Counted]:
+    """Count in several emulated machines, one for each of this machine's cores at a time."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         started = {name: pool.submit(count) for name, count in counts.items()}
         try:
-            return {name: started[name].result() for name in progress(started, desc=what, total=len(started))}
+            watched = progress(started, desc="artifacts, emulated", total=len(started))
+            return {name: started[name].result() for name in watched}
         finally:
             pool.shutdown(cancel_futures=True)  # if one failed, those that run end, and no more begin

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lab.a76.core import A76, prepare
-from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, guest_of, side_by_side
+from lab.a76.count import COUNTED, STEADY, Counted, count_artifact, packages_of, side_by_side
 from lab.a76.report import LABEL, gates
 from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, read_manifest
@@ -52,8 +52,8 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     for stem in sorted(artifacts, key=lambda stem: len(chosen[stem])):  # FP32, which takes longest, first
         path, manifest, seen = artifacts[stem], manifests[stem], [samples[i] for i in chosen[stem]]
         most = min(COUNTED, FEW.get(manifest["mode"], COUNTED))
-        jobs[stem] = partial(count_artifact, core, path, manifest, seen, guest=guest_of(path), counted=most)
-    counts = side_by_side(jobs, "artifacts, emulated", progress)
+        jobs[stem] = partial(count_artifact, core, path, manifest, seen, packages=packages_of(path), counted=most)
+    counts = side_by_side(jobs, progress)
     judged = _judge(artifacts, chosen, counts, samples, again, progress)
     rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}

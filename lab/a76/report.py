@@ -72,9 +72,8 @@ def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float |
 
 def rows_of(metrics: Mapping[str, Any]) -> list[list[str]]:
     """Return a row for each count, a header first, and the fewest instructions after it. metrics: of arm.json."""
-    counted = {**metrics["artifacts"], **metrics.get("peers", {})}
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
-    for name, found in sorted(counted.items(), key=lambda item: item[1]["instructions_g"]):
+    for name, found in sorted(metrics["artifacts"].items(), key=lambda item: item[1]["instructions_g"]):
         cells = [number(found[key], how) for key, how in COLUMNS.values()]
         errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
         span = "{low:.3g} to {high:.3g}".format_map(found["computed_pi5_ms"])

@@ -105,7 +105,7 @@ Happen = Callable[[Stage, Happening], object]
 HAPPENINGS: dict[str, tuple[Happen, tuple[int, int], tuple[int, int]]] = {}  # with the ranges of amount and for_ms
 TOLD: dict[str, Happen] = {}  # happenings of the fixed stories alone: no random drive has them
 A_WHILE, LONG, ONCE = (20, 2500), (20, 4000), (0, 0)
-AMOUNT = object()  # of a value: the happening's amount
+AMOUNT, NOW = object(), object()  # of a value: the happening's amount, and the time at which it begins (ms)
 
 
 def _may(what: str, amount: tuple[int, int] = ONCE, for_ms: tuple[int, int] = ONCE) -> Callable[[Happen], Happen]:
@@ -120,7 +120,8 @@ def during(thing: str, **values: Any) -> Happen:
     """Return what sets attributes of the world's `thing` while it lasts; "" is the world itself."""
 
     def happen(stage: Stage, h: Happening) -> None:
-        now = {name: h.amount if value is AMOUNT else value for name, value in values.items()}
+        meant = {AMOUNT: h.amount, NOW: stage.world.now_ms}
+        now = {name: meant.get(value, value) for name, value in values.items()}
         stage.during(h, getattr(stage.world, thing) if thing else stage.world, **now)
 
     return happen
@@ -128,18 +129,8 @@ def during(thing: str, **values: Any) -> Happen:
 
 _may("the camera is black", for_ms=LONG)(during("lens", black=True))
 _may("the camera gives no more frames", for_ms=LONG)(during("lens", silent=True))
-
-
-@_may("the camera freezes", for_ms=LONG)
-def _freeze(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.lens, frozen_ms=stage.world.now_ms)
-
-
-@_may("the car stands at a wall", for_ms=LONG)
-def _stand(stage: Stage, h: Happening) -> None:
-    stage.during(h, stage.world.lens, stands_ms=stage.world.now_ms)
-
-
+_may("the camera freezes", for_ms=LONG)(during("lens", frozen_ms=NOW))
+_may("the car stands at a wall", for_ms=LONG)(during("lens", stands_ms=NOW))
 _may("the supply is low", for_ms=(500, 8000))(during("", throttled="0x50005"))
 _may("frames come late", (20, 3000), A_WHILE)(during("lens", late_ms=AMOUNT))
 

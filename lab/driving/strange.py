@@ -7,7 +7,6 @@ drive goes on to its end, so that its outcome is known, and whether the car woul
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,11 @@ from balloon_world.drives import NoLog, TimedCar, drive_missing, wilson_interval
 from balloon_world.record import SHOVES
 from balloon_world.world import HORIZON_ROW as WALL
 from balloon_world.world import RATE_HZ, World, expert
-from rover_lib.onboard.drive.plan import OFF, Plan, Settings, smoothed
+from rover_lib.onboard.drive.plan import OFF, Settings, smoothed
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
-from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Episode, load_recordings
-from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.run.session import open_run
 
 SEED = 30_000  # of the first world: not of those on which the scores were chosen
 OTHER = 20_000  # from a world's seed to that of the world whose look or pictures it gets
@@ -33,10 +29,8 @@ CHANGE_S, LATE_S = 0.5, 0.1  # LATE_S: of a plan, as on a Pi 5
 BEFORE_S, AFTER_S = 0.5, 1.0  # in time is so long before the car passes the balloon, or so soon after the change
 TURNED_RAD, BLUR_PX, HUE, DUSK = math.radians(15), 15, 40, 0.3
 GOOD = ("recorded", "driven", "pushed")  # by the expert, as the recordings; by the policy; by the policy with pushes
-FRAMES = 200  # on which INT8 and FP32 are compared
 ROOM = "another room's pictures"  # where there are recordings of one
 BESIDE = ("a film of another world", "mirrored", "a wall like a floor")  # of which nothing is promised
-IN_TIME = ("by_familiarity", "by_agreement", "by_either")
 
 
 def _turned(world: "StrangeWorld", frame: np.ndarray) -> np.ndarray:
@@ -103,52 +97,38 @@ def judge_strangeness(
     real: recordings from elsewhere.
     """
     cv2.setNumThreads(1)
-    artifact, loaded = run_dir / "policy_static.pt", open_run(run_dir, progress)
-    policy, fp32 = load_policy(artifact, threads=1), load_policy(run_dir / "policy_fp32.pt", threads=1)
-    span = np.ptp(np.array(list(loaded.recordings.action_range().values())), axis=1)
-    unseen = Drives.of(loaded.parts).unseen.values()
-    most = max(max(_apart(_plans(policy, samples), span)) for samples in unseen)
-
+    artifact = run_dir / "policy_static.pt"
+    policy = load_policy(artifact, threads=1)
     rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
 
     def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
         how, seed = asked
         if how == "recorded":
             return _watch(policy, World(seed, SHOVES))
-        world = StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES * (how == "pushed"))
-        return _drive(policy, world, span)
+        return _drive(policy, StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES * (how == "pushed")))
 
     strange = [how for how in HOW if rooms or how != ROOM]
     counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)
     asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
     found = drive_missing(artifact, asked, one, kept, progress)
-    rows = {how: [row | _told(row, most) for key, row in found.items() if key[0] == how] for how in counts}
+    rows = {how: [row | _told(row) for key, row in found.items() if key[0] == how] for how in counts}
     failed = [row for how in strange if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
     return {
         "threshold_drives": policy.manifest["familiar"]["drives"],
         "good_stopped": {how: _share([row["stopped"] for row in rows[how]]) for how in GOOD},
         "strange": {how: _judge(rows[how]) for how in strange},
-        "failed_in_time": {name: _share([row[name] for row in failed]) for name in IN_TIME},
-        "rooms_unfamiliar_s": _judge_rooms(policy, rooms),
-        "good_disagreeing": {how: _share([max(row["apart"]) >= most for row in rows[how]]) for how in GOOD[1:]},
-        "int8_as_fp32": _compare(policy, fp32, pick_evenly(loaded.parts.held_out, FRAMES)),
+        "failed_in_time": _share([row["in_time"] for row in failed]),
     }
 
 
-def _drive(policy: Policy, world: World, span: np.ndarray) -> dict[str, Any]:
+def _drive(policy: Policy, world: World) -> dict[str, Any]:
     """Drive to the end, whatever is unfamiliar. The lists have a value for each plan, smoothed."""
     car = TimedCar(world, policy, LATE_S)
     outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), NoLog()).outcome
     away = [math.hypot(world.balloon.x_m - s.x_m, world.balloon.y_m - s.y_m) for s in world.trajectory]
     passed_s, ready_s = world.trajectory[int(np.argmin(away))].time_s, [plan.ready_s for plan in car.plans]
     strange = _smooth([plan.strange or 0.0 for plan in car.plans])
-    return {
-        "outcome": outcome,
-        "passed_s": passed_s,
-        "s": ready_s,
-        "strange": strange,
-        "apart": _apart(car.plans, span),
-    }
+    return {"outcome": outcome, "passed_s": passed_s, "s": ready_s, "strange": strange}
 
 
 def _watch(policy: Policy, world: World) -> dict[str, Any]:
@@ -156,44 +136,22 @@ def _watch(policy: Policy, world: World) -> dict[str, Any]:
     strange, action = list[float](), (0.0, 0.0)
     while not world.done:
         if world.state.time_s >= LATE_S * len(strange) - 1e-6:
-            strange.append(_unfamiliar(policy, world.render(), np.array(action)))
+            policy.predict_unclipped(world.render(), np.array(action))
+            strange.append(policy.strange or 0.0)
         action = expert(world)
         world.step(*action)
     return {"outcome": world.outcome, "passed_s": world.state.time_s, "s": [], "strange": _smooth(strange)}
-
-
-def _unfamiliar(policy: Policy, frame: np.ndarray, state: np.ndarray) -> float:
-    policy.predict_unclipped(frame, state)
-    return policy.strange or 0.0
 
 
 def _smooth(scores: Sequence[float]) -> list[float]:
     return [smoothed(scores[: i + 1]) for i in range(len(scores))]
 
 
-def _plans(policy: Policy, samples: Sequence[Any]) -> list[Plan]:
-    return [Plan(1, s.time_s, s.time_s, policy.predict_unclipped(s.frame_bgr(), s.state)) for s in samples]
-
-
-def _apart(plans: Sequence[Plan], span: np.ndarray) -> list[float]:
-    """How far each plan is from the one before, over the steps that both have, as a share of the recorded range."""
-    apart = [0.0]
-    for before, plan in pairwise(plans):
-        steps = round((plan.captured_s - before.captured_s) * RATE_HZ)
-        overlap = np.abs(plan.actions[: len(plan.actions) - steps] - before.actions[steps:])
-        apart.append(float((overlap.mean(0) / span).max()))
-    return _smooth(apart)
-
-
-def _told(row: Mapping[str, Any], most: float) -> dict[str, bool]:
-    """Say whether a drive would have been stopped, and which signals would have done it in time."""
+def _told(row: Mapping[str, Any]) -> dict[str, bool]:
+    """Say whether a drive would have been stopped, and whether in time."""
     latest_s = max(CHANGE_S + AFTER_S, row["passed_s"] - BEFORE_S)
-    in_time = [
-        any(value >= limit and s <= latest_s for s, value in zip(row["s"], row.get(name, ()), strict=False))
-        for name, limit in (("strange", 1.0), ("apart", most))
-    ]
-    stopped = max(row["strange"]) >= 1
-    return {"stopped": stopped} | dict(zip(IN_TIME, (*in_time, any(in_time)), strict=True))
+    in_time = any(value >= 1 and s <= latest_s for s, value in zip(row["s"], row["strange"], strict=False))
+    return {"stopped": max(row["strange"]) >= 1, "in_time": in_time}
 
 
 def _share(those: Sequence[bool]) -> dict[str, Any]:
@@ -203,28 +161,6 @@ def _share(those: Sequence[bool]) -> dict[str, Any]:
 
 
 def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    failed = [row for row in rows if row["outcome"] != "hit"]
-    told = {name: sum(row[name] for row in failed) for name in IN_TIME}
-    return {"drives": len(rows), "stopped": sum(row["stopped"] for row in rows), "failed": len(failed)} | told
-
-
-def _judge_rooms(policy: Policy, rooms: Sequence[Episode]) -> dict[str, float | None]:
-    """When each recording would have stopped the car, in seconds from its first picture; None: not within two."""
-    found = {}
-    for episode in rooms:
-        seen = episode.samples[: round(2 * RATE_HZ) : round(LATE_S * RATE_HZ)]
-        scores = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in seen])
-        times_s = (sample.time_s - seen[0].time_s for sample in seen)
-        found[episode.path.name] = next((s for s, score in zip(times_s, scores, strict=True) if score >= 1), None)
-    return found
-
-
-def _compare(policy: Policy, other: Policy, samples: Sequence[Any]) -> dict[str, Any]:
-    """In how many pictures, as they are and made strange, both policies say the same."""
-    world, same = StrangeWorld(SEED, "dusk"), {}
-    for how in ("as recorded", "half covered", "blurred", "dusk", "hue", "mirrored"):
-        make = HOW.get(how, lambda world, frame: frame)
-        seen = [(make(world, sample.frame_bgr()), sample.state) for sample in samples]
-        both = [[_unfamiliar(each, *given) >= 1 for given in seen] for each in (policy, other)]
-        same[how] = _share([one is two for one, two in zip(*both, strict=True)])
-    return same
+    failed = [row["in_time"] for row in rows if row["outcome"] != "hit"]
+    stopped = sum(row["stopped"] for row in rows)
+    return {"drives": len(rows), "stopped": stopped, "failed": len(failed), "in_time": sum(failed)}

@@ -12,7 +12,6 @@ from policies import memory_samples
 
 from lab.a76 import core as a76
 from lab.a76 import count_run as counting
-from lab.a76 import peers
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, emulate, prepare
 from lab.a76.count import STEADY, Counted, count_artifact
@@ -223,13 +222,6 @@ def test_an_fp32_that_differs_on_the_core_is_no_reference(count, tiny_run, monke
     monkeypatch.setattr(counting, "side_by_side", lambda jobs, *_: {"policy_fp32": jobs["policy_fp32"]()})
     with pytest.raises(RoverError, match=r"policy_fp32\.pt: differs by .* on the core"):
         count(0.5)
-
-
-def test_a_peer_without_finite_actions_of_that_shape_is_refused():
-    chunks = np.random.default_rng(0).uniform(0.01, 0.09, (6, 32, 2)).astype(np.float32)
-    for wrong in (chunks[:, :16], np.where(chunks > 0.08, np.nan, chunks)):
-        with pytest.raises(RoverError, match="a peer gave"):
-            peers.peer_metrics(Counted({}, wrong), {}, chunks, {})
 
 
 def test_what_the_guest_refuses_is_said_in_its_words(core, tiny_run, tmp_path):

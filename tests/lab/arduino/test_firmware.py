@@ -34,15 +34,6 @@ def armed(board):
     return board
 
 
-def test_neutral_before_anything_else(board):
-    events = board.run_ms(200)
-    on_pins(events, *NEUTRAL_US)
-    for pin, period_us in (("steering", 21316), ("throttle", 1016)):
-        assert pulses(events, pin)[0].at_us < 1000
-        assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
-    assert board.lines[0] == f"<H 4 4.2.0 {board.boot} 0 p {Car().id}"
-
-
 def test_a_line_full_of_rubbish_keeps_no_command_out(armed):
     """With the line full both ways, a turn of the loop takes less than 2 ms, and every byte is taken."""
     rng = random.Random(6)

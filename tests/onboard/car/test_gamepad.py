@@ -80,14 +80,6 @@ def test_only_a_press_that_is_seen_counts(pad):
         assert pad.sticks() is None
 
 
-def test_where_the_sticks_are_is_asked_at_the_opening(pad):
-    """A throttle held at its end counted as at rest until it moved."""
-    pad.values = {STEERING: -FULL, THROTTLE: -FULL}
-    pad.open()
-    pad.hold(True)
-    assert pad.sticks() == (-1, 1)
-
-
 def test_after_lost_events_all_is_asked_again_and_l1_pressed_again(pad):
     """What comes between the loss and the next report is a part only: an L1 in it does not count."""
     pad.hold(True)

@@ -5,6 +5,7 @@ import json
 import socket
 from dataclasses import replace
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,18 +21,6 @@ from rover_lib.onboard.drive.plan import Plan
 JPEG = b"\xff\xd8 a picture\n with a line's end \xff\xd9"
 FRAME = Frame(np.zeros((36, 64, 3), np.uint8), 999.95, 5, 0, 100.0, 40.0, JPEG)
 TICKS = 90
-
-
-class Eyes:
-    """A camera. frame: its newest frame, or an exception to raise."""
-
-    def __init__(self, frame=FRAME):
-        self.frame = frame
-
-    def latest(self):
-        if isinstance(self.frame, Exception):
-            raise self.frame
-        return self.frame
 
 
 class Listener:
@@ -71,10 +60,11 @@ class Listener:
 
 
 class Bench:
-    """A drive with a feed. each: called whenever the loop sleeps."""
+    """A drive with a feed. each: called whenever the loop sleeps. fails: what its camera raises."""
 
-    def __init__(self, folder, each=lambda: None, frame=FRAME):
-        self.clock, self.report, self.eyes, self.pilot = Clock(), Report(), Eyes(frame), Always()
+    def __init__(self, folder, each=lambda: None, frame=FRAME, fails=None):
+        self.clock, self.report, self.eyes, self.pilot = Clock(), Report(), Mock(), Always()
+        self.eyes.latest.configure_mock(return_value=frame, side_effect=fails)
         self.pilot.plan = Plan(3, 999.9, 1000.0, np.tile([0.25, 0.125], (32, 1))), 30.0
         self.link = Link(self.clock)
         self.clock.on_sleep = each
@@ -165,7 +155,7 @@ def test_views_that_come_and_go_move_no_tick(tmp_path, listener, alone):
 
 @pytest.mark.parametrize("fails", [CameraError("unplugged"), ValueError("anything")])
 def test_what_cannot_be_shown_stops_no_drive(tmp_path, listener, alone, fails):
-    bench = Bench(tmp_path, listener.hello, fails)
+    bench = Bench(tmp_path, listener.hello, fails=fails)
     assert bench.drive() == alone
     told = [e.text for e in bench.log.recent if "not fed any more" in e.text]
     assert len(told) == isinstance(fails, ValueError)

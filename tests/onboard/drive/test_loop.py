@@ -344,13 +344,6 @@ def test_a_car_that_stands_although_its_throttle_is_on(throttle, picture, stops_
     assert (ended_s is None) == (stops_s is None) and (ended_s or 0) <= (stops_s or 0)
 
 
-def test_a_stuck_car_ends_its_drive(pilot):
-    with pytest.raises(DriveFault, match="does not move"):
-        drives(pilot, 1.8)
-    pilot.sight._motion.stuck_s = 0.0  # off
-    drives(pilot, 3.0, start_s=2.0)
-
-
 def test_no_picture_is_nothing_to_drive_by(pilot):
     pilot.eyes.frame = None
     with pytest.raises(CameraError):

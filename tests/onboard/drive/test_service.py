@@ -21,12 +21,13 @@ from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
+from fake_drive import STATUS
 from needs import until
 
 from rover_lib.cli import main
 from rover_lib.onboard.car import host
 from rover_lib.onboard.car.pwm import PwmCalibration
-from rover_lib.onboard.car.servo_link import MISSING, LinkError, State, Telemetry
+from rover_lib.onboard.car.servo_link import MISSING, LinkError
 from rover_lib.onboard.drive import service as s
 from rover_lib.onboard.drive.arming import arm_when_ready, wanted_since
 from rover_lib.onboard.drive.flight_log import read_log
@@ -36,7 +37,6 @@ from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.session import Arming, Session
 from rover_lib.onboard.errors import CameraError
 
-STATUS = Telemetry(0.0, 7, 0, 0, "k", State.MANUAL, "h", "-", 1456, 120, 238, None, None, None, None, 0, 0, 0, 0)
 REQUEST_S = s.REQUEST_S
 
 
