@@ -22,6 +22,8 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Episode, load_recordings
+from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.run.session import open_run
 
 SEED = 30_000  # of the first world: not of those on which the scores were chosen
 OTHER = 20_000  # from a world's seed to that of the world whose look or pictures it gets
@@ -29,6 +31,7 @@ CHANGE_S, LATE_S = 0.5, 0.1  # LATE_S: of a plan, as on a Pi 5
 BEFORE_S, AFTER_S = 0.5, 1.0  # in time is so long before the car passes the balloon, or so soon after the change
 TURNED_RAD, BLUR_PX, HUE, DUSK = math.radians(15), 15, 40, 0.3
 GOOD = ("recorded", "driven", "pushed")  # by the expert, as the recordings; by the policy; by the policy with pushes
+FRAMES = 200  # on which INT8 and FP32 are compared
 ROOM = "another room's pictures"  # where there are recordings of one
 BESIDE = ("a film of another world", "mirrored", "a wall like a floor")  # of which nothing is promised
 
@@ -97,8 +100,8 @@ def judge_strangeness(
     real: recordings from elsewhere.
     """
     cv2.setNumThreads(1)
-    artifact = run_dir / "policy_static.pt"
-    policy = load_policy(artifact, threads=1)
+    artifact, held_out = run_dir / "policy_static.pt", open_run(run_dir, progress).parts.held_out
+    policy, fp32 = (load_policy(path, threads=1) for path in (artifact, run_dir / "policy_fp32.pt"))
     rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
 
     def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
@@ -118,6 +121,8 @@ def judge_strangeness(
         "good_stopped": {how: _share([row["stopped"] for row in rows[how]]) for how in GOOD},
         "strange": {how: _judge(rows[how]) for how in strange},
         "failed_in_time": _share([row["in_time"] for row in failed]),
+        "rooms_unfamiliar_s": {episode.path.name: _unfamiliar_s(policy, episode) for episode in rooms},
+        "int8_as_fp32": _compare(policy, fp32, pick_evenly(held_out, FRAMES)),
     }
 
 
@@ -136,11 +141,15 @@ def _watch(policy: Policy, world: World) -> dict[str, Any]:
     strange, action = list[float](), (0.0, 0.0)
     while not world.done:
         if world.state.time_s >= LATE_S * len(strange) - 1e-6:
-            policy.predict_unclipped(world.render(), np.array(action))
-            strange.append(policy.strange or 0.0)
+            strange.append(_unfamiliar(policy, world.render(), np.array(action)))
         action = expert(world)
         world.step(*action)
     return {"outcome": world.outcome, "passed_s": world.state.time_s, "s": [], "strange": _smooth(strange)}
+
+
+def _unfamiliar(policy: Policy, frame: np.ndarray, state: np.ndarray) -> float:
+    policy.predict_unclipped(frame, state)
+    return policy.strange or 0.0
 
 
 def _smooth(scores: Sequence[float]) -> list[float]:
@@ -164,3 +173,22 @@ def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     failed = [row["in_time"] for row in rows if row["outcome"] != "hit"]
     stopped = sum(row["stopped"] for row in rows)
     return {"drives": len(rows), "stopped": stopped, "failed": len(failed), "in_time": sum(failed)}
+
+
+def _unfamiliar_s(policy: Policy, episode: Episode) -> float | None:
+    """Return when a recording would have stopped the car, in seconds from its first picture; None: not within two."""
+    seen = episode.samples[: round(2 * RATE_HZ) : round(LATE_S * RATE_HZ)]
+    scores = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in seen])
+    times_s = (sample.time_s - seen[0].time_s for sample in seen)
+    return next((s for s, score in zip(times_s, scores, strict=True) if score >= 1), None)
+
+
+def _compare(policy: Policy, other: Policy, samples: Sequence[Any]) -> dict[str, Any]:
+    """In how many pictures, as they are and made strange, both policies say the same."""
+    world, same = StrangeWorld(SEED, "dusk"), {}
+    for how in ("as recorded", "half covered", "blurred", "dusk", "hue", "mirrored"):
+        make = HOW.get(how, lambda world, frame: frame)
+        seen = [(make(world, sample.frame_bgr()), sample.state) for sample in samples]
+        both = [[_unfamiliar(each, *given) >= 1 for given in seen] for each in (policy, other)]
+        same[how] = _share([one is two for one, two in zip(*both, strict=True)])
+    return same
