@@ -17,6 +17,7 @@ from recorded import real_recordings
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.workshop.recordings import pictures
 from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
@@ -186,6 +187,14 @@ def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
     left = [s for k, s in enumerate(whole) if k not in (4, 9, 19, 24, 29)]
     assert [s.chunk.tolist() for s in recordings.samples] == [s.chunk.tolist() for s in left]
     assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
+
+
+def test_a_picture_is_decoded_once_to_see_whether_it_is_torn(tmp_path, monkeypatch):
+    """Each load decoded all of them, and took four times as long."""
+    record(tmp_path)
+    load(tmp_path)
+    monkeypatch.delattr(pictures, "check_jpeg")
+    assert len(load(tmp_path).samples) == 40
 
 
 def as_another(folder, change):
