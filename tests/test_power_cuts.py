@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from needs import Late, real_time, until
 from recorded import record_drives
+from test_tub import records, tub
 
 from rover_learn import training
 from rover_lib.cli import main
@@ -179,8 +180,12 @@ def finish(inputs, folder):
         finish_killed(part)
 
 
-def export(inputs, folder):
-    main(["export-dataset", str(inputs / "episodes"), str(folder / "out")])
+def export(inputs, folder, source="episodes"):
+    main(["export-dataset", str(inputs / source), str(folder / "out")])
+
+
+def import_tub(inputs, folder):
+    export(inputs, folder, "tub")
 
 
 def train(inputs, folder):
@@ -206,6 +211,7 @@ def content_of(folder):
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
     record_drives(folder / "episodes")
+    tub(folder / "tub", records(70))
     child = start(train, folder, folder)
     assert os.waitpid(child, 0)[1] == 0
     with pytest.raises(ZeroDivisionError), EpisodeWriter(folder / NAME, About(), resolution=None) as writer:
@@ -217,7 +223,7 @@ def inputs(tmp_path_factory):
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("work", [finish, export, train, run])
+@pytest.mark.parametrize("work", [finish, export, import_tub, train, run])
 def test_what_a_power_cut_leaves_is_whole_or_not_there(inputs, disk, work, monkeypatch):
     """And after it the work can be done again: it is, once, at a moment in the middle."""
     monkeypatch.setenv("ROVER_CACHE", str(disk / "cache"))

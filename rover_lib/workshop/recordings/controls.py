@@ -180,9 +180,8 @@ def _refuse_other_pulses(channel: Channel, duties_pct: dict[int, float]) -> None
     pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
     if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        what = (
-            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us"
-        )
+        count = f"{len(far)} of {len(pulses_us)}"
+        what = f"{channel.name}: {count} pulses lie far beyond this car's {low_us} to {high_us} us"
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
         raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
 

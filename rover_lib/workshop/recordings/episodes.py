@@ -174,9 +174,8 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults, pictu
         controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        faults.add(
-            folder, "nothing_usable", f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
-        )
+        note = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        faults.add(folder, "nothing_usable", note)
         return None
     return Episode(
         id=folder.name,

@@ -49,9 +49,8 @@ def settle_names(
     meant = read_as_car(own)
     say = f"{option} {','.join(meant or own)}"
     if said and meant and meant != said:
-        raise error(
-            f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}", remedy=f"say {say}, or nothing"
-        )
+        what = f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}"
+        raise error(what, remedy=f"say {say}, or nothing")
     if meant and meant != own and not said:
         raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=f"if they are, say {say}")
     return said or own

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,8 +21,11 @@ class Pictures:
     def __init__(self, faults: Faults):
         self._faults = faults
         name = hashlib.sha256(bytes(faults.root.resolve())).hexdigest()[:16]
-        self._file, self._known, self._whole = cache_root() / f"pictures-{name}.json", dict[str, list[int]](), {}
-        with suppress(OSError, ValueError, TypeError):  # TypeError: JSON of another kind
+        self._known: dict[str, Sequence[int]] = {}
+        self._whole: dict[str, Sequence[int]] = {}
+        self._file: Path | None = None
+        with suppress(OSError, ValueError, TypeError, RuntimeError):  # JSON of another kind; a user without a home
+            self._file = cache_root() / f"pictures-{name}.json"
             self._known = dict(read_json(self._file))
 
     def size_of(self, home: Path, picture: Path, name: str, listing: Path) -> tuple[int, int] | None:
@@ -29,12 +34,12 @@ class Pictures:
         home: that folder, resolved. name: the picture's in `listing`, the file that lists it.
         """
         try:
-            if Path(name).is_absolute() or not picture.resolve().is_relative_to(home):
+            if name.startswith(os.sep) or not os.path.realpath(picture).startswith(f"{home}{os.sep}"):
                 self._faults.add(listing, "path_leaves_folder", f"{quote(name)} is outside of the episode")
                 return None
             there = picture.stat()
             # The time of the last change of any kind: a copy may bring along the time of its content.
-            key = f"{picture} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
+            key = f"{home.name}/{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
             self._whole[key] = self._known.get(key) or check_jpeg(read_plain(picture, MOST_BYTES))
             height, width = self._whole[key]
             return height, width
@@ -46,7 +51,7 @@ class Pictures:
 
     def keep(self) -> None:
         """Write the cache, if it has changed and there is room for it."""
-        if self._whole.keys() != self._known.keys():
+        if self._file and self._whole.keys() != self._known.keys():
             with suppress(OSError):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
                 self._file.write_text(json.dumps(self._whole))  # half a file is no JSON, and is not used

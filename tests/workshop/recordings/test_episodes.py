@@ -12,7 +12,7 @@ import hostile
 import numpy as np
 import pytest
 import simplejpeg
-from recorded import real_recordings
+from recorded import edit_json, real_recordings
 
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
@@ -52,10 +52,7 @@ def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
 
 def edit(folder, change):
     """Rewrite a recording's JSON."""
-    path = folder / "episode_data.json"
-    content = json.loads(path.read_text())
-    changed = change(content)
-    path.write_text(json.dumps(content if changed is None else changed))
+    edit_json(folder / "episode_data.json", change)
     return folder
 
 
@@ -115,7 +112,7 @@ def test_pairs_of_a_faultless_recording(tmp_path):
     ("columns", "driver"), [({}, "human"), ({"mode": "static"}, "policy"), ({"driver": "nobody"}, "nobody")]
 )
 def test_every_sample_says_who_drove(tmp_path, columns, driver):
-    edit(record(tmp_path), lambda content: [row.update(columns) for row in content["control_samples"][10:]] and None)
+    edit(record(tmp_path), lambda content: [row.update(columns) for row in content["control_samples"][10:]])
     edit(tmp_path / "episode_20260101_120000", lambda content: content["control_samples"][20].update(driver="the cat"))
     recordings = load(tmp_path)
     assert {sample.driver for sample in recordings.samples if sample.row > 15} == {driver}
@@ -232,12 +229,12 @@ def test_the_same_drive_again_is_left_out(tmp_path, change):
 
 def test_equal_actions_before_other_scenes_are_no_copy(tmp_path):
     """As a keyboard makes them."""
-    as_another(
-        record(tmp_path),
-        lambda folder: [
-            cv2.imwrite(str(path), np.full((18, 32, 3), 90, np.uint8)) for path in (folder / "frames").iterdir()
-        ],
-    )
+
+    def elsewhere(folder):
+        for path in (folder / "frames").iterdir():
+            cv2.imwrite(str(path), np.full((18, 32, 3), 90, np.uint8))
+
+    as_another(record(tmp_path), elsewhere)
     assert len(load(tmp_path).episodes) == 2
 
 
@@ -272,7 +269,7 @@ NO_PULSES = [
 
 @pytest.mark.parametrize("lost", NO_PULSES, ids=["no period", "no pulse", "flagged"])
 def test_throttle_without_a_measured_pulse_is_missing_not_zero(tmp_path, lost):
-    edit(record(tmp_path), lambda content: [row.update(lost) for row in content["control_samples"][20:30]] and None)
+    edit(record(tmp_path), lambda content: [row.update(lost) for row in content["control_samples"][20:30]])
     recordings = load(tmp_path)
     kind = "throttle_no_pulse" if "throttle_measured" in lost else "throttle_zero_period"
     assert kinds(recordings) == {kind: 10, "frame_without_measurement": 8, "frame_without_state": 1}
@@ -425,9 +422,8 @@ def rewritten(formulas, wrong=0, share=1.0):
             for name, (neutral, span) in formulas.items():
                 low = -1 if name == "steering" else 0
                 said = (100 * row[f"{name}_raw_us"] / row[f"{name}_period_us"] - neutral) / span
-                row[f"{name}_normalized"] = round(
-                    float(rng.uniform(low, 1)) if i < wrong else min(max(said, low), 1), 4
-                )
+                said = float(rng.uniform(low, 1)) if i < wrong else min(max(said, low), 1)
+                row[f"{name}_normalized"] = round(said, 4)
 
     return change
 

@@ -16,6 +16,7 @@ import torch
 from click.testing import CliRunner
 from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
+from recorded import edit_json as edit
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -115,25 +116,22 @@ def test_our_own_recordings_say_their_names_themselves(tmp_path):
 # ---- what LeRobot's writer made ------------------------------------------------------------------------------------
 
 
-def make(root, kind="image", actions=CAR, states=CAR, fps=FPS, value=None):
-    """EPISODES of FRAMES by LeRobot's writer. actions, states: the features' names. value: of every action."""
+def make(root, kind):
+    """EPISODES of FRAMES by LeRobot's writer."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    row = {"dtype": "float32", "shape": (2,)}
-    features = {
-        CAM: {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]},
-        "observation.state": row | {"names": list(states)},
-        "action": row | {"names": list(actions)},
-    }
+    row = {"dtype": "float32", "shape": (2,), "names": list(CAR)}
+    picture = {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]}
+    features = {CAM: picture, "observation.state": row, "action": row}
     video = {"use_videos": kind == "video", "video_backend": "pyav"}
-    made = LeRobotDataset.create("local/made", fps, features, root=root, **video)
+    made = LeRobotDataset.create("local/made", FPS, features, root=root, **video)
     rng = np.random.default_rng(0)
     for episode in range(EPISODES):
         for _ in range(FRAMES + episode):
             row = {
                 CAM: smooth_frame(rng, *SIZE),
                 "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
-                "action": rng.uniform(0, 0.5, 2).astype(np.float32) if value is None else np.float32(value),
+                "action": rng.uniform(0, 0.5, 2).astype(np.float32),
                 "task": f"hit the {episode}. balloon",
             }
             made.add_frame(row)
@@ -149,9 +147,7 @@ def datasets(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(huggingface.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
-        yield functools.cache(
-            lambda kind="image", **options: make(tmp_path_factory.mktemp("made") / kind, kind, **options)
-        )
+        yield functools.cache(lambda kind="image": make(tmp_path_factory.mktemp("made") / kind, kind))
 
 
 @pytest.fixture
@@ -273,11 +269,9 @@ def version_2(root):
         part = rows.slice(episode["dataset_from_index"], episode["length"])
         parquet.write_table(part, root / f"data/chunk-000/episode_{i:06d}.parquet")
     for name, keys in (("episodes", ("episode_index", "length")), ("tasks", ("task_index", "task"))):
-        told = (
-            episodes
-            if name == "episodes"
-            else [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
-        )
+        told = episodes
+        if name == "tasks":
+            told = [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
         lines = [json.dumps({key: row[key] for key in keys}) for row in told]
         (root / f"meta/{name}.jsonl").write_text("\n".join(lines) + "\n")
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -411,9 +405,8 @@ def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
         column = pyarrow.array([{"bytes": data, "path": None} for data in pictures], t.schema.field(CAM).type)
         actions = t.column("action").to_pylist()
         actions[10:20] = actions[:10]
-        t = t.set_column(
-            t.column_names.index("action"), "action", pyarrow.array(actions, t.schema.field("action").type)
-        )
+        acted = pyarrow.array(actions, t.schema.field("action").type)
+        t = t.set_column(t.column_names.index("action"), "action", acted)
         return t.set_column(at, CAM, column)
 
     pictures[10:20] = pictures[:10]
@@ -423,29 +416,20 @@ def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
     assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
 
 
-def edit(path, change):
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 @pytest.mark.slow
 def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, datasets, tmp_path):
     """A fine-tuned policy has its base's input_features, and LeRobot never resizes."""
     smaller = shutil.copytree(trained, tmp_path / "smaller")
-    edit(
-        smaller / "config.json",
-        lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, 36, 128]),
-    )
+    seen = "observation.images.cam_front"
+    edit(smaller / "config.json", lambda c: c["input_features"][seen].update(shape=[3, 36, 128]))
     loaded, right = load(smaller, datasets()), load(trained, datasets())
     (note,) = loaded.checkpoint.report["notes"]
     assert "128x36" in note and "128x72" in note
     assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
     sample = right.recordings.samples[0]
     assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
-    write_lerobot(
-        tmp_path / "ours", replace(right.checkpoint.config, image_sizes=((36, 64),)), right.checkpoint.weights, {}
-    )
+    squeezed = replace(right.checkpoint.config, image_sizes=((36, 64),))
+    write_lerobot(tmp_path / "ours", squeezed, right.checkpoint.weights, {})
     assert load(tmp_path / "ours", datasets()).checkpoint.config.image_sizes == ((36, 64),)  # squeezed on purpose
 
 
