@@ -50,12 +50,10 @@ class Formula:
         duty = f"(duty % - {self.neutral_pct:.3g})" if self.neutral_pct else "duty %"
         return f"{duty} / {self.span_pct:.3g}"
 
-    def actions(self, duties_pct: np.ndarray) -> np.ndarray:
-        return ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
-
     def is_followed(self, actions: np.ndarray, duties_pct: np.ndarray) -> bool:
         """Whether recorded actions, (n,), are those of this formula at their duties, all but a few."""
-        agrees = np.abs(self.actions(duties_pct) - actions) <= EXACT
+        expected = ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
+        agrees = np.abs(expected - actions) <= EXACT
         return len(actions) > 0 and agrees.mean() >= FOLLOWS
 
 
