@@ -41,7 +41,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def __init__(self, config: RoverArtifactConfig, dataset_meta: Any = None, **kwargs: Any):
         super().__init__(config)
         self.config: RoverArtifactConfig = config
-        self._limits = this_car().limits
+        self._limits, self._settings = this_car().limits, Settings.of(params()["drive"])
         self._queue: deque[Tensor] = deque()
         self._scores: list[float] = []  # Plan.strange of the newest plans
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
@@ -68,7 +68,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
 
         Raises DriveFault where the policy has seen nothing like its pictures, unless params.yml has it otherwise.
         """
-        if boottime() - self._planned_s > _stop_s():
+        if boottime() - self._planned_s > self._settings.stop_s:
             self._queue.clear()
         if not self._queue:
             self._planned_s = boottime()
@@ -78,7 +78,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         return self._queue.popleft()
 
     def _check_familiar(self) -> None:
-        if self._process.strange is None or Settings.of(params()["drive"]).unfamiliar != STOP:
+        if self._process.strange is None or self._settings.unfamiliar != STOP:
             return
         self._scores = [*self._scores, self._process.strange][-SMOOTHED:]
         if not (strange := smoothed(self._scores)) < 1:
@@ -93,10 +93,8 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         """
         camera = f"{OBS_IMAGES}.{self._camera}"
         if not {camera, OBS_STATE} <= set(batch):
-            remedy = f"--robot.camera_name={self._camera} --dataset.video=true"
-            raise PolicyError(
-                f"the policy needs {camera} and {OBS_STATE}", found=sorted(map(str, batch)), remedy=remedy
-            )
+            what, remedy = "the policy needs", f"--robot.camera_name={self._camera} --dataset.video=true"
+            raise PolicyError(f"{what} {camera} and {OBS_STATE}", found=sorted(map(str, batch)), remedy=remedy)
         pictures = (batch[camera].detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8)
         states = batch[OBS_STATE].detach().cpu().numpy()
         chunks = []
@@ -136,7 +134,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             what = "the rover has one camera, and steering and throttle as state and actions"
             raise PolicyError(what, found=f"{cameras} and {names}")
         self._camera = cameras[0]
-        rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), _stop_s()
+        rate_hz, chunk, stop_s = float(manifest["rate_hz"]), int(manifest["chunk"]), self._settings.stop_s
         if self.config.n_action_steps > (most := min(chunk, int(stop_s * rate_hz))):
             what = f"n_action_steps may be {most} at most: `rover drive` stops by a plan of {stop_s:g} s"
             raise ParamsError(what, found=self.config.n_action_steps)
@@ -145,8 +143,3 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         for asks, option in ((find_rollout(), "--fps"), (dataset_meta, "--dataset.fps")):
             if asks is not None and asks.fps != rate_hz:
                 raise PolicyError("not this artifact's rate", found=asks.fps, remedy=f"{option}={rate_hz:g}")
-
-
-def _stop_s() -> float:
-    """Return the age of a plan at which `rover drive` stops the car."""
-    return Settings.of(params()["drive"]).stop_s

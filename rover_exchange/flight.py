@@ -33,9 +33,8 @@ def flight_figure(flight: Flight) -> Figure:
     if (ticks["fade"] < 1).any():
         # The area hangs from the top: its share of the height is the share of the throttle that is taken away.
         options = {"step": "post", "transform": throttle.get_xaxis_transform(), "color": RED, "alpha": 0.18, "lw": 0}
-        throttle.fill_between(
-            t_s, ticks["fade"], 1, label="faded, for the plan's age or an unfamiliar place", **options
-        )
+        options["label"] = "faded, for the plan's age or an unfamiliar place"
+        throttle.fill_between(t_s, ticks["fade"], 1, **options)
     _draw_plan(plan, ticks, flight.header.get("drive", {}))
     late.plot(t_s, ticks["late_ms"], ".", color=SLATE, ms=2.5, label="lateness of a command")
     for ax, name in zip(axes[:, 0], HEIGHTS, strict=True):

@@ -21,7 +21,8 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture, nothing_usable
+from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, nothing_usable
+from rover_lib.workshop.recordings.pictures import Pictures
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
     Episode,
@@ -142,7 +143,7 @@ def _samples(
     run: list[_Record], tub: Path, car: Car, begins: bool, stands: set[int], faults: Faults
 ) -> tuple[Sample, ...]:
     """begins: whether the run begins its session, so that the car stood before it. stands: see _standing_parts."""
-    images, home = tub / "images", tub.resolve()
+    images, home, pictures = tub / "images", tub.resolve(), Pictures(faults)
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
@@ -150,7 +151,7 @@ def _samples(
     actions = np.stack([-car.left * np.array([r.angle for r in run]), throttle], 1).astype(np.float32)
     samples = []
     for k, record in enumerate(run):
-        if not check_picture(home, images / record.picture, record.picture, tub, faults) or (k == 0 and not begins):
+        if not pictures.size_of(home, images / record.picture, record.picture, tub) or (k == 0 and not begins):
             continue
         after = min(k + 1, len(run) - 1)
         before = actions[k - 1] if k else np.asarray(NEUTRAL, np.float32)

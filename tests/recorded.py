@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,13 @@ def real_recordings() -> Path:
 def content_of(folder: Path) -> dict[str, Any]:
     """Return what an episode's file says."""
     return json.loads((folder / "episode_data.json").read_text())
+
+
+def edit_json(path: Path, change: Callable[[Any], object]) -> None:
+    """Rewrite a JSON file after `change` has altered its content in place."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
 
 
 def names_in(folder: Path) -> list[str]:

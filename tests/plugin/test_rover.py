@@ -231,9 +231,8 @@ def test_what_an_arm_does_is_refused_before_anything_is_opened(tmp_path, strateg
     """LeRobot's classes are known by their names, and the config by its variable's."""
     moves = {"smooth_handover": True, "reset_to_initial_position": True} if strategy == "Episodic" else {}
     strategy = type(strategy, (), moves)()
-    cfg = type("RolloutConfig", (SimpleNamespace,), {})(
-        strategy=strategy, interpolation_multiplier=multiplier, teleop=teleop
-    )
+    config = type("RolloutConfig", (SimpleNamespace,), {})
+    cfg = config(strategy=strategy, interpolation_multiplier=multiplier, teleop=teleop)
     rover = Rover(RoverConfig(port="/dev/nothing", calibration_dir=tmp_path))
     with pytest.raises(ParamsError, match=word):
         rover.connect()

@@ -102,9 +102,8 @@ def test_a_packed_folder_is_a_pretrained_policy(artifact, tmp_path, monkeypatch)
     assert config.input_features["observation.images.cam_front"].shape == (3, 48, 96)
     policy = make_policy(config, ds_meta=dataset())
     overrides = {"device_processor": {"device": "cpu"}, "rename_observations_processor": {"rename_map": {}}}
-    before, after = make_pre_post_processors(
-        config, pretrained_path=str(moved), dataset_stats={}, preprocessor_overrides=overrides
-    )
+    given = {"pretrained_path": str(moved), "dataset_stats": {}, "preprocessor_overrides": overrides}
+    before, after = make_pre_post_processors(config, **given)
     picture, state = np.zeros((36, 64, 3), np.uint8), np.zeros(2, np.float32)
     observation = {"observation.images.cam_front": picture, "observation.state": state}
     action = predict_action(observation, policy, torch.device("cpu"), before, after, use_amp=False)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from command import rover
+from test_episodes import kinds
 
 from rover_exchange.export_dataset import usual_rate_hz
 from rover_exchange.tub import read_tub
@@ -50,10 +51,6 @@ def tub(root, rows, deleted=(), per_catalog=30, lines=lambda rows: [json.dumps(r
     last = {"paths": paths, "current_index": len(rows), "max_len": per_catalog, "deleted_indexes": list(deleted)}
     (root / "manifest.json").write_text("\n".join(map(json.dumps, [[], [], {}, {"created_at": 1.0}, last])) + "\n")
     return root
-
-
-def kinds(recordings):
-    return {fault.kind: fault.count for fault in recordings.faults}
 
 
 @pytest.mark.parametrize(("car", "side"), [(Car(), 1), (LEFT, -1)])
@@ -151,17 +148,6 @@ def test_what_is_broken_is_counted(tmp_path):
             (root / "manifest.json").write_text(manifest)
         with pytest.raises(EpisodeError, match=r"manifest\.json"):
             read_tub(root, LEFT)
-
-
-@pytest.mark.slow
-def test_a_folder_of_tubs_is_named_with_a_command_that_works(tmp_path):
-    for i in range(2):
-        tub(tmp_path / f"tubs/tub_{i}", records(20))
-    refusal = rover("export-dataset", tmp_path / "tubs", tmp_path / "out")
-    assert refusal.exit_code == 1 and "a folder of 2 donkeycar tubs" in refusal.output
-    words = refusal.output.partition("; rover ")[2].partition(",")[0].replace("OUT", str(tmp_path / "out")).split()
-    done = rover(*words)
-    assert done.exit_code == 0, done.output
 
 
 @pytest.mark.slow

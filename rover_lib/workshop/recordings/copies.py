@@ -64,7 +64,10 @@ def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
 def _look_alike(episode: Episode, other: Episode, pairs: list[tuple[int, int]]) -> bool:
     """Whether most pictures at the same actions are the same. pairs: a sample of each."""
     found: Counter[bool] = Counter()
-    for k, there in pick_evenly(sorted(pairs), COMPARED):
+    chosen = pick_evenly(sorted(pairs), COMPARED)
+    for k, there in chosen:
+        if found[False] > SHARED * len(chosen):
+            return False
         try:
             seen = [_scaled(e.samples[i].frame_bgr()) for e, i in ((episode, k), (other, there))]
         except EpisodeError:

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
-from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
+from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import EPISODE_FILES
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
@@ -43,6 +42,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
+from rover_lib.workshop.recordings.pictures import Pictures
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
 from rover_lib.workshop.recordings.strangers import name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
@@ -120,10 +120,13 @@ def load_recordings(
         many = f"{len(killed)} killed ones" if killed else None
         raise EpisodeError(f"{root}: no episode folders in it", found=many, remedy=remedy)
     faults = Faults(root)
+    pictures = Pictures(faults)
     for part in killed:
         faults.add(part, "killed_recording", finish)
     listed = progress(folders, desc="reading episodes", total=len(folders))
-    episodes = tuple(episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults)))
+    loaded = [_load_episode(folder, chunk, sync_s, faults, pictures) for folder in listed]
+    episodes = tuple(episode for episode in loaded if episode)
+    pictures.keep()
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise nothing_usable(f"{root}: no usable sample in {len(folders)} folder(s)", faults.listed(), remedy)
@@ -144,7 +147,7 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
     return EpisodeError(f"{what} ({worst or 'empty'})", found=found or None, remedy="" if "; " in found else remedy)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults, pictures: Pictures) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         with limited_memory():
@@ -165,15 +168,14 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
     except EpisodeError as e:
         faults.add(folder, "no_formula", str(e))
         return None
-    frames = _read_frames(folder, frames_source, frame_rows, faults)
+    frames = _read_frames(folder, frames_source, frame_rows, faults, pictures)
     samples: tuple[Sample, ...] = ()
     if controls and frames:
         controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        faults.add(
-            folder, "nothing_usable", f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
-        )
+        note = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        faults.add(folder, "nothing_usable", note)
         return None
     return Episode(
         id=folder.name,
@@ -217,7 +219,7 @@ def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
     return list(table)
 
 
-def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
+def _read_frames(folder: Path, path: Path, rows: list, faults: Faults, pictures: Pictures) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
@@ -237,7 +239,7 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        frames.append(_Frame(int(number), time_s, picture, check_picture(home, picture, name, path, faults)))
+        frames.append(_Frame(int(number), time_s, picture, pictures.size_of(home, picture, name, path)))
     sizes = Counter(f.size for f in frames if f.size)
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
     for i, frame in enumerate(frames):
@@ -254,23 +256,6 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
     return kept
-
-
-def check_picture(home: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
-    """Return a listed picture's (height, width); None unless it is there and whole.
-
-    home: the episode's folder, resolved.
-    """
-    try:
-        if Path(name).is_absolute() or not picture.resolve().is_relative_to(home):
-            faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
-            return None
-        return check_jpeg(read_plain(picture, MOST_BYTES))
-    except CameraError as e:
-        faults.add(picture, "broken_jpeg", str(e))
-    except (OSError, ValueError, RuntimeError):  # not there, unreadable, a name too long, a zero byte, a loop of links
-        faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
-    return None
 
 
 def _actions_of(

@@ -28,7 +28,7 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.controls import Faults
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.names import ACTION, STATE, name_actions, name_states
+from rover_lib.workshop.recordings.names import ACTION, STATE, name_numbers, name_states
 from rover_lib.workshop.recordings.samples import (
     ACTION_NAMES,
     Episode,
@@ -281,7 +281,7 @@ def _layout(
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"record one, or name its column '{key}'")
     sizes = {name: size for name, (_, size) in cameras.items()}
-    actions, action_order = name_actions(root, features, source.action_names)
+    actions, action_order = name_numbers(root, features, ACTION, source.action_names)
     states, state_order, has_state = actions, action_order, STATE in features
     if has_state:
         states, state_order = name_states(root, features, source.action_names)
@@ -294,16 +294,11 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
         remedy = "choose another: --camera NAME"
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
-    height, width = _size_of(feature)
+    # The colours come last or first.
+    height, width = shape[1:] if shape[0] <= 4 < shape[2] else shape[:2]
     if height * width > PICTURE_PIXELS:
         raise EpisodeError(f"{root}: '{key}' has pictures of {width}x{height}", remedy="scale them down")
     return height, width
-
-
-def _size_of(feature: Mapping[str, Any]) -> tuple[int, int]:
-    """Height and width of a camera, whose shape has its colours last or first."""
-    first, second, last = feature["shape"]
-    return (second, last) if first <= 4 < last else (first, second)
 
 
 def _read_entries(root: Path, info: Mapping[str, Any]) -> list[_Entry]:

@@ -49,31 +49,26 @@ def settle_names(
     meant = read_as_car(own)
     say = f"{option} {','.join(meant or own)}"
     if said and meant and meant != said:
-        raise error(
-            f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}", remedy=f"say {say}, or nothing"
-        )
+        what = f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}"
+        raise error(what, remedy=f"say {say}, or nothing")
     if meant and meant != own and not said:
         raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=f"if they are, say {say}")
     return said or own
 
 
-def name_actions(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
-    """Return a dataset's names of its actions, or those `said` by the user, as `Named` has them."""
-    return _name_numbers(root, features, ACTION, said)
-
-
 def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
-    """The same of its states: the user's names of the actions if they have none, or the same as the actions."""
+    """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
     own = _names(features[STATE])
     (size,) = features[STATE]["shape"]
     if own and not (said and own == _names(features[ACTION])):
         said = (read_as_car(own) or own) if said else own
     elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
         said = tuple(f"state_{i}" for i in range(size))
-    return _name_numbers(root, features, STATE, said)
+    return name_numbers(root, features, STATE, said)
 
 
-def _name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
+def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
+    """Return a dataset's names of its states or actions, or those `said` by the user, as `Named` has them."""
     (size,) = features[key]["shape"]
     own = _names(features[key])
     names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)

@@ -243,7 +243,7 @@ class Recordings:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
-        drivers = _counted(s.driver for s in self.samples)
+        drivers = Counter(s.driver for s in self.samples)
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -252,16 +252,12 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
-            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
+            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
             "faults": [vars(f) for f in self.faults],
         }
-
-
-def _counted(words: Iterable[str]) -> dict[str, int]:
-    return dict(sorted(Counter(words).items()))
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:

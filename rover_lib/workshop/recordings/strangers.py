@@ -5,13 +5,12 @@ from pathlib import Path
 from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 
 READ = "only folders of episodes, LeRobotDatasets and donkeycar tubs are read: write a LeRobotDataset of it"
-PICTURE = "[0-9]*_[0-9]*_*.jpg"
 # What lies in a folder, and what the folder then is.
 OTHERS = {
     "model_metadata.json": "an AWS DeepRacer model",
     "policy_best.ckpt": "a checkpoint of the first ACT",
     "dataset_stats.pkl": "a checkpoint of the first ACT",
-    PICTURE: "pictures of a JetRacer or JetBot with a point to drive to in their names, without actions",
+    "[0-9]*_[0-9]*_*.jpg": "pictures of a JetRacer or JetBot with a point to drive to in their names, without actions",
     "*.hdf5": "recordings of the first ACT or of robomimic, in HDF5 files",
     "*.h5": "recordings in HDF5 files",
     "driving_log.csv": "recordings of Udacity's simulator",

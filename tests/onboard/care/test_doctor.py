@@ -224,7 +224,6 @@ def test_a_check_that_breaks_is_its_own_fail(tmp_path, monkeypatch):
     result = rover("doctor", *devices)
     assert {"camera", "Arduino", "governor"} <= set(re.findall(r"^fail +(\w+)", result.stdout, re.M))
     assert result.exit_code == 1 and re.search(r"^\w+ +memory ", result.stdout, re.M)
-    monkeypatch.setattr(
-        doctor, "examine", lambda *args, **options: [doctor.Check("a", "ok", ""), doctor.Check("b", "warning", "")]
-    )
+    checks = [doctor.Check("a", "ok", ""), doctor.Check("b", "warning", "")]
+    monkeypatch.setattr(doctor, "examine", lambda *args, **options: checks)
     assert rover("doctor").exit_code == 0

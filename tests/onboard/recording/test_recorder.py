@@ -215,10 +215,8 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, virtual, monkeypatch):
 def status_of(n, host_s=0.0):
     """Every fourth throttle pulse is lost."""
     throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
-    steering = 1456 + n % 50 * 4, 21316
-    return Telemetry(
-        host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", "-", 1456, 120, 238, *steering, *throttle, 0, 0, 0, 0
-    )
+    receiver = 1456 + n % 50 * 4, 21316, *throttle
+    return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", "-", 1456, 120, 238, *receiver, 0, 0, 0, 0)
 
 
 class FakeLink:

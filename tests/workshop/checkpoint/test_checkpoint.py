@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from policies import TINY, check_is, lerobot_policy, memory_samples, normalised, trainer_content
+from recorded import edit_json as edit
 from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError
@@ -38,12 +39,6 @@ def refused(path) -> str:
     message = str(e.value)
     assert str(path) in message and "\n" not in message and len(message) < 1000 and e.value.remedy
     return message
-
-
-def edit(path, change):
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
 
 
 def save(folder, policy, inner, outer):

@@ -16,6 +16,7 @@ import torch
 from click.testing import CliRunner
 from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
+from recorded import edit_json as edit
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -115,25 +116,22 @@ def test_our_own_recordings_say_their_names_themselves(tmp_path):
 # ---- what LeRobot's writer made ------------------------------------------------------------------------------------
 
 
-def make(root, kind="image", actions=CAR, states=CAR, fps=FPS, value=None):
-    """EPISODES of FRAMES by LeRobot's writer. actions, states: the features' names. value: of every action."""
+def make(root, kind):
+    """EPISODES of FRAMES by LeRobot's writer."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    row = {"dtype": "float32", "shape": (2,)}
-    features = {
-        CAM: {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]},
-        "observation.state": row | {"names": list(states)},
-        "action": row | {"names": list(actions)},
-    }
+    row = {"dtype": "float32", "shape": (2,), "names": list(CAR)}
+    picture = {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]}
+    features = {CAM: picture, "observation.state": row, "action": row}
     video = {"use_videos": kind == "video", "video_backend": "pyav"}
-    made = LeRobotDataset.create("local/made", fps, features, root=root, **video)
+    made = LeRobotDataset.create("local/made", FPS, features, root=root, **video)
     rng = np.random.default_rng(0)
     for episode in range(EPISODES):
         for _ in range(FRAMES + episode):
             row = {
                 CAM: smooth_frame(rng, *SIZE),
                 "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
-                "action": rng.uniform(0, 0.5, 2).astype(np.float32) if value is None else np.float32(value),
+                "action": rng.uniform(0, 0.5, 2).astype(np.float32),
                 "task": f"hit the {episode}. balloon",
             }
             made.add_frame(row)
@@ -149,9 +147,7 @@ def datasets(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(huggingface.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
-        yield functools.cache(
-            lambda kind="image", **options: make(tmp_path_factory.mktemp("made") / kind, kind, **options)
-        )
+        yield functools.cache(lambda kind="image": make(tmp_path_factory.mktemp("made") / kind, kind))
 
 
 @pytest.fixture
@@ -188,30 +184,6 @@ def test_the_names_of_a_dataset_decide_which_column_is_throttle(tmp_path):
     said = features(action=TWO | {"names": list(SWAPPED)}, state=TWO | {"names": list(CAR)})
     found, _ = lerobot_dataset._layout(tmp_path, said, Source(tmp_path))
     assert (found.action_names, found.action_order, found.state_order) == (CAR, (1, 0), (0, 1))
-
-
-@pytest.mark.slow
-def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
-    straight = load_recordings(datasets(), CHUNK).samples[5]
-    swapped = straight.chunk[:, ::-1]
-    other = shutil.copytree(datasets(), tmp_path / "other")
-    content = json.loads((other / "meta/info.json").read_text())
-    for names in ({"motors": SWAPPED}, None):
-        for key in ("action", "observation.state"):
-            content["features"][key]["names"] = names
-        content["features"][CAM]["shape"] = [3, *SIZE]  # colours first
-        written(other, content)
-        if names:
-            recordings = load_recordings(other, CHUNK)
-            assert "action: steering (column 1), throttle (column 0)" in recordings.layout.words()
-            assert np.array_equal(recordings.samples[5].state, straight.state[::-1])
-            assert np.array_equal(recordings.samples[5].chunk, swapped)
-            assert np.array_equal(recordings.samples[5].frame_bgr(), straight.frame_bgr())
-    assert "--action-names steering,throttle" in refused(other)
-    for said, chunk in (("throttle, steering", swapped), ("steering,throttle", straight.chunk)):
-        assert np.array_equal(load_recordings(Source.of(other, said), CHUNK).samples[5].chunk, chunk)
-    result = CliRunner().invoke(main, ["inspect", str(other), "--action-names", "throttle,steering"])
-    assert result.exit_code == 0 and "steering (column 1)" in result.output
 
 
 DATA, EPISODES_AT = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -297,11 +269,9 @@ def version_2(root):
         part = rows.slice(episode["dataset_from_index"], episode["length"])
         parquet.write_table(part, root / f"data/chunk-000/episode_{i:06d}.parquet")
     for name, keys in (("episodes", ("episode_index", "length")), ("tasks", ("task_index", "task"))):
-        told = (
-            episodes
-            if name == "episodes"
-            else [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
-        )
+        told = episodes
+        if name == "tasks":
+            told = [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
         lines = [json.dumps({key: row[key] for key in keys}) for row in told]
         (root / f"meta/{name}.jsonl").write_text("\n".join(lines) + "\n")
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -322,6 +292,7 @@ OTHERS_WAYS = [
     (lambda root: column("dataset_to_index", 10, 2)(root / EPISODES_AT), {"scrambled_index"}),
     (version_2, {"no_statistics"}),
     (lambda root: edit(root / "meta/info.json", lambda c: c["features"]["action"].update(names=[[*CAR]])), set()),
+    (lambda root: edit(root / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])), set()),
 ]
 
 
@@ -376,7 +347,7 @@ def as_printed(message, root, whole):
 
 TRIGGERS = [
     (named(action=None, state=None), (0, 1)),
-    (named(action=[*SWAPPED], state=None), (1, 0)),
+    (named(action={"motors": [*SWAPPED]}, state=None), (1, 0)),
     (named(action=None, state=[[*SWAPPED]]), (1, 0)),
     (named(action=["Throttle", "Steering"], state=["Throttle", "Steering"]), (1, 0)),
     (named(action=["linear.vel", "angular.vel"], state=["linear.vel", "angular.vel"]), (1, 0)),
@@ -394,8 +365,14 @@ TRIGGERS = [
 def test_the_printed_remedy_works_on_what_it_is_printed_for(datasets, copied, trigger, order):
     root = copied()
     trigger(root / EPISODES_AT if trigger is TRIGGERS[-1][0] else root)
-    recordings = load_recordings(as_printed(refused(root), root, datasets()), CHUNK)
+    source, straight = as_printed(refused(root), root, datasets()), load_recordings(datasets(), CHUNK).samples[5]
+    recordings = load_recordings(source, CHUNK)
     assert recordings.layout.action_order == order and len(recordings.samples) == 33
+    assert np.array_equal(recordings.samples[5].chunk, straight.chunk[:, order])
+    assert np.array_equal(recordings.samples[5].state, straight.state[list(recordings.layout.state_order)])
+    if isinstance(source, Source) and source.action_names:
+        result = CliRunner().invoke(main, ["inspect", str(root), "--action-names", ",".join(source.action_names)])
+        assert result.exit_code == 0, result.output
 
 
 @pytest.mark.slow
@@ -428,9 +405,8 @@ def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
         column = pyarrow.array([{"bytes": data, "path": None} for data in pictures], t.schema.field(CAM).type)
         actions = t.column("action").to_pylist()
         actions[10:20] = actions[:10]
-        t = t.set_column(
-            t.column_names.index("action"), "action", pyarrow.array(actions, t.schema.field("action").type)
-        )
+        acted = pyarrow.array(actions, t.schema.field("action").type)
+        t = t.set_column(t.column_names.index("action"), "action", acted)
         return t.set_column(at, CAM, column)
 
     pictures[10:20] = pictures[:10]
@@ -440,29 +416,20 @@ def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
     assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
 
 
-def edit(path, change):
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 @pytest.mark.slow
 def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, datasets, tmp_path):
     """A fine-tuned policy has its base's input_features, and LeRobot never resizes."""
     smaller = shutil.copytree(trained, tmp_path / "smaller")
-    edit(
-        smaller / "config.json",
-        lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, 36, 128]),
-    )
+    seen = "observation.images.cam_front"
+    edit(smaller / "config.json", lambda c: c["input_features"][seen].update(shape=[3, 36, 128]))
     loaded, right = load(smaller, datasets()), load(trained, datasets())
     (note,) = loaded.checkpoint.report["notes"]
     assert "128x36" in note and "128x72" in note
     assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
     sample = right.recordings.samples[0]
     assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
-    write_lerobot(
-        tmp_path / "ours", replace(right.checkpoint.config, image_sizes=((36, 64),)), right.checkpoint.weights, {}
-    )
+    squeezed = replace(right.checkpoint.config, image_sizes=((36, 64),))
+    write_lerobot(tmp_path / "ours", squeezed, right.checkpoint.weights, {})
     assert load(tmp_path / "ours", datasets()).checkpoint.config.image_sizes == ((36, 64),)  # squeezed on purpose
 
 
