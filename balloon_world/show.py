@@ -18,10 +18,9 @@ import cv2
 
 from balloon_world.drives import SEED, NoLog, TimedCar
 from balloon_world.world import RATE_HZ, World
-from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.load import Policy, load_policy
+from rover_lib.onboard.policy.load import load_policy
 
 if TYPE_CHECKING:
     from rover_lib.onboard.view.server import View
@@ -32,7 +31,6 @@ HOLD_S = 1.5  # between two worlds
 # Threads wait for each other by spinning. Beside other busy programs, two needed 400 ms of processor for a plan of the
 # demo's that one computes in 4. The first number is what counts: XNNPACK's pool keeps it for as long as a process runs.
 THREADS = 1
-MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SIDES = {"push left": 1, "push right": -1}  # what the page of a simulation, and no other, can do to the car
 SCRIPT = Path(__file__).with_name("simulation.js").read_bytes()
 SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
@@ -45,24 +43,17 @@ class Simulation:
 
     Whoever watches can push the car off its way. A drive with pushes counts for the pushes, not for the policy.
 
-    artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. title: the
-    page's; "": the name of the artifact's folder. Raises what load_policy() raises.
+    title: the page's; "": the artifact's place. Raises what load_policy() raises.
     """
 
     script = SCRIPT  # for the page
 
     def __init__(self, artifact: Path | str, title: str = ""):
         artifact = Path(artifact)
-        self._title = title or artifact.parent.name
-        suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
-        beside = {mode: artifact.with_name(f"policy_{mode}{suffix}") for mode in MODES}
-        self._paths = {MODES[mode]: path for mode, path in beside.items() if path.is_file()}
-        if artifact not in self._paths.values():
-            self._paths = {artifact.name: artifact}
-        self._wanted = next(name for name, path in self._paths.items() if path == artifact)
-        self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
-        self.car = self._policies[self._wanted].car
-        self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
+        self._title = title or f"{artifact.parent.name}: {artifact.name}"
+        self._policy = load_policy(artifact, threads=THREADS)
+        self.car = self._policy.car
+        self._results = [0, 0]  # hits, worlds
         self._pushed = [0, 0]  # pushes that the policy recovered from, and all
         self._seed = SEED
         cv2.setNumThreads(THREADS)
@@ -91,37 +82,29 @@ class Simulation:
             self.ask("stop")
 
     def ask(self, what: str) -> None:
-        """Do what the page asks for: "stop", "next", a push, or "drive <name>" of another mode. Ignore all else."""
-        if what in SIDES:
-            if self._driving:
-                self._driving.push(SIDES[what])
-            return
-        name = what.removeprefix("drive ")
-        if what != "stop" and what != "next" and name not in self._paths:
+        """Do what the page asks for: "stop", "next" or a push. Ignore all else."""
+        if what in SIDES and self._driving:
+            self._driving.push(SIDES[what])
+        if what not in ("stop", "next"):
             return
         self._held = what == "stop"
-        if name in self._paths:
-            self._wanted = name
         if self._driving:
-            self._seed += what == "next" and not self._driving.world.done  # another policy gets the same world
+            self._seed += what == "next" and not self._driving.world.done
             self._driving.stop.set()
-        if what != "stop":
+        if what == "next":
             self._next.set()
 
     def run(self, post: Post, worlds: int | None = None) -> None:
         """Drive through `worlds` worlds, None: until the view has ended. post: takes each picture."""
         settings, driven = Settings.of(params()["drive"]), 0
         while not self._closing.is_set() and driven != worlds:
-            name = self._wanted
-            if name not in self._policies:
-                self._policies[name] = load_policy(self._paths[name], threads=THREADS)
             world = World(self._seed, left=self.car.left)  # as in run_trials: older recordings turned left
-            car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
+            car = self._driving = PacedCar(world, self._policy, lambda car: post(*self._seen(car)))
             self._next.clear()
             outcome = car.drive(settings, car.log).outcome
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                counted, by = (self._pushed, car.pushes) if car.pushes else (self._results[name], 1)
+                counted, by = (self._pushed, car.pushes) if car.pushes else (self._results, 1)
                 counted[0] += by * car.world.hit
                 counted[1] += by
                 self._seed += 1
@@ -143,7 +126,7 @@ class Simulation:
         """What the page shows of a car now: a message as in feed.py, with `world` for what only a simulation knows."""
         world, row, plan, frame = car.world, car.log.row, car.newest(), car.world.render()
         head: dict[str, Any] = {
-            "phase": "driving", "text": "", "title": f"{self._title}: {self._wanted}, balloon world",
+            "phase": "driving", "text": "", "title": f"{self._title}, balloon world",
             "sent_s": car.clock(), "missing": "", "who": "A", "why": "simulated", "events": [], "machine": {},
             "missed": 0, "hz": RATE_HZ, "late_most_ms": 0.0, "tick": row and row._asdict(),
             "pins": row and [row.steering_us, row.throttle_us], "frame": round(car.clock() * RATE_HZ),
@@ -156,7 +139,6 @@ class Simulation:
             "seed": world.seed,
             "pushed": self._pushed,
             "results": self._results,
-            "drives": self._wanted,
             "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
             "balloon": [world.balloon.x_m, world.balloon.y_m],
         }

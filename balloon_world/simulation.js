@@ -1,10 +1,9 @@
 
-// Appended to the page of a view, for a simulation: which policy drives, a map, and pushes that whoever watches gives.
+// Appended to the page of a view, for a simulation: a map, and pushes that whoever watches gives.
 for (const rule of [
   "#world { display: grid; grid-template-columns: 1fr 120px; gap: 8px; align-items: start; margin: 8px 0; }",
   "#world button { display: block; width: 100%; min-height: 40px; margin: 0 0 6px; padding: 4px 10px; font: inherit;"
     + " text-align: left; color: #e8e8e8; background: #2a2f34; border: 2px solid #2a2f34; border-radius: 6px; }",
-  "#world button.on { border-color: #3b8fd4; }",
   "#map { width: 120px; height: 120px; background: #23282d; }",
   "#hint { grid-column: 1 / -1; }",
   ".real { display: none; }",
@@ -16,7 +15,8 @@ function element(tag, id, parent, more) {
 const parts = document.createElement("div");
 parts.id = "world";
 $("missing").after(parts);
-const hint = element("div", "hint", parts), choices = element("div", "choices", parts);
+element("div", "hint", parts);
+element("button", "next", parts, {textContent: "next world"}).addEventListener("click", () => ask("next"));
 element("canvas", "map", parts, {width: 240, height: 240});
 newsMs = 5000;  // a simulation that waits for a busy machine moves no car
 
@@ -27,22 +27,9 @@ function ask(what) {
 simulated = m => {
   const w = m.world;
   if (!w) return;
-  const names = [...Object.keys(w.results), ""];
-  if (choices.childElementCount !== names.length) {
-    choices.replaceChildren();
-    for (const name of names) {
-      const id = name ? "drive " + name : "next";
-      element("button", id, choices).addEventListener("click", () => ask(id));
-    }
-  }
-  for (const name in w.results) {
-    const b = $("drive " + name), [hits, worlds] = w.results[name];
-    b.textContent = name + (worlds ? ": hit " + hits + " of " + worlds : ": drive it");
-    b.className = name === w.drives ? "on" : "";
-  }
-  put("next", "next world");
-  const [recovered, pushes] = w.pushed;
+  const [hits, worlds] = w.results, [recovered, pushes] = w.pushed;
   put("hint", "Push the car: arrow keys, or tap a side of the picture."
+    + (worlds ? " Hit " + hits + " of " + worlds + "." : "")
     + (pushes ? " Recovered from " + recovered + " of " + pushes + " pushes." : ""));
   // The map has the car's way from below.
   const g = $("map").getContext("2d"), ways = [...w.path, w.balloon];

@@ -5,7 +5,7 @@
 Drives connect to a Unix socket and send the messages that feed.py describes. Browsers get the page over HTTP, and each
 page opens a WebSocket. It receives the newest message, and the next one only after it has confirmed that it shows the
 previous one: so no messages queue up. A page may send only "shown N" and "stop", and the view never sends a drive
-anything but a stop. In a simulation, a page may also ask for the next world or another policy.
+anything but a stop. In a simulation, a page may also ask for the next world or a push.
 
 Whoever has the token may watch the drive and stop it. It is in each request's URL and in no cookie, so that no other
 page in the same browser can use the view.

@@ -349,7 +349,7 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     """Steering may differ here, throttle may not."""
 
     def badly_written(module, config):
-        return SimpleNamespace(predict=lambda inputs: predictions(module, inputs) + torch.tensor([0.0, 0.5]))
+        return SimpleNamespace(run=lambda inputs: [predictions(module, [inputs]) + torch.tensor([0.0, 0.5])])
 
     monkeypatch.setattr("rover_lib.workshop.int8.export.TorchScript", badly_written)
     with pytest.raises(ArtifactError, match="throttle of the written graph differs"):
