@@ -271,11 +271,10 @@ def judge(
 
 @dataclass(frozen=True)
 class TrialReport:
-    """How a policy drove. wilson: 95 % interval of the share of hits. hit: in each world, by its seed."""
+    """How a policy drove. hit: in each world, by its seed."""
 
     hits: int
     trials: int
-    wilson: tuple[float, float]
     hit: tuple[bool, ...]
 
 
@@ -309,7 +308,7 @@ def run_trials(
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
     hit = tuple(_hits_in(policy, World(world_seed, left=left), replan_every) for world_seed in seeds)
-    return TrialReport(sum(hit), worlds, wilson_interval(sum(hit), worlds), hit)
+    return TrialReport(sum(hit), worlds, hit)
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:

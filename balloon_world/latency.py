@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
 JUDGED_MS = 150.0
-How = tuple[float, int, Settings]  # latency in ms, pushes, settings of the loop
 
 
 def measure_latencies(
@@ -47,41 +47,34 @@ def measure_latencies(
     limit_pct = p["gates"]["worlds_lost_pct"]
     given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
-    settings, hows = Settings.of(p["drive"]), list[How]()
+    settings, rows = Settings.of(p["drive"]), list[dict[str, Any]]()
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
-        hows.append((ms, count, replace(settings, compensate=True)))
+        how = {"latency_ms": round(float(ms), 3), "pushes": count}
+        rows.append(how | {"compensate": True})
         if ms:  # a plan that takes no time leaves nothing to compensate
-            hows.append((ms, count, replace(settings, compensate=False)))
-    drives = _drive_all(artifact, hows, worlds, progress)
-    rows = [_row(how, driven) for how, driven in zip(hows, drives, strict=True)]
+            rows.append(how | {"compensate": False})
+
+    def one(policy: Any, asked: tuple[int, int]) -> Driven:
+        how, seed = rows[asked[0]], asked[1]
+        chosen = replace(settings, compensate=how["compensate"])
+        return drive_in(policy, World(seed, how["pushes"]), how["latency_ms"] / 1e3, chosen)
+
+    asked = list(product(range(len(rows)), range(SEED, SEED + worlds)))
+    driven = dict(progress(everywhere(artifact, asked, one), desc="driving", total=len(asked)))
+    for i, row in enumerate(rows):
+        row |= _found([driven[i, seed] for seed in range(SEED, SEED + worlds)])
     metrics = {"rows": rows, "gates": gates(rows, limit_pct)}
     return write_stage(artifact.with_name("drive.json"), "drive", params=given, metrics=metrics, inputs=inputs)
 
 
-def _drive_all(artifact: Path, hows: Sequence[How], worlds: int, progress: Progress) -> list[list[Driven]]:
-    """Drive through the same worlds in each way; return the drives of each."""
-
-    def one(policy: Any, asked: tuple[int, int]) -> Driven:
-        latency_ms, pushes, settings = hows[asked[0]]
-        return drive_in(policy, World(asked[1], pushes), latency_ms / 1e3, settings)
-
-    asked = [(i, seed) for i in range(len(hows)) for seed in range(SEED, SEED + worlds)]
-    drives = dict(progress(everywhere(artifact, asked, one), desc="driving", total=len(asked)))
-    return [[drives[i, seed] for seed in range(SEED, SEED + worlds)] for i in range(len(hows))]
-
-
-def _row(how: How, driven: Sequence[Driven]) -> dict[str, Any]:
-    """Return a row of drive.json."""
-    latency_ms, pushes, settings = how
-    row: dict[str, Any] = {"latency_ms": round(float(latency_ms), 3), "pushes": pushes}
-    row["compensate"] = settings.compensate
+def _found(driven: Sequence[Driven]) -> dict[str, Any]:
+    """Return what a row of drive.json says of its drives."""
     outcomes = [d.outcome for d in driven]
-    row |= count_hits(outcomes)
-    row |= {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
+    found = count_hits(outcomes) | {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
     ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
-        row[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
-    return row
+        found[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None
+    return found
 
 
 def gates(rows: Sequence[Mapping[str, Any]], limit_pct: float) -> list[dict[str, Any]]:
@@ -94,29 +87,12 @@ def gates(rows: Sequence[Mapping[str, Any]], limit_pct: float) -> list[dict[str,
     return [worlds_lost(f"{GATED} at {JUDGED_MS:g} ms: {WORLDS_LOST}", pairs, worlds, limit_pct)]
 
 
-def _how(row: Mapping[str, Any]) -> str:
-    how = f"{row['pushes']} pushes" if row["pushes"] else "left alone"
-    return how if row["compensate"] else f"{how}, not compensated"
-
-
-def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
-    """Return the rows of drive.json as plots.hits draws them, over the latency in ms."""
-    found: dict[str, list[tuple[float, Mapping[str, Any]]]] = {}
-    for row in content["metrics"]["rows"]:
-        found.setdefault(_how(row), []).append((row["latency_ms"], row))
-    return found
-
-
 def table(content: Mapping[str, Any]) -> Table:
     """Show the content of drive.json as a table."""
     rows = []
     for r in content["metrics"]["rows"]:
+        how = f"{r['pushes']} pushes" if r["pushes"] else "left alone"
+        how += "" if r["compensate"] else ", not compensated"
         age = "-" if r["plan_age_p95_ms"] is None else f"{r['plan_age_p95_ms']:.0f} ms"
-        hits = f"{r['hits']} of {r['trials']}"
-        rows.append((_how(r), f"{r['latency_ms']:g} ms", age, hits, str(r["stopped"])))
-    gates, notes = content["metrics"]["gates"], []
-    for g in gates:
-        found = "not measured" if g["found"] is None else f"{g['found']:.3g}"
-        verdict = {True: "pass", False: "FAIL", None: "not shown"}[g["passed"]]
-        notes.append(f"{g['gate']}: {found}, at most {g['limit']}: {verdict}")
-    return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows, notes=notes)
+        rows.append((how, f"{r['latency_ms']:g} ms", age, f"{r['hits']} of {r['trials']}", str(r["stopped"])))
+    return Table(("", "latency", "plan age, p95", "hits", "stopped"), rows)

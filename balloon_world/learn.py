@@ -8,7 +8,6 @@ many seconds of whole drives by the same expert. Both are judged in worlds in wh
 artifacts, which are what would drive the car.
 """
 
-import itertools
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -16,13 +15,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from balloon_world.drives import SEED, append_row, count_hits, drive_in, drive_missing, judge, read_rows
+from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, judge
 from balloon_world.record import BETWEEN_DRIVES, WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
@@ -204,17 +204,15 @@ class _Lab:
         return list(drive_missing(artifact, asked, one, folder / DRIVES_FILE, self.progress, desc).values())
 
     def _demonstrate(self, number: int, left_s: float) -> None:
-        """Record left_s seconds of whole drives by the expert; the last drive is cut."""
-        folder, first = self.folder / _name(DEMONSTRATED, number), 1000 * number
-        done = {row["seed"]: row["human_s"] for row in read_rows(folder / DRIVES_FILE)}
-        for i in itertools.count():
-            if left_s <= HALF_A_TICK_S:
-                return
-            seed = FIRST_DEMONSTRATED + first + i
-            if seed not in done:
-                done[seed] = demonstrate(folder, first + i, self.experiment.learned_in(i, seed), left_s)
-                append_row(folder / DRIVES_FILE, {"seed": seed, "human_s": done[seed]})
-            left_s -= done[seed]
+        """Record left_s seconds of whole drives by the expert, unless they are there; the last drive is cut."""
+        folder, index = self.folder / _name(DEMONSTRATED, number), 1000 * number
+        if folder.exists():
+            return
+        with build_folder(folder) as new:
+            while left_s > HALF_A_TICK_S:
+                world = self.experiment.learned_in(index, FIRST_DEMONSTRATED + index)
+                left_s -= demonstrate(new, index, world, left_s)
+                index += 1
 
     def judge(self, rounds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Drive every policy through the worlds that judge, as far as missing, and return the rows of learn.json."""
@@ -233,8 +231,7 @@ class _Lab:
             human_s = float(sum(r["human_s"] for r in rounds[:number]))
             row: dict[str, Any] = {"name": name, "arm": arm, "round": number, "human_s": human_s}
             for how, outcomes in found.items():
-                hits_of_40 = outcomes[:GATED_WORLDS].count("hit")
-                row[how] = count_hits(outcomes, key="wilson") | {"hits_of_40": hits_of_40}
+                row[how] = count_hits(outcomes, key="wilson")
             rows.append(row)
         return rows
 
@@ -254,29 +251,26 @@ def _anew(folder: Path, index: int, world: World) -> WorldEpisode:
 # --- the results ------------------------------------------------------------------------------------------------------
 
 
+def _hits_of_40(drives: Mapping[str, Any]) -> int | None:
+    """Return how many of the first GATED_WORLDS worlds were hit; None if not all of them were driven."""
+    missed = sum(seed < SEED + GATED_WORLDS for seed in drives["missed"])
+    return GATED_WORLDS - missed if drives["trials"] >= GATED_WORLDS else None
+
+
 def gates(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Judge the last round by hits in notebook 07's 40 worlds, if all were driven, and by a sign test in all worlds."""
     last, other = ([row for row in rows if row["arm"] == arm][-1] for arm in ARMS)
-    hits = {how: last[how]["hits_of_40"] if last[how]["trials"] >= GATED_WORLDS else None for how in (PUSHED, ALONE)}
-    lost = None if hits[ALONE] is None else rows[0][ALONE]["hits_of_40"] - hits[ALONE]
+    pushed, alone, before = (_hits_of_40(drives) for drives in (last[PUSHED], last[ALONE], rows[0][ALONE]))
+    lost = None if alone is None or before is None else before - alone
     missed, others_missed = ({*row[PUSHED]["missed"]} for row in (last, other))
     p = sign_test(len(others_missed - missed), len(missed - others_missed))
     by_chance = p if last[PUSHED]["hits"] > other[PUSHED]["hits"] else 1.0
     least = params()["gates"]["corrected_hits"]
     return [
-        gate(f"hits of {GATED_WORLDS} when pushed, corrected", hits[PUSHED], ">=", least),
+        gate(f"hits of {GATED_WORLDS} when pushed, corrected", pushed, ">=", least),
         gate(f"hits of {GATED_WORLDS} lost when left alone", lost, "<=", 0),
         gate("chance that demonstrations do as well when pushed, by a sign test", by_chance, "<=", CHANCE),
     ]
-
-
-def lines(content: Mapping[str, Any]) -> dict[str, list[tuple[float, Mapping[str, Any]]]]:
-    """Return how the pushed car hits as plots.hits draws it, over the seconds of a human, for each way to learn on."""
-    before, *policies = content["metrics"]["policies"]
-    found = {policy["arm"]: [(0.0, before["pushed"])] for policy in policies}
-    for policy in policies:
-        found[policy["arm"]].append((policy["human_s"], policy["pushed"]))
-    return found
 
 
 def table(content: Mapping[str, Any]) -> Table:

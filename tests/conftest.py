@@ -158,19 +158,18 @@ def artifacts(made_once, request) -> dict[str, Path]:
         from policies import memory_samples
 
         from rover_lib.workshop.act import ACT
-        from rover_lib.workshop.int8.export import export
+        from rover_lib.workshop.int8.export import Exporter
         from rover_lib.workshop.int8.quantize import quantize
         from rover_lib.workshop.int8.scheme import Scheme
 
         thin, calibration = request.getfixturevalue("thin")
-        samples = memory_samples(4, seed=1)
-        export(ACT(thin.config, thin.weights), thin, folder / "policy_fp32.pt", samples=samples)
+        exporter = Exporter(thin, memory_samples(4, seed=1))
+        exporter.export(ACT(thin.config, thin.weights), folder / "policy_fp32.pt")
         mixed = Scheme("mixed", float_blocks=("backbone.stem", "decoder.1.feed_forward"))
         for scheme in (Scheme("dynamic"), Scheme("static"), mixed):
-            path = folder / f"policy_{scheme.mode}.pt"
-            export(quantize(thin, scheme, calibration), thin, path, samples=samples, calibration=calibration)
+            exporter.export(quantize(thin, scheme, calibration), folder / f"policy_{scheme.mode}.pt", calibration)
         static = quantize(thin, Scheme("static"), calibration)
-        export(static, thin, folder / "policy_static.onnx.zip", samples, calibration)
+        exporter.export(static, folder / "policy_static.onnx.zip", calibration)
 
     folder = made_once("artifacts", make)
     return {mode: folder / f"policy_{mode}.pt" for mode in ("fp32", "dynamic", "static", "mixed")}

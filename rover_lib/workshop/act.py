@@ -483,14 +483,6 @@ def multiply_accumulates(model: ACT) -> dict[str, int]:
     return dict(counts)
 
 
-def parameters_by_block(model: ACT) -> dict[str, int]:
-    """Count weights and biases by block, with the names of `multiply_accumulates`."""
-    counts: Counter[str] = Counter()
-    for name, tensor in model.named_parameters():
-        counts[block_of(name)] += tensor.numel()
-    return dict(counts)
-
-
 def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
     """Return an observation of the right shapes: a state of zeros and grey frames."""
     frames = (torch.full((h, w, 3), 128, dtype=torch.uint8) for h, w in config.image_sizes)

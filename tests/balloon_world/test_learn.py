@@ -91,7 +91,6 @@ def policies(pushed, alone=(), trials=40):
         row = {"name": name, "arm": arm, "round": int(number or 0), "human_s": 10.0 * int(number or 0)}
         for how, of in (("pushed", missed), ("alone", alone if name == "corrected-1" else ()), ("decoy", ())):
             row[how] = count_hits(["left" if i in of else "hit" for i in range(trials)], key="wilson")
-            row[how]["hits_of_40"] = row[how]["hits"]
         rows.append(row)
     return rows
 

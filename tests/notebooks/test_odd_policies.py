@@ -65,19 +65,15 @@ def trained(seen, folder):
     return plan
 
 
-def run_here(run_dir, **given):
-    """The five notebooks, which know each other only by files."""
-    for name in NAMES:
-        run_cells(name, run_dir, **(QUICK | given))
-
-
 def test_goes_the_whole_way(tmp_path, monkeypatch, capsys):
     import datasets
 
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
     run_dir = tmp_path / "run"
     theirs = trained(dataset(tmp_path / "dataset"), tmp_path / "policy")
-    run_here(run_dir, checkpoint=str(tmp_path / "policy"), episodes=str(tmp_path / "dataset"))
+    given = {"checkpoint": str(tmp_path / "policy"), "episodes": str(tmp_path / "dataset")}
+    for name in NAMES:  # which know each other only by files
+        run_cells(name, run_dir, **QUICK, **given)
     assert "FP32 artifact and LeRobot differ by less than 1e-4: True" in capsys.readouterr().out
 
     policy = load_policy(run_dir / "policy_fp32.pt")

@@ -45,9 +45,6 @@ class Channel:
     def _span_pct(self, action: float) -> float:
         return self.span_pct if action >= 0 or self.below_pct is None else self.below_pct
 
-    def _duty_pct(self, action: float) -> float:
-        return self.neutral_pct + self._span_pct(action) * action
-
     @property
     def us_per_unit(self) -> float:
         """Microseconds of pulse per unit of action; if the two sides differ, those of the wider one."""
@@ -73,7 +70,8 @@ class Channel:
         action = _finite(action, self.name)
         if not self.low <= action <= self.high:
             raise CarError(f"{self.name} must be in [{self.low:g}, {self.high:g}]", found=f"{action:g}")
-        return round(self._duty_pct(action) / 100 * self.period_us)
+        duty_pct = self.neutral_pct + self._span_pct(action) * action
+        return round(duty_pct / 100 * self.period_us)
 
     def action(self, pulse_us: float, period_us: float | None = None) -> float | None:
         """Return the action that a pulse stands for, clipped to [low, high], or None (not 0) if no pulse was measured.

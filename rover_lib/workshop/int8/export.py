@@ -1,6 +1,6 @@
 """Write the artifact: one file with the graph, its manifest and its parity vectors, which is all that a rover needs.
 
-export(quantized, checkpoint, "policy_static.pt", samples, calibration)  # or .onnx.zip, for ONNX Runtime
+Exporter(checkpoint, samples).export(quantized, "policy_static.pt", calibration)  # or .onnx.zip, for ONNX Runtime
 """
 
 import warnings
@@ -120,6 +120,7 @@ class Exporter:
         self.car = car_of(samples)
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
+        self.gmac = sum(multiply_accumulates(self.float_policy).values()) / 1e9
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity["vectors"]).round().astype(int))
         for i in self.stored:
@@ -129,10 +130,6 @@ class Exporter:
     @cached_property
     def float_actions(self) -> Tensor:
         return predictions(self.float_policy, self.inputs)
-
-    @cached_property
-    def gmac(self) -> float:
-        return sum(multiply_accumulates(self.float_policy).values()) / 1e9
 
     def export(
         self,
@@ -238,17 +235,6 @@ class Exporter:
             errors = (actions - self.float_actions[rows]).abs().amax((0, 1)).tolist()
             allowed = [max(a, self.parity["int8_errors"] * e) for a, e in zip(allowed, errors, strict=True)]
         return dict(zip(self.checkpoint.config.action_names, allowed, strict=True))
-
-
-def export(
-    policy: ACT | QuantizedPolicy,
-    checkpoint: Checkpoint,
-    path: Path | str,
-    samples: Sequence[Sample],
-    calibration: Calibration | None = None,
-) -> str:
-    """Write one artifact as `Exporter.export` does, and return its content hash."""
-    return Exporter(checkpoint, samples).export(policy, path, calibration)[0]
 
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:

@@ -76,7 +76,8 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     threshold = max(map(largest_smoothed, scores.values()))
     familiar.limits = (unit * threshold).astype(np.float32)
     shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
-    low, high = rate_interval(len(shares))
+    # of the rate of new drives beyond the largest of so many: of a Beta(1, n)
+    low, high = (1 - share ** (1 / len(shares)) for share in ((1 + BETWEEN) / 2, (1 - BETWEEN) / 2))
     least = []
     for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
         sample = drives.unseen[name][int(scores[name].argmax())]
@@ -88,9 +89,3 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
 def largest_smoothed(scores: np.ndarray) -> float:
     """Return the largest score of a drive's pictures, (n,), after the smoothing that the rover does."""
     return max(smoothed(scores[: i + 1].tolist()) for i in range(len(scores)))
-
-
-def rate_interval(drives: int) -> tuple[float, float]:
-    """Return the 95 % interval of the rate of new drives beyond the largest of so many: of a Beta(1, drives)."""
-    tail = (1 - BETWEEN) / 2
-    return 1 - (1 - tail) ** (1 / drives), 1 - tail ** (1 / drives)

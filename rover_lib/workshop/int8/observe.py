@@ -297,17 +297,13 @@ def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
             calls.setdefault(str(node.target), []).append(node)
     for nodes in calls.values():
         for sides in ([node.all_input_nodes for node in nodes], [node.users for node in nodes]):
-            shared, *others = (_first_observer(prepared, side) for side in sides)
+            shared, *others = (next((n for n in side if _observer(prepared, n)), None) for side in sides)
             for other in others:
                 if shared is not None and other is not None:
                     other.target = shared.target
     prepared.delete_all_unused_submodules()
     prepared.recompile()
     return prepared
-
-
-def _first_observer(prepared: nn.Module, nodes: Iterable[Node]) -> Node | None:
-    return next((node for node in nodes if _observer(prepared, node)), None)
 
 
 def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:

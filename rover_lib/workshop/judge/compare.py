@@ -55,8 +55,8 @@ class WorstFrame:
 class Fidelity:
     """Chunks of every artifact on the same n frames.
 
-    reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A), or None where nobody drove;
-    is_pad: (n, C) bool, steps after the end of the recording.
+    reference: (n, C, A) float32 of FP32; chunks: the same by mode; recorded: (n, C, A); is_pad: (n, C) bool, steps
+    after the end of the recording.
     """
 
     action_names: tuple[str, ...]
@@ -64,7 +64,7 @@ class Fidelity:
     samples: tuple[Any, ...]
     reference: np.ndarray
     chunks: dict[str, np.ndarray]
-    recorded: np.ndarray | None
+    recorded: np.ndarray
     is_pad: np.ndarray
 
     def errors(self, mode: str) -> np.ndarray:
@@ -102,8 +102,6 @@ class Fidelity:
 
     def recorded_error(self, chunks: np.ndarray) -> dict[str, float | None]:
         """How far plans (n, C, A) are from what the driver did, mean over the recorded steps."""
-        if self.recorded is None:
-            return {}
         e = np.abs(chunks.astype(np.float64) - self.recorded)[~self.is_pad].mean(0)
         return {f"{a}_vs_recorded_pct": self.in_pct(e[i], a) for i, a in enumerate(self.action_names)}
 
@@ -179,8 +177,8 @@ def fidelity(
 ) -> Fidelity:
     """Run every policy on every sample.
 
-    samples: with frame_bgr() and state; chunk (C, A) and is_pad (C,) where there is a recording. action_range: name ->
-    (least, most). Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
+    samples: with frame_bgr(), state, chunk (C, A) and is_pad (C,). action_range: name -> (least, most).
+    Raises PolicyError for no samples, policies of other actions or chunks, or an action without a range.
     """
     names = tuple(reference.action_names)
     if not samples:
@@ -197,16 +195,14 @@ def fidelity(
         frame = sample.frame_bgr()
         for mode, policy in policies.items():
             planned[mode].append(policy.predict_chunk(frame, sample.state))
-    recorded = all(getattr(s, "chunk", None) is not None for s in samples)
-    pads = [s.is_pad for s in samples] if recorded else np.zeros((len(samples), reference.chunk), bool)
     return Fidelity(
         action_names=names,
         action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
         samples=tuple(samples),
         reference=np.stack(planned.pop("")),
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
-        recorded=np.stack([s.chunk for s in samples]) if recorded else None,
-        is_pad=np.asarray(pads, bool),
+        recorded=np.stack([s.chunk for s in samples]),
+        is_pad=np.stack([s.is_pad for s in samples]),
     )
 
 
@@ -234,7 +230,7 @@ def metrics(
         modes[mode] = found | report.summary(mode) | {"pairs": pairs}
     worst = []
     for w in (w for mode in report.chunks for w in report.worst(mode)):
-        at = {"episode": getattr(w.sample, "episode", None), "frame": getattr(w.sample, "frame_name", None)}
+        at = {"episode": w.sample.episode, "frame": w.sample.frame_name}
         found = {"mode": w.mode, "action": w.action, "error_pct": w.error_pct}
         worst.append(found | at | {"fp32": w.reference, "int8": w.other})
     return {

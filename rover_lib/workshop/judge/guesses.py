@@ -71,11 +71,11 @@ class Judged:
 def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
     """Hold the FP32 plans of a comparison and the guesses against the driver.
 
-    learned: samples of other episodes, which the policy could learn from; the guesses know no others. None if nobody
-    drove on the frames of the comparison, or no action is judged.
+    learned: samples of other episodes, which the policy could learn from; the guesses know no others. None if there
+    are none, or no action is judged.
     """
     units = {a: pct for a in report.action_names if (pct := report.pct(a)) is not None}
-    if report.recorded is None or not units or not learned:
+    if not units or not learned:
         return None
     recorded, known = report.recorded, ~report.is_pad
     acted = np.stack([s.chunk for s in learned])

@@ -54,11 +54,6 @@ class Benchmarks:
         return Table(header, rows, notes=notes)
 
 
-def read_clock() -> dict[str, Any] | None:
-    """The metrics of the clock's JSON; None outside a checkout, which alone has it."""
-    return read_stage(CLOCK, "clock")["metrics"] if CLOCK.is_file() else None
-
-
 def read_benchmarks(run_dir: Path | str, fetched: Path | str) -> Benchmarks:
     """Read all benchmark-<host>.json of a run's folder, and of the folder where Ansible puts those of the rovers."""
     by_host: dict[str, dict[str, Any]] = {}

@@ -4,7 +4,7 @@ found = compare_pairs([True] * 39 + [False], [True] * 40)
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 Z = 1.959963984540054  # of 95 %
@@ -33,14 +33,13 @@ def loss_interval(only_first: int, only_second: int, worlds: int) -> tuple[float
         return gap / math.sqrt(spread) if spread > 0 else math.copysign(math.inf, gap)
 
     seen = (only_first - only_second) / worlds
-    return _root(lambda loss: score(loss) - Z, -1.0, seen), _root(lambda loss: score(loss) + Z, seen, 1.0)
-
-
-def _root(falling: Callable[[float], float], low: float, high: float) -> float:
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
-    return (low + high) / 2
+    ends = []
+    for low, high, wanted in ((-1.0, seen, Z), (seen, 1.0, -Z)):  # the score falls from end to end
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if score(middle) > wanted else (low, middle)
+        ends.append((low + high) / 2)
+    return ends[0], ends[1]
 
 
 def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, Any]:

@@ -8,7 +8,6 @@
 # ruff: noqa: F401, these are the names that notebooks use
 
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.plots.drives import hits, students
 from rover_lib.workshop.plots.figures import action_error, episode_overview, familiarity, sensitivity, worst_frames
 from rover_lib.workshop.plots.style import save
 from rover_lib.workshop.plots.tables import gates

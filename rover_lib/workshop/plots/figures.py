@@ -110,12 +110,10 @@ def worst_frames(report: Fidelity, mode: str = "static", count: int = 3, rate_hz
     times_s = np.arange(report.reference.shape[1]) / rate_hz
     for row, found in zip(axes, frames, strict=True):
         style.show_picture(row[0], found.sample, f"{found.action} {found.error_pct:.2f} % off")
-        recorded = getattr(found.sample, "chunk", None)
+        known = ~found.sample.is_pad
         for ax, name in zip(row[1:], every or (found.action,), strict=True):
             i = report.action_names.index(name)
-            if recorded is not None:
-                known = ~found.sample.is_pad
-                ax.plot(times_s[known], recorded[known, i], color=GREY, lw=3, label="driver")
+            ax.plot(times_s[known], found.sample.chunk[known, i], color=GREY, lw=3, label="driver")
             ax.plot(times_s, found.reference[:, i], **line_of("fp32"))
             ax.plot(times_s, found.other[:, i], ls="--", **line_of(mode))
             ax.set_ylabel(name, fontsize=9)

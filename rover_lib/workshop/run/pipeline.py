@@ -18,13 +18,13 @@ from typing import Any
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, content_hash
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop.act import ACT, multiply_accumulates, parameters_by_block
+from rover_lib.onboard.stage import read_stage, sha256_of
+from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.choose import Chooser
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.int8.familiar import Drives
-from rover_lib.workshop.int8.frames import describe_odd, odd_samples, odd_share
+from rover_lib.workshop.int8.frames import odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -32,7 +32,6 @@ from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
-from rover_lib.workshop.recordings.turning import Sides
 from rover_lib.workshop.run.session import Opened, open_run
 
 DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared
@@ -157,14 +156,13 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     again = open_run(run_dir, progress)
     checkpoint, parts = again.checkpoint, again.parts
     exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES))
-    drives = Drives.of(parts)
     stage = read_stage(run_dir / "quantize.json", "quantize")
     made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
     if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
         what = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
         raise ArtifactError(what, remedy="quantize again")
-    calibration = Calibration.load(calibrated)
+    calibration, drives = Calibration.load(calibrated), Drives.of(parts)
     policies: dict[str, ACT | QuantizedPolicy] = {
         "fp32": ACT(checkpoint.config, checkpoint.weights),
         "static": quantize(checkpoint, Scheme.of(made["scheme"]), calibration),
@@ -175,64 +173,3 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
         written[path.name], _ = exporter.export(policy, path, calibration if name == "static" else None, drives)
         forget_graphs()
     return written
-
-
-def write_load(
-    run_dir: Path | str, loaded: Opened, fit: Mapping[str, Any] | None = None, sides: Sides | None = None
-) -> None:
-    """load.json: where a run starts from. fit: `plausible.Fit.summary`."""
-    checkpoint, recordings = loaded.checkpoint, loaded.recordings
-    model = ACT(checkpoint.config, checkpoint.weights)
-    work = {"macs_by_block": multiply_accumulates(model), "parameters_by_block": parameters_by_block(model)}
-    metrics: dict[str, Any] = {
-        "checkpoint": checkpoint.report | {"sha256": checkpoint.sha256, "identity": checkpoint.identity} | work,
-        "recordings": recordings.summary(),
-        "split": loaded.parts.episodes,
-    }
-    if fit:
-        metrics["fit"] = fit
-    if sides and sides.turnings:
-        found = {name: getattr(sides, name) for name in ("side", "mirrored", "denied")}
-        metrics["steering"] = found | {"words": sides.words()}
-    source = recordings.source
-    given = {
-        "checkpoint": checkpoint.path.resolve(),
-        "episodes": recordings.root.resolve(),
-        "action_names": ",".join(source.action_names),
-        "camera": ",".join(source.cameras),
-    }
-    inputs = {checkpoint.path.name: checkpoint.sha256} | recordings.hashes()
-    write_stage(Path(run_dir) / "load.json", "load", params=given, metrics=metrics, inputs=inputs)
-
-
-def write_calibrate(
-    run_dir: Path | str,
-    checkpoint: Checkpoint,
-    calibration: Calibration,
-    samples: Sequence[Sample],
-    recipe: Recipe,
-    note: str | None = None,
-) -> None:
-    """calibration.pt, and calibrate.json: which frames calibrated, and what they showed. note: from `Recipe.choose`."""
-    calibration.save(Path(run_dir) / "calibration.pt")
-    metrics = {
-        "samples": calibration.samples,
-        "note": note,
-        "seconds_s": calibration.seconds,
-        "odd": describe_odd(calibration.frames, calibration.seen),
-        "episodes": sorted({s.episode for s in samples}),
-    }
-    digests = {path: sha256_of(path) for path in {s.frame_path for s in samples}}  # a video holds many frames
-    inputs = {f"{s.episode}/{s.frame_path.name}": digests[s.frame_path] for s in samples}
-    inputs["checkpoint"] = checkpoint.sha256
-    given = {"samples": recipe.samples, "seed": recipe.seed, "smooth": recipe.scheme.smooth}
-    write_stage(Path(run_dir) / "calibrate.json", "calibrate", params=given, metrics=metrics, inputs=inputs)
-
-
-def write_quantize(
-    run_dir: Path | str, checkpoint: Checkpoint, metrics: dict[str, Any], given: Mapping[str, Any] | None = None
-) -> None:
-    """quantize.json. metrics: `modes` from `export_policies`, and the tables of choosing. given: the parameters."""
-    inputs = {"calibration.pt": sha256_of(Path(run_dir) / "calibration.pt"), "checkpoint": checkpoint.sha256}
-    said = dict(given or params()["quantization"])
-    write_stage(Path(run_dir) / "quantize.json", "quantize", params=said, metrics=metrics, inputs=inputs)

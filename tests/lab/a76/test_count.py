@@ -22,7 +22,7 @@ from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
-from rover_lib.workshop.int8.export import export
+from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.progress import silent
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
@@ -145,11 +145,11 @@ def tiny_run(thin, tmp_path_factory) -> Path:
     """A run's folder with artifacts of the tests' thin policy, always the same."""
     folder = tmp_path_factory.mktemp("run")
     (checkpoint, calibration), samples = thin, memory_samples(16)
-    scheme, options = q.Scheme("static"), {"samples": samples[:1]}  # each parity vector takes the emulated core a while
-    export(ACT(checkpoint.config, checkpoint.weights), checkpoint, folder / "policy_fp32.pt", **options)
-    static = q.quantize(checkpoint, scheme, calibration)
-    export(static, checkpoint, folder / "policy_static.pt", calibration=calibration, **options)
-    export(static, checkpoint, folder / "policy_static.onnx.zip", calibration=calibration, **options)
+    exporter = Exporter(checkpoint, samples[:1])  # each parity vector takes the emulated core a while
+    exporter.export(ACT(checkpoint.config, checkpoint.weights), folder / "policy_fp32.pt")
+    static = q.quantize(checkpoint, q.Scheme("static"), calibration)
+    for name in ("policy_static.pt", "policy_static.onnx.zip"):
+        exporter.export(static, folder / name, calibration)
     return folder
 
 

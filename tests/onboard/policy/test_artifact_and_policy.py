@@ -35,10 +35,10 @@ def test_drives(artifacts, mode):
 def test_a_policy_of_gelu_drives_and_is_accepted(tiny, tmp_path):
     """If an operator has changed since it was new, as gelu has, torch names a record of its archive differently."""
     from rover_lib.workshop.act import ACT
-    from rover_lib.workshop.int8.export import export
+    from rover_lib.workshop.int8.export import Exporter
 
     other, path = replace(tiny, config=replace(tiny.config, activation="gelu")), tmp_path / "policy_fp32.pt"
-    content = export(ACT(other.config, other.weights), other, path, memory_samples(1, seed=9))
+    content, _ = Exporter(other, memory_samples(1, seed=9)).export(ACT(other.config, other.weights), path)
     assert load_policy(path).predict_chunk(FRAME, STATE).std() > 0
     assert inspect_artifact(path, allow=("mode",)).content_hash == content
 
@@ -61,11 +61,12 @@ def test_refuses_what_is_not_an_observation_and_plans_that_are_not_finite(artifa
 
 @pytest.mark.slow
 def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny, calibration, tmp_path, monkeypatch):
-    from rover_lib.workshop.int8.export import export
+    from rover_lib.workshop.int8.export import Exporter
     from rover_lib.workshop.int8.quantize import quantize
     from rover_lib.workshop.int8.scheme import Scheme
 
-    export(quantize(tiny, Scheme(), calibration), tiny, tmp_path / "p.pt", memory_samples(1), calibration)
+    static = quantize(tiny, Scheme(), calibration)
+    Exporter(tiny, memory_samples(1)).export(static, tmp_path / "p.pt", calibration)
     asked, (state, frame) = [], (np.full(2, 0.1, np.float32), 255 - FRAME)
     monkeypatch.setattr(
         "rover_lib.onboard.policy.torch_engine.give_back_packed_weights", lambda module: asked.append(module) or 0

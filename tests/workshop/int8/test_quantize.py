@@ -20,7 +20,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct, mae_pct
-from rover_lib.workshop.int8.export import Exporter, export
+from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, restore_observed
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
@@ -340,7 +340,7 @@ def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     act = exporter.float_policy
     assert found.manifest["gmac"] == pytest.approx(sum(multiply_accumulates(act).values()) / 1e9)
     assert found.manifest["weights_mb"] == pytest.approx(4 * sum(p.numel() for p in act.parameters()) / 1e6)
-    export(ACT(tiny.config, tiny.weights), tiny, tmp_path / "b.pt", memory_samples(2))
+    Exporter(tiny, memory_samples(2)).export(ACT(tiny.config, tiny.weights), tmp_path / "b.pt")
     assert "car" not in read_manifest(tmp_path / "b.pt")
     assert read_manifest(tmp_path / "b.pt")["parity"]["tolerance"]["steering"] == pytest.approx(1e-4)
 
@@ -353,5 +353,5 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
 
     monkeypatch.setattr("rover_lib.workshop.int8.export.TorchScript", badly_written)
     with pytest.raises(ArtifactError, match="throttle of the written graph differs"):
-        export(off_by(tiny, 0.1, 0.0), tiny, tmp_path / "a.pt", memory_samples(2), calibration)
+        Exporter(tiny, memory_samples(2)).export(off_by(tiny, 0.1, 0.0), tmp_path / "a.pt", calibration)
     assert not (tmp_path / "a.pt").exists()

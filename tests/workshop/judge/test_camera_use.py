@@ -28,13 +28,15 @@ class Known:
         return np.tile(seen.astype(np.float32), (CHUNK, 1))
 
 
+def seen(k, state):
+    """The k-th frame of a drive, which shows k."""
+    drove = {"chunk": np.zeros((CHUNK, 2)), "is_pad": np.zeros(CHUNK, bool), "episode": "a", "row": k, "time_s": k / 30}
+    return SimpleNamespace(frame_bgr=lambda: np.full((4, 6, 3), k, np.uint8), state=state, **drove)
+
+
 def looked(policy, count=10, action_range=RANGE):
     """On samples of which the k-th shows k and was at k / 100."""
-    samples = [
-        SimpleNamespace(frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8), state=np.full(2, k / 100, np.float32))
-        for k in range(count)
-    ]
-    report = fidelity(policy, {}, samples, action_range)
+    report = fidelity(policy, {}, [seen(k, np.full(2, k / 100, np.float32)) for k in range(count)], action_range)
     policy.asked = 0
     return look(policy, report)
 
@@ -76,12 +78,7 @@ class Turns(Known):
 
 def test_how_far_a_plan_moves_if_its_picture_is_older():
     """The k-th frame shows k: a picture that is 33 ms older moves steering by 0.004, which is 0.4 % of its range."""
-    samples = [
-        SimpleNamespace(
-            frame_bgr=lambda k=k: np.full((4, 6, 3), k, np.uint8), state=np.zeros(2), episode="a", row=k, time_s=k / 30
-        )
-        for k in range(60)
-    ]
+    samples = [seen(k, np.zeros(2)) for k in range(60)]
     found = look(Turns(), fidelity(Turns(), {}, samples[1::2], RANGE), samples)
     assert found.summary()["steering_by_100_ms_pct"] == pytest.approx(3 * 0.4)
     assert found.summary()["throttle_by_100_ms_pct"] == 0

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -46,8 +45,8 @@ def sample(pads=0, recorded=((0, 0),) * CHUNK):
         state=np.zeros(2, np.float32),
         chunk=np.float32(recorded),
         is_pad=is_pad,
-        frame_path=Path("episode/frames/frame_000001.jpg"),
         episode="episode",
+        frame_name="frame_000001.jpg",
     )
 
 

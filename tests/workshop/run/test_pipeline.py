@@ -9,10 +9,11 @@ from policies import memory_samples
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
-from rover_lib.workshop.run.pipeline import Recipe, export_onnx, write_quantize
+from rover_lib.workshop.run.pipeline import Recipe, export_onnx
 from rover_lib.workshop.run.session import Opened
 
 
@@ -55,7 +56,9 @@ def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(
     made = artifacts["static"] if another == "calibration" else artifacts["mixed"]
     (tmp_path / "policy_static.pt").write_bytes(made.read_bytes())
     described = {"content_hash": content_hash(artifacts["static"]), "scheme": asdict(Scheme())}
-    write_quantize(tmp_path, loaded.checkpoint, {"modes": {"static": described}})
+    inputs = {"calibration.pt": sha256_of(tmp_path / "calibration.pt")}
+    given = {"params": {}, "metrics": {"modes": {"static": described}}, "inputs": inputs}
+    write_stage(tmp_path / "quantize.json", "quantize", **given)
     if another == "calibration":
         replace(calibration, seconds=0.0).save(tmp_path / "calibration.pt")
     before = sorted(tmp_path.iterdir())

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from executed import run_cells
 from recorded import record_drives
 
 from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
@@ -12,7 +13,6 @@ from rover_lib.workshop.checkpoint.contents import check_limits
 from rover_lib.workshop.checkpoint.files import write_lerobot
 from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.run import session
-from rover_lib.workshop.run.pipeline import write_load
 from rover_lib.workshop.run.session import load, open_run
 
 
@@ -26,7 +26,7 @@ def test_what_changed_since_is_refused(tiny, tmp_path):
 
     write(0.02)
     drives = record_drives(tmp_path / "episodes", frames=40)
-    write_load(tmp_path, load(tmp_path / "pretrained_model", drives))
+    run_cells("01_load", tmp_path, checkpoint=tmp_path / "pretrained_model", episodes=drives)
     assert open_run(tmp_path).checkpoint.config.action_unnorm.scale == pytest.approx((0.4, 0.02))
     write(0.03)
     with pytest.raises(RoverError, match="statistics have changed"):
