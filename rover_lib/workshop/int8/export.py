@@ -6,6 +6,7 @@ Exporter(checkpoint, samples).export(quantized, "policy_static.pt", calibration)
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from importlib.metadata import entry_points
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -71,7 +72,7 @@ def _reread(frozen: torch.jit.ScriptModule) -> torch.jit.ScriptModule:
 
 
 class Onnx:
-    """The policy as ONNX, written node by node: see `onnx_graph`."""
+    """The policy as ONNX, written node by node: see rover_exchange/onnx_graph.py."""
 
     engine = ONNXRUNTIME
 
@@ -81,14 +82,14 @@ class Onnx:
         import onnxruntime
 
         from rover_lib.onboard.policy.onnx_engine import session_of
-        from rover_lib.workshop.int8.onnx_graph import onnx_model
 
+        (onnx_model,) = entry_points(group="rover.graphs", name="onnx")  # what stands beside rover_lib joins it so
         self.versions = {"onnx": onnx.__version__, "onnxruntime": onnxruntime.__version__}
         self.names = ["state", *(f"frame_{name}" for name in config.cameras)]
         inputs = dict(zip(self.names, example_inputs(config), strict=True))
         graph = graph_of(module)
         outputs = ("chunk", "embedding")[: len(_each(graph(*inputs.values())))]
-        self.model = onnx_model(graph, inputs, outputs).SerializeToString(deterministic=True)
+        self.model = onnx_model.load()(graph, inputs, outputs).SerializeToString(deterministic=True)
         self.session = session_of(self.model, torch.get_num_threads())
 
     def run(self, inputs: tuple[Tensor, ...]) -> Sequence[Tensor]:

@@ -50,10 +50,12 @@ class Formula:
         duty = f"(duty % - {self.neutral_pct:.3g})" if self.neutral_pct else "duty %"
         return f"{duty} / {self.span_pct:.3g}"
 
+    def actions(self, duties_pct: np.ndarray) -> np.ndarray:
+        return ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
+
     def is_followed(self, actions: np.ndarray, duties_pct: np.ndarray) -> bool:
         """Whether recorded actions, (n,), are those of this formula at their duties, all but a few."""
-        expected = ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
-        agrees = np.abs(expected - actions) <= EXACT
+        agrees = np.abs(self.actions(duties_pct) - actions) <= EXACT
         return len(actions) > 0 and agrees.mean() >= FOLLOWS
 
 
@@ -178,8 +180,9 @@ def _refuse_other_pulses(channel: Channel, duties_pct: dict[int, float]) -> None
     pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
     if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        count = f"{len(far)} of {len(pulses_us)}"
-        what = f"{channel.name}: {count} pulses lie far beyond this car's {low_us} to {high_us} us"
+        what = (
+            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us"
+        )
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
         raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
 

@@ -8,13 +8,13 @@ import torch
 from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
 from torch import nn
 
+from rover_exchange.onnx_graph import onnx_model, stack_stem
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.graph import graph_of
 from rover_lib.workshop.int8.observe import calibrate
-from rover_lib.workshop.int8.onnx_graph import onnx_model, stack_stem
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
