@@ -156,6 +156,10 @@ class EmulatedArduino:
         """Set the pulses that the receiver gets from the next one on; 0 stands for no signal."""
         self._process.send_line(f"transmitter {steering_us} {throttle_us}")
 
+    def wiggle(self) -> None:
+        """Let the human move the steering stick to both sides and let go. It takes 0.14 s, and counts 0.25 s later."""
+        self._process.send_line("wiggle")
+
     def ready(self, ready: bool) -> None:
         """Set whether the human wiggles the stick unasked whenever a car that was not stopped lacks only that."""
         self._process.send_line(f"ready {ready:d}")
