@@ -72,6 +72,7 @@ def test_too_few_drives_and_parts_of_a_drive_set_no_threshold(thin, tmp_path):
     assert exporter.export(module, tmp_path / "few.pt", drives=few) == plain
 
 
+@pytest.mark.slow
 def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
     state, (sample,) = np.zeros(2, np.float32), memory_samples(1)
     policies = {name: load_policy(made / name) for name in (*MADE, "without.pt")}

@@ -79,6 +79,7 @@ def jumped(dazzled, jumping):
     return calibrate(dazzled, jumping)
 
 
+@pytest.mark.slow
 def test_calibration_keeps_each_frames_extremes(dazzled, jumping, jumped, tmp_path):
     jumped.save(tmp_path / "calibration.pt")
     again = Calibration.load(tmp_path / "calibration.pt")

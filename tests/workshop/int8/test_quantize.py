@@ -155,6 +155,7 @@ def test_refusals(tiny, calibration, tmp_path):
             act_on()
 
 
+@pytest.mark.slow
 def test_clipping_at_either_end_counts(tiny, calibration):
     quantized, few = quantize(tiny, Scheme(observer="minmax"), calibration), memory_samples(12)[:4]
     assert q.most_clipped(quantized, tiny, calibration, few)["clipped_pct"] < 0.5  # they calibrated
@@ -321,6 +322,7 @@ def off_by(checkpoint, *by):
     return q.QuantizedPolicy(Scheme(), act, {})
 
 
+@pytest.mark.slow
 def test_an_artifact_says_what_it_is(tiny, calibration, tmp_path):
     """Its rate, its car, its camera's shape, and how far it may differ: twice its own error, never too much."""
     described = Car().description()
