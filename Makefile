@@ -102,8 +102,9 @@ test: lint $(DEMO)
 	MAKEFLAGS= $(PYTEST)
 
 # No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
+# They hardly wait for anything, so that a process more than there are cores would only import torch once more.
 test-fast: $(READY)
-	$(PYTEST) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
+	$(PYTEST) --numprocesses $$(nproc) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
 
 # Tests in real time and of whole fleets. Run them on a quiet machine before each release.
 check-release: lint $(DEMO)

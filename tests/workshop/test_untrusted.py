@@ -80,6 +80,7 @@ def test_a_table_has_no_more_rows_than_its_bytes_can_hold(tmp_path):
     assert check_table(path) == ["index"]
 
 
+@pytest.mark.slow
 def test_memory_is_limited_within_and_as_before_afterwards():
     before = resource.getrlimit(resource.RLIMIT_DATA)
     with pytest.raises(MemoryError), limited_memory():
