@@ -80,10 +80,10 @@ class Policy:
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
             what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
             raise PolicyError(what, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
+        shapes = [embedding.shape for embedding in embeddings]
+        if shapes != ([(1, *self._familiar.mean.shape)] if self._familiar else []):
+            raise PolicyError(f"{self.path}: gives another embedding than its manifest says", found=shapes)
         if self._familiar:
-            shapes = [embedding.shape for embedding in embeddings]
-            if shapes != [(1, *self._familiar.mean.shape)]:
-                raise PolicyError(f"{self.path}: gives another embedding than its manifest says", found=shapes)
             self.strange = float(self._familiar.strange(embeddings[0])[0])
         return y[0].copy()
 
@@ -119,10 +119,12 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     source.prove()
     engine = import_engine(source).load(source, threads)
     path, vectors = source.path, source.parity
-    policy = Policy(path, engine, source.manifest, Familiar.of(vectors))
+    familiar = Familiar.of(vectors)
+    policy = Policy(path, engine, source.manifest, familiar)
     chunks, strange = _predict(policy, vectors)
     _check_differences(policy, chunks, vectors)
-    _check_strange(policy, strange, vectors)
+    if familiar:
+        _check_strange(policy, familiar.strange(vectors["embedding"]), strange)
     if engine.give_back() and not np.array_equal(_predict(policy, vectors)[0], chunks):
         raise ArtifactError(f"{path}: predicts differently without its original weights", remedy="do not drive")
     give_back_freed()
@@ -155,11 +157,9 @@ def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str,
             raise ArtifactError(what, remedy="do not drive with it")
 
 
-def _check_strange(policy: Policy, strange: list[float | None], vectors: Mapping[str, np.ndarray]) -> None:
+def _check_strange(policy: Policy, wanted: np.ndarray, strange: list[float | None]) -> None:
     """Raise ArtifactError if the parity vectors' pictures are more or less familiar here than where it was made."""
-    if not (familiar := Familiar.of(vectors)):
-        return
-    difference = np.abs(familiar.strange(vectors["embedding"]) - np.array(strange)).max()
+    difference = np.abs(wanted - np.array(strange)).max()
     if not difference <= TOLERANCE[policy.manifest["mode"] != "fp32"]:  # so that NaN fails too
         what = f"{policy.path}: how unfamiliar a picture is differs here by {difference:.3g} of the threshold"
         raise ArtifactError(what, remedy="do not drive with it")

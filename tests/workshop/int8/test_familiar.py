@@ -112,3 +112,13 @@ def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatc
     monkeypatch.undo()
     with pytest.raises(ArtifactError, match=r"unfamiliar|parity vector|sizes"):
         load_policy(tmp_path / "p.zip")
+
+
+def test_an_embedding_that_no_manifest_tells_of_is_refused(made, tmp_path):
+    with Artifact(made / "policy_fp32.onnx.zip") as whole:
+        manifest, vectors, model = dict(whole.manifest), dict(whole.parity), whole.record(artifact.ONNX)
+    del manifest["familiar"]
+    vectors = {name: of for name, of in vectors.items() if name != "embedding" and not name.startswith("familiar")}
+    artifact.save_onnx(tmp_path / "p.zip", model, manifest, vectors)
+    with pytest.raises(ArtifactError, match="another embedding"):
+        load_policy(tmp_path / "p.zip")
