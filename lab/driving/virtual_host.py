@@ -266,7 +266,7 @@ class VirtualPlanner(Planner):
         self._number = 0
         self.content: dict[int, int] = {}  # by a plan's number, when (ms) its picture's scene was really to be seen
         never = cast(Any, None)  # the thread that asks for predictions is never started here
-        super().__init__(eyes.camera, never, commanded, RATE_HZ, limits=world.car.limits, clock=world.clock)
+        super().__init__(eyes.camera, never, commanded, limits=world.car.limits, clock=world.clock)
         self._news = cast(Any, _Waiting(world))
         eyes.on_frame = self._look
 

@@ -70,8 +70,8 @@ def drive_car(
             log.event(sentence, level=logging.WARNING)
         commanded = Commanded()
         planner = Planner(
-            camera, policy.predict, commanded, policy.rate_hz,
-            rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits, strange=lambda: policy.strange,
+            camera, policy, commanded,
+            rest_s=REST_S, latency_s=options.latency_ms / 1e3, limits=this_car().limits,
         )  # fmt: skip
         stack.enter_context(planner)
         session = Session(

@@ -1,6 +1,6 @@
 """Plan while the control loop runs: a thread keeps asking the policy for a plan of the newest frame.
 
-    with PolicyProcess("policy_static.pt") as policy, Planner(camera, policy.predict, commanded, 30.0) as planner:
+    with PolicyProcess("policy_static.pt") as policy, Planner(camera, policy, commanded) as planner:
         plan = planner.newest()
 
 The policy has a process of its own, so that it cannot delay the control loop, and can be killed if it hangs.
@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -38,33 +38,37 @@ ANSWER_BYTES = 100_000
 UNTOLD = 99.0  # Plan.strange where the process tells no number, which a page could not show
 TERMINALS = {signal.SIGINT, signal.SIGHUP, signal.SIGQUIT}  # signals of a terminal to all its programs
 
-Predict = Callable[[np.ndarray, np.ndarray], np.ndarray]  # frame (h, w, 3) uint8 BGR, state (2,) -> (chunk, 2)
+
+class Predictor(Protocol):
+    """What a planner asks. rate_hz: actions per second of a plan. strange: Plan.strange of the newest prediction."""
+
+    rate_hz: float
+    strange: float | None
+
+    def predict(self, frame_bgr: np.ndarray, state: np.ndarray, /) -> np.ndarray:
+        """Return (chunk, 2) actions, unclipped, for a frame (h, w, 3) uint8 BGR and a state (2,), or raise."""
 
 
 class Planner:
     """Keeps planning from the newest frame, in a thread; a context manager.
 
-    predict: returns (chunk, 2) actions, unclipped, or raises. rate_hz: actions per second of a plan. rest_s: pause
-    after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see Plan. strange:
-    returns Plan.strange of the newest prediction.
+    rest_s: pause after each plan, except in without_rest(). latency_s: the least time that a plan takes. limits: see
+    Plan.
     """
 
     def __init__(
         self,
         camera: Camera,
-        predict: Predict,
+        policy: Predictor,
         commanded: Commanded,
-        rate_hz: float,
         *,
         rest_s: float = 0.0,
         latency_s: float = 0.0,
         limits: np.ndarray = LIMITS,
-        strange: Callable[[], float | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._camera, self._predict, self._commanded, self._rate_hz = camera, predict, commanded, rate_hz
+        self._camera, self._policy, self._commanded = camera, policy, commanded
         self._rest_s, self._latency_s, self._limits, self._clock = rest_s, latency_s, limits, clock
-        self._strange = strange
         self._closing = threading.Event()
         self._no_rest = threading.Event()
         self._news = threading.Condition()
@@ -129,13 +133,13 @@ class Planner:
                 if frame is None:
                     continue
                 frame_number = frame.number
-                state = self._commanded.state(frame.captured_s, self._rate_hz)
+                state = self._commanded.state(frame.captured_s, self._policy.rate_hz)
                 asked_s = self._asked_s = self._clock()
-                actions = self._predict(frame.image, state)
+                actions = self._policy.predict(frame.image, state)
                 time.sleep(max(0.0, asked_s + self._latency_s - self._clock()))
                 self._asked_s = None
                 number += 1
-                plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits, self._strange())
+                plan = Plan(number, frame.captured_s, self._clock(), actions, self._limits, self._policy.strange)
                 with self._news:
                     self._plan = plan
                     self._news.notify_all()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +38,10 @@ class Frames:
         return Frame(FRAME, time.monotonic(), self.number, 0, 100.0, 40.0)
 
 
+def policy_of(predict):
+    return SimpleNamespace(predict=predict, rate_hz=30.0, strange=None)
+
+
 def until_raises(planner, kind, match, seconds=3):
     end = time.monotonic() + seconds
     with pytest.raises(kind, match=match):
@@ -53,7 +58,7 @@ def test_plans_follow_the_frames():
         return CHUNK
 
     commanded = Commanded()
-    with Planner(Frames(), predict, commanded, 30.0) as planner:
+    with Planner(Frames(), policy_of(predict), commanded) as planner:
         first = planner.wait(2.0)
         commanded.add(time.monotonic() - 1 / 30, 0.25, 0.5)
         time.sleep(0.05)
@@ -73,9 +78,9 @@ def raising(frame, state):
 def test_what_must_not_drive_is_raised():
     wild = lambda *_: np.full((8, 2), 3.0, np.float32)  # noqa: E731
     for predict, match in ((wild, "outside the range"), (raising, "ZeroDivisionError: by zero")):
-        with Planner(Frames(), predict, Commanded(), 30.0) as planner:
+        with Planner(Frames(), policy_of(predict), Commanded()) as planner:
             until_raises(planner, PolicyError, match)
-    with Planner(Frames(fails_after=3), lambda frame, state: CHUNK, Commanded(), 30.0) as planner:
+    with Planner(Frames(fails_after=3), policy_of(lambda frame, state: CHUNK), Commanded()) as planner:
         until_raises(planner, CameraError, "unplugged")
 
 
@@ -90,7 +95,7 @@ def test_a_plan_to_begin_by_is_fresh(monkeypatch):
             raise PolicyError("too late")
         return answer
 
-    with Planner(Frames(), predict, Commanded(), 30.0, rest_s=10.0) as planner:
+    with Planner(Frames(), policy_of(predict), Commanded(), rest_s=10.0) as planner:
         old = planner.wait(2.0)
         planner.renew(5.0)
         assert planner.newest() is old
