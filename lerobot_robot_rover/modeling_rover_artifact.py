@@ -23,7 +23,7 @@ from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.pilot import RECORD_HERE, unfamiliar
-from rover_lib.onboard.drive.plan import SMOOTHED, STOP, Plan, Settings, smoothed
+from rover_lib.onboard.drive.plan import STOP, Plan, Settings, Smoother, is_unfamiliar
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError
 from rover_lib.onboard.params import params
 
@@ -43,7 +43,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits, self._settings = this_car().limits, Settings.of(params()["drive"])
         self._queue: deque[Tensor] = deque()
-        self._scores: list[float] = []  # Plan.strange of the newest plans
+        self._smoother = Smoother()
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
         self._process = PolicyProcess(config.file)
         weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
@@ -60,7 +60,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Prepare for an episode: wait for the human's gesture, which is not part of it, if a rover is connected."""
         self._queue.clear()
-        self._scores = []
+        self._smoother = Smoother()
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -80,8 +80,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def _check_familiar(self) -> None:
         if self._process.strange is None or self._settings.unfamiliar != STOP:
             return
-        self._scores = [*self._scores, self._process.strange][-SMOOTHED:]
-        if not (strange := smoothed(self._scores)) < 1:
+        if is_unfamiliar(strange := self._smoother.add(self._process.strange)):
             self._queue.clear()
             raise DriveFault(unfamiliar(strange), remedy=RECORD_HERE)
 

@@ -17,7 +17,7 @@ from balloon_world.drives import NoLog, TimedCar, drive_missing, wilson_interval
 from balloon_world.record import SHOVES
 from balloon_world.world import HORIZON_ROW as WALL
 from balloon_world.world import RATE_HZ, World, expert
-from rover_lib.onboard.drive.plan import OFF, Settings, smoothed
+from rover_lib.onboard.drive.plan import OFF, Settings, Smoother
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.workshop.progress import Progress, silent
@@ -28,7 +28,7 @@ from rover_lib.workshop.run.session import open_run
 SEED = 30_000  # of the first world: not of those on which the scores were chosen
 OTHER = 20_000  # from a world's seed to that of the world whose look or pictures it gets
 CHANGE_S, LATE_S = 0.5, 0.1  # LATE_S: of a plan, as on a Pi 5
-BEFORE_S, AFTER_S = 0.5, 1.0  # in time is so long before the car passes the balloon, or so soon after the change
+BEFORE_S, AFTER_S = 0.5, 1.0  # a stop is in time 0.5 s before the car passes the balloon, or within 1 s of the change
 TURNED_RAD, BLUR_PX, HUE, DUSK = math.radians(15), 15, 40, 0.3
 GOOD = ("recorded", "driven", "pushed")  # by the expert, as the recordings; by the policy; by the policy with pushes
 FRAMES = 200  # on which INT8 and FP32 are compared
@@ -153,7 +153,7 @@ def _unfamiliar(policy: Policy, frame: np.ndarray, state: np.ndarray) -> float:
 
 
 def _smooth(scores: Sequence[float]) -> list[float]:
-    return [smoothed(scores[: i + 1]) for i in range(len(scores))]
+    return list(map(Smoother().add, scores))
 
 
 def _told(row: Mapping[str, Any]) -> dict[str, bool]:

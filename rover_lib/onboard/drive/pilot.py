@@ -10,7 +10,7 @@ from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.motion import Motion
-from rover_lib.onboard.drive.plan import STOP, WARN, Commanded, Follower, Plan, Settings
+from rover_lib.onboard.drive.plan import STOP, WARN, Commanded, Follower, Plan, Settings, is_unfamiliar
 from rover_lib.onboard.errors import CameraError, DriveFault, PolicyError, RoverError
 
 FIRST_PLAN_S = 10.0
@@ -178,7 +178,7 @@ class PolicyPilot:
         """Raise RoverError if nobody may drive by the newest picture, or it is unfamiliar to the policy."""
         self.sight.check()
         plan = self._planner.newest()
-        if plan and plan.strange is not None and not plan.strange < 1 and self._settings.unfamiliar == STOP:
+        if plan and plan.strange is not None and is_unfamiliar(plan.strange) and self._settings.unfamiliar == STOP:
             raise RoverError(unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
 
     def sent(self, at_s: float, order: Order) -> None:

@@ -8,7 +8,7 @@ Nothing here uses a clock or a device: times are arguments, in seconds of one mo
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -144,10 +144,21 @@ class Command:
     cut: float = 0.0
 
 
-def smoothed(scores: Sequence[float]) -> float:
-    """Return the mean of the newest SMOOTHED scores of a drive's plans, Plan.strange; there is at least one."""
-    newest = scores[-SMOOTHED:]
-    return sum(newest) / len(newest)
+class Smoother:
+    """The mean of the newest SMOOTHED scores, Plan.strange, of one drive's plans."""
+
+    def __init__(self) -> None:
+        self._newest: deque[float] = deque(maxlen=SMOOTHED)
+
+    def add(self, score: float) -> float:
+        """Take a plan's score; return the mean that has it."""
+        self._newest.append(score)
+        return sum(self._newest) / len(self._newest)
+
+
+def is_unfamiliar(strange: float) -> bool:
+    """Whether a score says that the policy has seen nothing like it; NaN does, too."""
+    return not strange < 1
 
 
 class Follower:
@@ -164,7 +175,7 @@ class Follower:
         self._blended = 0  # ticks since then
         self.strange: float | None = None
         self.strange_s: float | None = None
-        self._scores: list[float] = []  # the newest SMOOTHED
+        self._smoother = Smoother()
 
     def add(self, plan: Plan, now_s: float) -> None:
         """Let a fresh plan take over at this tick. It is ignored unless its frame is newer than the last plan's."""
@@ -176,9 +187,8 @@ class Follower:
             self._offset, self._blended = old - self._meant(plan, now_s), 0
         self.plan = plan
         if plan.strange is not None:
-            self._scores = [*self._scores, plan.strange][-SMOOTHED:]
-            self.strange = smoothed(self._scores)
-            if not self.strange < 1 and self.strange_s is None:  # NaN, too
+            self.strange = self._smoother.add(plan.strange)
+            if is_unfamiliar(self.strange) and self.strange_s is None:
                 self.strange_s = now_s
 
     def stop_s(self) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rover_lib.onboard.drive.plan import smoothed
+from rover_lib.onboard.drive.plan import Smoother
 from rover_lib.onboard.policy.familiar import Familiar
 from rover_lib.workshop.recordings.episodes import Split
 from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, pick_evenly
@@ -76,7 +76,7 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     threshold = max(map(largest_smoothed, scores.values()))
     familiar.limits = (unit * threshold).astype(np.float32)
     shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
-    # of the rate of new drives beyond the largest of so many: of a Beta(1, n)
+    # The share of new drives above the largest of n has a Beta(1, n) distribution; this is its interval.
     low, high = (1 - share ** (1 / len(shares)) for share in ((1 + BETWEEN) / 2, (1 - BETWEEN) / 2))
     least = []
     for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
@@ -88,4 +88,4 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
 
 def largest_smoothed(scores: np.ndarray) -> float:
     """Return the largest score of a drive's pictures, (n,), after the smoothing that the rover does."""
-    return max(smoothed(scores[: i + 1].tolist()) for i in range(len(scores)))
+    return max(map(Smoother().add, scores.tolist()))
