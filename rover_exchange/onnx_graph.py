@@ -166,7 +166,7 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     top, bottom = (torch.cat([e, e[:, : 6 * surplus]], 1) for e in (m.top, m.bottom))
     bottom = torch.cat([bottom, top[:1]])  # the eighth row, whose weight is 0
     edges = {"left": m.left, "right": right, "top": top, "bottom": bottom}
-    if m.dtype == torch.qint8:  # pixel - 128: add 128 without a carry, and read the same bits as signed
+    if m.quantized:  # pixel - 128: add 128 without a carry, and read the same bits as signed
         shifted = w.add("Add", [flat, w.constant(f"{name}_128", np.array(128, np.uint8))], f"{name}_shifted")
         flat = w.add("Cast", [shifted], f"{name}_signed", to=TensorProto.INT8)
         edges = {side: (edge.to(torch.int16) - 128).to(torch.int8) for side, edge in edges.items()}
@@ -238,7 +238,7 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
 
 def _rounded(w: _Writer, n: Node, result: Tensor, source: str, *, relu: bool) -> str:
     """Quantize a result, after a ReLU if there is one and clipping at the zero point does not do the same."""
-    if relu and result.q_zero_point() != (-128 if result.dtype == torch.qint8 else 0):
+    if relu and result.q_zero_point() != -128:
         source = w.add("Relu", [source], f"{n.name}_positive")
     return w.quantized(n.name, result, source)
 

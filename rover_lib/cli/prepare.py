@@ -65,7 +65,7 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     Executes five notebooks in the run's folder. Ends with a verdict, also in report.html and run.json: which artifact
     to deploy, what failed, and what to do about it.
 
-    -p turns any of the notebooks' parameters; a value is YAML: 0.5, affine, [static, mixed].
+    -p turns any of the notebooks' parameters; a value is YAML: 0.5, minmax, [static, mixed].
 
     --only 03 --name try1: execute one notebook on that run again, whose results are replaced; `rover report` judges it.
     """

@@ -125,7 +125,7 @@ class Columns(nn.Module):
     def __init__(self, norm: Affine, height: int, width: int):
         super().__init__()
         self.scale, self.zero_pixel = column_scale(norm)
-        self.dtype: torch.dtype | None = None  # of the quantized output; None if the output is float
+        self.quantized = False  # the output; else it is float
         self.out_width = (width - 1) // 2 + 1
         self.rows = 2 * ((height - 1) // 2) + 7
         self.pitch = 2 * (self.out_width - 1) + self.WINDOW  # padded pixels in a row
@@ -138,15 +138,14 @@ class Columns(nn.Module):
     def forward(self, frame: Tensor) -> Tensor:
         x = torch.cat([self.left, frame.flatten(1), self.right], 1)
         x = torch.cat([self.top, x, self.bottom], 0)
-        if self.dtype == torch.qint8:
+        if self.quantized:
             x = torch.bitwise_xor(x, 128).to(torch.int8)  # pixel - 128: the conversion keeps the bits
         shape, strides = (self.rows, self.out_width, 3 * self.WINDOW), (3 * self.pitch, 6, 1)
         x = x.as_strided(shape, strides).contiguous()
-        if self.dtype is None:
-            x = (x.float() - self.zero_pixel) * self.scale
+        if self.quantized:
+            x = torch._make_per_tensor_quantized_tensor(x, self.scale, self.zero_pixel - 128)
         else:
-            zero_point = self.zero_pixel - (128 if self.dtype == torch.qint8 else 0)
-            x = torch._make_per_tensor_quantized_tensor(x, self.scale, zero_point)
+            x = (x.float() - self.zero_pixel) * self.scale
         return x.permute(2, 0, 1)[None]  # channels-last in memory
 
 

@@ -65,7 +65,7 @@ def test_what_a_run_was_not_asked_to_know_is_refused_before_anything_runs(one_no
     with pytest.raises(runs.RoverError, match="plain folder name"):
         runs.run("ck", "episodes", "../up", runs_dir=tmp_path)
     with pytest.raises(runs.RoverError, match="shape"):
-        runs.execute("01_load", tmp_path, shape="affine")
+        runs.execute("01_load", tmp_path, shape="round")
 
 
 OF_ARTIFACTS = ("load.json", "run.json", "report.html", "arm.json", "students.json", "06_arm.ipynb", "policy_static.pt")
@@ -134,8 +134,7 @@ TURNED = {
     "03_quantize": (
         "quantize",
         {
-            "scheme": "affine", "observers": ["percentile"], "percentile": 99.5, "float_blocks": ["backbone.stem"],
-            "modes": ["mixed"], "choosing_frames": 2,
+            "observers": ["minmax"], "float_blocks": ["backbone.stem"], "modes": ["mixed"], "choosing_frames": 2,
         },
     ),
     "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
@@ -163,9 +162,9 @@ def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     assert calibrated["params"] == TURNED["02_calibrate"][1] and calibrated["metrics"]["samples"] == 7
     schemes = {mode: made.get("scheme") for mode, made in quantized["metrics"]["modes"].items()}
     assert schemes.keys() == {"fp32", "static", "mixed"} and schemes["mixed"]["float_blocks"] == ["backbone.stem"]
-    for key, value in {"kind": "affine", "observer": "percentile", "percentile": 99.5, "smooth": 0.7}.items():
+    for key, value in {"observer": "minmax", "smooth": 0.7}.items():
         assert schemes["static"][key] == schemes["mixed"][key] == value
-    assert quantized["params"]["scheme"] == "affine" and quantized["params"]["modes"] == ["mixed"]
+    assert quantized["params"]["modes"] == ["mixed"]
     assert {p.name for p in turned.glob("policy_*.pt")} == {f"policy_{mode}.pt" for mode in schemes}
     found = compared["metrics"]
     assert (found["frames"], found["fp32"]["trials"], set(found["modes"])) == (4, 1, {"static", "mixed"})

@@ -68,7 +68,6 @@ def test_float_policy_is_the_same(name, tmp_path):
     ("name", "scheme"),
     [
         ("tiny", Scheme()),
-        ("tiny", Scheme(kind="affine")),
         ("two cameras, odd", Scheme()),  # they share a backbone's weights, but not the steps of its numbers
     ],
 )

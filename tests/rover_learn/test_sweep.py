@@ -37,9 +37,9 @@ def sheet(tmp_path):
 
 
 def test_every_combination_is_a_run_and_keeps_its_name_while_the_sheet_grows(sheet, tmp_path):
-    jobs = read_sheet(sheet(params={"calibration.seed": [0, 1, 2], "quantization.scheme": ["symmetric", "affine"]}))
+    jobs = read_sheet(sheet(params={"calibration.seed": [0, 1, 2], "quantization.smooth": [0.3, 0.5]}))
     assert len(jobs) == len({job.name for job in jobs}) == 2 * 3 * 2
-    assert jobs[0].name.startswith("best_model-samples100-seed0-schemesymmetric-")
+    assert jobs[0].name.startswith("best_model-samples100-seed0-smooth0.3-")
     assert len(read_sheet(sheet(notebooks={"samples": [100, 100]}))) == 3
     few = {job.name for job in read_sheet(sheet())}
     assert few < {job.name for job in read_sheet(sheet(notebooks={"samples": [100, 200, 300]}))}

@@ -211,7 +211,7 @@ class Exporter:
         return {
             "schema": artifact.SCHEMA,
             "mode": mode,
-            "scheme": static.kind if static else "dynamic" if scheme else "float",
+            "scheme": "symmetric" if static else "dynamic" if scheme else "float",
             "engine": form.engine,
             "cameras": cameras,
             "state_names": list(config.state_names),

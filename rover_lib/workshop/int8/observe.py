@@ -30,7 +30,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
-from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, Scheme
+from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 
@@ -40,7 +40,7 @@ OBSERVER = "activation_post_process"  # in FX's names of observers
 
 
 class RangeObserver(UniformQuantizationObserverBase):
-    """Sees a tensor's values during calibration; the range is chosen afterwards, in any of four ways.
+    """Sees a tensor's values during calibration; the range is chosen afterwards, in any of three ways.
 
     Keeps the exact minimum and maximum and a histogram over [-limit, limit]; when it is outgrown, two neighbouring bins
     merge into one. frames: each frame's least and largest value, (2,). of_frames: the range of the choice `frames`.
@@ -48,11 +48,11 @@ class RangeObserver(UniformQuantizationObserverBase):
 
     BINS = 4096
 
-    def __init__(self, *, dtype: torch.dtype, quant_min: int, quant_max: int, choice: str, percentile: float):
+    def __init__(self, *, choice: str):
         super().__init__(
-            dtype=dtype, qscheme=torch.per_tensor_affine, quant_min=quant_min, quant_max=quant_max, eps=SMALLEST_SCALE
+            dtype=torch.qint8, qscheme=torch.per_tensor_affine, quant_min=LOW, quant_max=HIGH, eps=SMALLEST_SCALE
         )
-        self.choice, self.percentile, self.observing = choice, percentile, True
+        self.choice, self.observing = choice, True
         self.frames: list[Tensor] = []
         self.of_frames: tuple[float, float] | None = None
         self.min_val = nn.Buffer(torch.tensor(torch.inf))
@@ -88,9 +88,7 @@ class RangeObserver(UniformQuantizationObserverBase):
         low, high = self.min_val.item(), self.max_val.item()
         if low > high:
             raise ArtifactError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
-        if self.choice == "percentile":
-            low, high = self._percentiles(low, high)
-        elif self.choice == "histogram":
+        if self.choice == "histogram":
             low, high = self._least_squares(low, high)
         elif self.choice == "frames":
             low, high = self.of_frames or (low, high)
@@ -99,15 +97,6 @@ class RangeObserver(UniformQuantizationObserverBase):
     def _centres(self) -> Tensor:
         limit = self.limit.item()
         return (torch.arange(self.BINS) + 0.5) * (2 * limit / self.BINS) - limit
-
-    def _percentiles(self, low: float, high: float) -> tuple[float, float]:
-        share = self.histogram.cumsum(0) / self.histogram.sum()
-        tail = (1 - self.percentile / 100) / 2
-        centres = self._centres()
-        inside = centres[(share >= tail) & (share <= 1 - tail)]
-        if len(inside) == 0:
-            return low, high
-        return max(low, inside[0].item()), min(high, inside[-1].item())
 
     def _least_squares(self, low: float, high: float) -> tuple[float, float]:
         """The range whose rounding plus clipping has the least squared error over the histogram."""
@@ -231,7 +220,7 @@ def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) 
     """Let the observers of a restored graph choose their ranges by this scheme."""
     kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
     for place, observer in _places(prepared).items():
-        observer.choice, observer.percentile = scheme.observer, scheme.percentile
+        observer.choice = scheme.observer
         observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
 
 
@@ -265,10 +254,7 @@ def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | Non
 
 
 def _qconfig(scheme: Scheme) -> QConfig:
-    dtype, low, high = KINDS[scheme.kind]
-    activation = RangeObserver.with_args(
-        dtype=dtype, quant_min=low, quant_max=high, choice=scheme.observer, percentile=scheme.percentile
-    )
+    activation = RangeObserver.with_args(choice=scheme.observer)
     weight = PerChannelMinMaxObserver.with_args(
         dtype=torch.qint8, qscheme=torch.per_channel_symmetric, quant_min=-127, quant_max=127, eps=SMALLEST_SCALE
     )

@@ -34,7 +34,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8.observe import AGAIN, Calibration, restore_observed, scale_model
 from rover_lib.workshop.int8.scales import projections
-from rover_lib.workshop.int8.scheme import ENGINE, KINDS, SMALLEST_SCALE, STAYS_FLOAT, Scheme
+from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, SMALLEST_SCALE, STAYS_FLOAT, Scheme
 from rover_lib.workshop.recordings.episodes import Sample
 
 Int8Layer = int8.Conv2d | int8.Linear | fused_int8.ConvReLU2d | dynamic_int8.Linear
@@ -64,7 +64,7 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
         module, expected = _dynamic(checkpoint, calibration).eval(), list(projections(model))
     layers = int8_layers(module)
     check_acted(layers, expected)
-    if static and scheme.kind == "symmetric":
+    if static:
         check_fast(module, example_inputs(config))
     dead = _check_scales(layers)
     report = {
@@ -163,17 +163,17 @@ def convert(prepared: GraphModule, config: ActConfig, scheme: Scheme, only: Iter
             qconfig_mapping=observe.qconfig_mapping(config, scheme, only),
             backend_config=get_qnnpack_backend_config(),
         )
-    return _columns_are_int8(converted, KINDS[scheme.kind][0])
+    return _columns_are_int8(converted)
 
 
-def _columns_are_int8(converted: GraphModule, dtype: torch.dtype) -> GraphModule:
+def _columns_are_int8(converted: GraphModule) -> GraphModule:
     """Let columns arrive quantized, as they are, where FX has put a quantization behind them."""
     for node in list(converted.graph.nodes):
         if node.op != "call_module" or not isinstance(columns := converted.get_submodule(str(node.target)), Columns):
             continue
         for user in list(node.users):
             if user.target is torch.quantize_per_tensor:
-                columns.dtype = dtype
+                columns.quantized = True
                 user.replace_all_uses_with(node)
                 converted.graph.erase_node(user)
     converted.graph.eliminate_dead_code()
@@ -190,11 +190,10 @@ def most_clipped(
     samples: which calibration should not have seen.
     """
     prepared = restore_observed(checkpoint, quantized.scheme, calibration)
-    _, low, high = KINDS[quantized.scheme.kind]
     clipped, seen = Counter[str](), Counter[str]()
     with ExitStack() as hooks:
         for name, m in int8_layers(quantized.module).items():
-            ends = (low - m.zero_point - 0.5) * m.scale, (high - m.zero_point + 0.5) * m.scale
+            ends = (LOW - m.zero_point - 0.5) * m.scale, (HIGH - m.zero_point + 0.5) * m.scale
 
             def watch(_: nn.Module, __: Any, x: Tensor, n: str = name, ends: tuple[float, float] = ends) -> None:
                 floor, ceiling = ends

@@ -31,7 +31,7 @@ from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
-ARTIFACTS = ("fp32", *MODES, "static_affine")
+ARTIFACTS = ("fp32", *MODES)
 GATED_WORLDS = 40  # in which params.yml counts balloons
 GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
 

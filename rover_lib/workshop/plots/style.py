@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 BLACK = "#333333"
 ORANGE = "#E69F00"
-SKY = "#56B4E9"
 GREEN = "#009E73"
 BLUE = "#0072B2"
 RED = "#D55E00"  # a limit, a floor, a fault, a stopped car; and the balloon
@@ -36,11 +35,9 @@ COLOURS = {
     "dynamic": ORANGE,
     "static": BLUE,
     "mixed": GREEN,
-    "static_affine": SKY,
     "steering": "#332288",
     "throttle": "#CC79A7",
 }
-NAMES = {"fp32": "FP32", "static_affine": "static, affine"}
 MOST_ACTIONS = 3  # a figure shows at most this many beside each other
 
 
@@ -100,7 +97,7 @@ def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
 
 def line_of(mode: str) -> dict[str, Any]:
     """Return the colour and the label of a mode's line."""
-    return {"color": COLOURS.get(mode, GREY), "label": NAMES.get(mode, mode), "lw": 1.8}
+    return {"color": COLOURS.get(mode, GREY), "label": "FP32" if mode == "fp32" else mode, "lw": 1.8}
 
 
 def legend_below(fig: Figure, ax: Axes, columns: int) -> None:

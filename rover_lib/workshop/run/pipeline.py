@@ -56,7 +56,7 @@ class Recipe:
         return cls(
             samples=samples or p["calibration"]["samples"],
             seed=p["calibration"]["seed"],
-            scheme=Scheme(kind=said["scheme"], smooth=said["smooth"], percentile=said["percentile"]),
+            scheme=Scheme(smooth=said["smooth"]),
             observers=tuple(said["observers"]),
         )
 
@@ -88,8 +88,7 @@ def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None
 
     Mixed is among them only if it leaves a block in float.
     """
-    dynamic, affine = replace(static, mode="dynamic"), replace(static, kind="affine")
-    schemes = {"dynamic": dynamic, "static": static, "mixed": mixed, "static_affine": affine}
+    schemes = {"dynamic": replace(static, mode="dynamic"), "static": static, "mixed": mixed}
     if unknown := [mode for mode in modes or () if mode not in schemes]:
         raise ArtifactError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
     if not mixed.float_blocks:

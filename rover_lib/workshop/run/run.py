@@ -42,9 +42,7 @@ IN_PARAMS = {
     "samples": ("calibration", "samples"),
     "seed": ("calibration", "seed"),
     "smooth": ("quantization", "smooth"),
-    "scheme": ("quantization", "scheme"),
     "observers": ("quantization", "observers"),
-    "percentile": ("quantization", "percentile"),
     "iterations": ("benchmark", "iterations"),
     "threads": ("benchmark", "threads"),
 }

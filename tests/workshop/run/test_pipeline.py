@@ -28,9 +28,7 @@ def loaded(tiny):
 def test_the_schemes_of_a_run():
     recipe = Recipe.of(params())
     schemes = pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed", float_blocks=("head",)))
-    found = [(name, scheme.mode, scheme.kind) for name, scheme in schemes.items()]
-    modes = [(mode, mode, "symmetric") for mode in ("dynamic", "static", "mixed")]
-    assert found == [*modes, ("static_affine", "static", "affine")]
+    assert {name: scheme.mode for name, scheme in schemes.items()} == {m: m for m in ("dynamic", "static", "mixed")}
     assert "mixed" not in pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed"))  # it is static
 
 
