@@ -20,8 +20,8 @@ from lerobot_robot_rover.line import ACTIONS, wait_for_humans
 from lerobot_robot_rover.rollout import find_rollout
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime
+from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.inference import PolicyProcess
-from rover_lib.onboard.drive.opening import another_car
 from rover_lib.onboard.drive.pilot import RECORD_HERE, unfamiliar
 from rover_lib.onboard.drive.plan import STOP, Plan, Settings, Smoother, is_unfamiliar
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError

@@ -9,11 +9,11 @@ import time
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive.arming import arm_capped
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, Sight
 from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.drive.session import arm_capped
 from rover_lib.onboard.drive.watch import SWITCH_S, HealthWatch
 from rover_lib.onboard.errors import DriveFault
 

@@ -20,10 +20,10 @@ from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.host import boottime, default_log
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.car.servo_link import ServoLink
-from rover_lib.onboard.drive.arming import arm_when_ready
 from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.pilot import HOLE_S, LATE_FRAME_S, Sight
 from rover_lib.onboard.drive.plan import Plan, Settings
+from rover_lib.onboard.drive.session import arm_when_ready
 from rover_lib.onboard.errors import CameraError, PolicyError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame

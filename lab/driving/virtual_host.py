@@ -25,11 +25,10 @@ from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Teleme
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.service import Request, Service
-from rover_lib.onboard.drive.session import Arming, Session
+from rover_lib.onboard.drive.session import Arming, DriveOptions, Session
 from rover_lib.onboard.errors import PolicyError, RoverError, sentence_of
 from rover_lib.onboard.params import params
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.command import AS_JSON, FILE, FROM_0, FROM_1, show
+from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, show
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar

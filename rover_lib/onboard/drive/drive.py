@@ -7,26 +7,27 @@ drive_car(DriveOptions(artifact=Path("policy_static.pt"), camera="0", port="/dev
 import contextlib
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any
 
-from rover_lib.onboard.artifact.manifest import Artifact, seen_size
+from rover_lib.onboard.artifact.manifest import Artifact, car_of, seen_size
 from rover_lib.onboard.car.camera import Camera, check_shape, size_like
-from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.host import default_view
+from rover_lib.onboard.car.car import Car, this_car
+from rover_lib.onboard.car.host import default_log, default_view
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.feed import Feed
+from rover_lib.onboard.drive.flight_log import FlightLog, log_limits
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.drive.opening import DriveOptions, another_car, open_flight_log
 from rover_lib.onboard.drive.plan import Commanded, Settings
 from rover_lib.onboard.drive.service import Service
-from rover_lib.onboard.drive.session import Session
+from rover_lib.onboard.drive.session import DriveOptions, Session
 from rover_lib.onboard.drive.watch import exit_if_hung, stop_on_signals
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
+from rover_lib.onboard.status_line import StatusLine
 
 REST_S = 1.0  # between plans while the car is not driving
 
@@ -81,3 +82,24 @@ def drive_car(
         session.drive(stop)
         while service and not stop.is_set():
             session.drive(stop, said=report.ended)
+
+
+def another_car(manifest: dict[str, Any], this: Car) -> str:
+    """Return a warning if an artifact was calibrated for another car, else "". It may drive all the same."""
+    meant = car_of(manifest)
+    if meant.drives_like(this):
+        return ""
+    return f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: see that the way is free"
+
+
+@contextlib.contextmanager
+def open_flight_log(options: DriveOptions, settings: Settings, report: Report) -> Iterator[FlightLog]:
+    """Open a flight log whose events are also lines on the terminal, above the report's status."""
+    (max_bytes, keep), path = log_limits(), options.log_file or default_log()
+    header: dict[str, Any] = {"artifact": str(options.artifact), "hz": options.hz, **vars(settings)}
+    if not (car := this_car()).drives_like(Car()):
+        header["car"] = car.description()
+    with StatusLine(lambda: report.status) as status:
+        logging.basicConfig(level=logging.INFO, format="rover: %(message)s", handlers=[status], force=True)
+        with FlightLog(path, header=header, max_bytes=max_bytes, keep=keep) as log:
+            yield log

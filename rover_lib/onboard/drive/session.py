@@ -6,9 +6,9 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,22 +17,51 @@ from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
-from rover_lib.onboard.drive.arming import arm_capped, arm_when_ready, wanted_since, what_is_missing
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner
-from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
-from rover_lib.onboard.drive.opening import DriveOptions
+from rover_lib.onboard.drive.loop import Arm, Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Settings
-from rover_lib.onboard.drive.service import Service
+from rover_lib.onboard.drive.service import CHECK_S, Service, check_age
 from rover_lib.onboard.drive.takeover import TakeoverRecorder
 from rover_lib.onboard.drive.watch import HealthWatch, boost_priority
 from rover_lib.onboard.errors import DriveFault, RoverError, sentence_of
 from rover_lib.onboard.recording.episode import About
 from rover_lib.onboard.recording.recorder import Recorder, room_for
 
+WAIT_S = 30.0  # for a human, from the command that asks for the car; the Arduino refuses an arming after 31
 TAKEN_OVER = "the human drives, and is recorded until the sticks are let go"
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """The options of `rover drive`.
+
+    hz: commands per second. dry_run: no motor is driven. record: folder in which an episode is written. record_mb: how
+    much all episodes in it may take together; None: limited by the disk. max_seconds, ticks: when to end.
+    throttle_limit: replaces that of params.yml. threads: of the policy; None: all cores but one. log_file: None: the
+    user's. service: run as a systemd service, disarmed until a human arms it. latency_ms: make each plan take at least
+    this long, for comparisons. view: the socket of a view; None: the user's. asked_s: when the car was asked for, by
+    boottime().
+    """
+
+    artifact: Path
+    camera: str = "0"
+    port: str = ""
+    hz: float = 30.0
+    dry_run: bool = False
+    record: Path | None = None
+    record_mb: float | None = None
+    max_seconds: float | None = None
+    ticks: int | None = None
+    throttle_limit: float | None = None
+    threads: int | None = None
+    log_file: Path | None = None
+    service: bool = False
+    latency_ms: float = 0.0
+    view: Path | None = None
+    asked_s: float = field(default_factory=boottime)
 
 
 @dataclass
@@ -202,3 +231,63 @@ class Arming:
             recorder.close(takeover.ended if takeover.fault else None)
         except Exception as error:
             log.event(f"the human is not recorded: {sentence_of(error)}", level=logging.ERROR)
+
+
+def wanted_since(asked_s: float, clock: Callable[[], float] = boottime) -> Callable[[], None]:
+    """Return a check for a car that was asked for at asked_s: it raises once that is over WAIT_S ago."""
+    return lambda: check_age(clock() - asked_s, WAIT_S)
+
+
+def arm_when_ready(
+    arm: Arm,
+    link: ServoLink,
+    stop: threading.Event,
+    notify: Callable[[str], None],
+    checks: Sequence[Callable[[], object]] = (),
+    still_wanted: Callable[[], object] | None = None,
+) -> Telemetry | None:
+    """Arm for a human in a terminal: say what is missing, wait for it, and then arm.
+
+    checks: called while waiting; each raises if its device fails. still_wanted: raises if the human asked too long ago;
+    None: they ask now. Raises RoverError when told to stop.
+    """
+    still_wanted = still_wanted or wanted_since(boottime())
+    link.request()
+    told = ""
+    while missing := what_is_missing(link):
+        still_wanted()
+        if missing != told:
+            notify(f"before the car can drive: {missing}")
+            told = missing
+        for check in checks:
+            check()
+        if stop.wait(CHECK_S):
+            raise RoverError("told to stop before a human armed the car", kind="not armed")
+    still_wanted()
+    return arm()
+
+
+def what_is_missing(link: ServoLink) -> str:
+    """Return what a human must do before the Arduino can be armed, "" if nothing. Raises LinkError."""
+    telemetry = link.latest()
+    return link.remedy(telemetry.missing) if telemetry and telemetry.missing != "-" else ""
+
+
+def arm_capped(
+    link: ServoLink, limit: float, notify: Callable[[str], None], still_wanted: Callable[[], object] = lambda: None
+) -> Telemetry:
+    """Arm a car, after the Arduino was told to limit the host's throttle to `limit`, in [0, 1].
+
+    notify: told if the Arduino allows less. Raises what still_wanted raises, and LinkError.
+    """
+    channel = link.calibration.throttle
+    directions = (limit, -limit) if channel.low < 0 else (limit,)
+    farthest_us = max(map(channel.pulse_us, directions), key=lambda us: abs(us - channel.neutral_us))
+    cap_us = link.lower_cap(farthest_us).cap_us
+    span_us = abs(channel.pulse_us(limit) - channel.neutral_us)
+    if cap_us - channel.neutral_us < span_us:
+        cap = limit * (cap_us - channel.neutral_us) / span_us
+        what = f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), this drive may ask for {limit:.2f}"
+        notify(f"{what}: what is above is cut; a reset of the Arduino raises a lowered cap")
+    still_wanted()
+    return link.arm()

@@ -9,9 +9,9 @@ import pytest
 
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car.car import Car, read_car
-from rover_lib.onboard.drive.arming import arm_capped
-from rover_lib.onboard.drive.opening import another_car
+from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
+from rover_lib.onboard.drive.session import arm_capped
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of

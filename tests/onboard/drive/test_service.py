@@ -29,12 +29,10 @@ from rover_lib.onboard.car import host
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import MISSING, LinkError
 from rover_lib.onboard.drive import service as s
-from rover_lib.onboard.drive.arming import arm_when_ready, wanted_since
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.drive.loop import Report
-from rover_lib.onboard.drive.opening import DriveOptions
 from rover_lib.onboard.drive.plan import Settings
-from rover_lib.onboard.drive.session import Arming, Session
+from rover_lib.onboard.drive.session import Arming, DriveOptions, Session, arm_when_ready, wanted_since
 from rover_lib.onboard.errors import CameraError
 
 REQUEST_S = s.REQUEST_S
@@ -404,7 +402,7 @@ def test_ages_of_consent_go_on_while_the_machine_is_suspended(monkeypatch):
     assert DriveOptions(Path("policy.pt")).asked_s == 5000.0
 
 
-# arming.py
+# Arming
 
 
 def session_of(asked_s=0.0, renew=lambda age_s: None, **parts):
