@@ -30,7 +30,7 @@ from rover_lib.workshop.checkpoint.files import write_both
 from rover_lib.workshop.judge.recorded_range import Range
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample
-from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
 
 MOST = {"to_parent": 1.0, "held_out_share": 0.999}

@@ -70,13 +70,19 @@ def test_what_readme_says_to_type_works(demo_run, tmp_path, monkeypatch):
     assert [words[1] for words in asked] == ["look", "demo", "watch", "notebooks-open", "test", "run"]
     for words in (words for words in asked if words[1] in ("watch", "notebooks-open", "run")):
         dry = ["make", "-n", "--no-print-directory", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready"]
-        command = subprocess.run([*dry, *words[1:]], capture_output=True, text=True, check=True).stdout.splitlines()[-1]
+        printed = subprocess.run([*dry, *words[1:]], capture_output=True, text=True, check=True).stdout
+        *before, command = printed.splitlines()
         if words[1] == "run":
             assert command == f"{sys.prefix}/bin/rover run 'best_model.pth' 'episodes' --name 'mine'"
             continue
         env = os.environ | {"PYTHONPATH": str(ROOT), "BROWSER": "true", "ROVER_AS_ROOT": "1", "HOME": str(tmp_path)}
+        subprocess.run("\n".join(before), shell=True, check=True)
         with started(command + " --web-port 0" * (words[1] == "watch"), env) as output:
             assert any(re.search(seen[words[1]], line) for line in output), command
+    assert not {"episodes", "best_model.pth"} & {path.name for path in (tmp_path / "runs" / "demo-copy").iterdir()}
+    (tmp_path / "runs" / "taken").mkdir()
+    for wrong in ("NAME=dmo", "NAME=demo AS=demo", "NAME=demo AS=taken"):  # no run, the run itself, no copy
+        assert subprocess.run([*dry[:1], *dry[2:], "notebooks-open", *wrong.split()]).returncode == 2
     names: dict = {"frame_bgr": np.zeros((360, 640, 3), np.uint8), "state": np.zeros(2, np.float32)}
     exec("\n".join(line for line in lines if not line.startswith("make ")), names)
     assert names["chunk"].shape == (32, 2)

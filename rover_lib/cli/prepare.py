@@ -69,9 +69,9 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
 
     --only 03 --name try1: execute one notebook on that run again, whose results are replaced; `rover report` judges it.
     """
+    from rover_lib.workshop.run import run_folder
     from rover_lib.workshop.run.run import execute, find_notebook
     from rover_lib.workshop.run.run import run as run_notebooks
-    from rover_lib.workshop.run.run_folder import run_folder
 
     given = _values_of(turned)
     if only and not (checkpoint or episodes):

@@ -1,6 +1,8 @@
 """The notebooks as runs, and with each of their parameters turned."""
 
+import ast
 import json
+import shutil
 
 import nbformat
 import pytest
@@ -9,7 +11,6 @@ from executed import run_cells
 from rover_lib.onboard.params import params
 from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import run_report
-from rover_lib.workshop.run.copy_run import copy_run
 from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
 
 
@@ -129,6 +130,20 @@ def test_root_learns_at_once_that_it_may_load_no_artifact(old_run, monkeypatch):
 
 # --- turning parameters ---
 
+
+@pytest.mark.parametrize("name", runs.NAMES + runs.AFTERWARDS)
+def test_each_parameter_of_a_notebook_is_read_there_and_says_what_params_yml_says(name):
+    path, read = runs.NOTEBOOKS / f"{name}.ipynb", set()
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            nodes = ast.walk(ast.parse(cell.source))
+            read |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
+    for parameter, literal, _ in runs.parameters_in(path):
+        assert parameter in read
+        if place := runs.IN_PARAMS.get(parameter):
+            assert ast.literal_eval(literal) == params()[place[0]][place[1]]
+
+
 TURNED = {
     "02_calibrate": ("calibrate", {"samples": 7, "seed": 3, "smooth": 0.7}),
     "03_quantize": (
@@ -145,9 +160,8 @@ TURNED = {
 @pytest.fixture(scope="module")
 def turned(demo_run, tmp_path_factory):
     """A copy of the demo's run in which each parameter of notebooks 02 to 05 was turned; 02 has a kernel."""
-    runs_dir = tmp_path_factory.mktemp("runs")
-    (runs_dir / "demo").symlink_to(demo_run)
-    folder = copy_run("demo", "copy", runs_dir)
+    folder = tmp_path_factory.mktemp("runs") / "copy"
+    shutil.copytree(demo_run, folder, ignore=shutil.ignore_patterns("episodes", "*.pth"))
     for name, (_, given) in TURNED.items():
         (runs.execute if name == "02_calibrate" else run_cells)(name, folder, **given)
     return folder

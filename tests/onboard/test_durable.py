@@ -13,7 +13,7 @@ from rover_lib.onboard import durable
 from rover_lib.onboard.durable import ASKED, build_folder
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.run import run_folder
 
 
 def whole(folder):

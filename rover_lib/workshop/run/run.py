@@ -30,7 +30,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
-from rover_lib.workshop.run.run_folder import run_folder
+from rover_lib.workshop.run import run_folder
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
