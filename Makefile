@@ -64,7 +64,6 @@ demo: $(READY)
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	@touch $(DEMO)
 	@echo
-	@echo 'the report, for your browser:   file://$(CURDIR)/runs/demo/report.html'
 	@echo 'its notebooks, in JupyterLab:   make notebooks-open NAME=demo'
 	@echo 'late plans, a smaller policy:   make demo-more'
 	@echo 'see it drive in your browser:   make watch'

@@ -62,8 +62,8 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
     EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command.
-    Executes five notebooks in the run's folder. Ends with a verdict, also in report.html and run.json: which artifact
-    to deploy, what failed, and what to do about it.
+    Executes five notebooks in the run's folder. Ends with a verdict, also in run.json: which artifact to deploy,
+    what failed, and what to do about it.
 
     -p turns any of the notebooks' parameters; a value is YAML: 0.5, minmax, [static, mixed].
 
@@ -100,9 +100,9 @@ def report(run_dir: Path) -> None:
 
 
 def _judge(run_dir: Path) -> None:
-    from rover_lib.workshop.run.run_report import PAGE, text, write
+    from rover_lib.workshop.run.run_report import text, write
 
-    click.echo(f"{text(write(run_dir)['metrics'])}\n\ndone: {run_dir / PAGE}")
+    click.echo(f"{text(write(run_dir)['metrics'])}\n\ndone: {run_dir}")
 
 
 @click.command(short_help="Say what a file or folder is; list the runs.")

@@ -19,7 +19,7 @@ def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):
     monkeypatch.setattr("rover_lib.workshop.run.run.run", lambda *args, **options: folder)
     result = rover("run", "best_model.pth", "recordings")
     assert result.exit_code == 0 and "Verdict: deploy policy_static.pt" in result.output
-    assert "Next:" in result.output and (folder / "report.html").is_file()
+    assert "Next:" in result.output
     content = json.loads((folder / "run.json").read_text())
     assert content["metrics"]["headline"] in rover("report", folder).output
     for listed in (rover("inspect", folder.parent, "--json"), rover("inspect", "--json")):

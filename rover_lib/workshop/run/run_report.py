@@ -1,47 +1,37 @@
-"""What a run ends with: its verdict as run.json, as one page of HTML, and in words.
+"""What a run ends with: its verdict as run.json, in words, and as a model card.
 
-content = write("runs/mine")        # run.json and report.html, from the JSON that its stages left
+content = write("runs/mine")        # run.json, from the JSON that its stages left
 print(text(content["metrics"]))
 """
 
 import os
-import re
 import shutil
 import sys
-from base64 import b64encode
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
-from jinja2 import Environment, FileSystemLoader
-from markupsafe import Markup, escape
+from jinja2 import Template
 
 from rover_lib.onboard.artifact.acceptance import THIS_CAR
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.advice import CALLED, Names, against
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import headline, verdict
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
 LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
-PAGE = "report.html"
 CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 AGAIN = "'rover run' of its checkpoint makes it again"
-FIGURES = {  # of the run's folder, with what each shows
-    "04_action_error": "How far each mode's plan is from FP32's, step by step",
-    "04_worst_frames": "The frames on which static INT8 differs most from FP32",
-    "03_sensitivity": "How much of the error each block causes",
-    "04_familiarity": "How unfamiliar each held-out drive is, of what stops the car, and the least familiar pictures",
-}
 
 
 def write(run_dir: Path | str) -> dict[str, Any]:
-    """Judge a run and leave run.json and report.html in its folder. Returns run.json's content.
+    """Judge a run and leave run.json in its folder. Returns its content.
 
     Made anew of what is there, with what `make count` and `rover world students` added. Raises RoverError where a stage
     is missing, is of other artifacts or lacks what is to be judged, and for an artifact that was not compared.
@@ -66,10 +56,7 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         raise RoverError(f"{folder}: its stages lack {missing}, as of another version", remedy=AGAIN) from missing
     inputs = {path.name: sha256_of(path) for path in files.values()}
     given = {"verdict": p["verdict"], "gates": p["gates"]}
-    content = write_stage(folder / "run.json", "run", params=given, metrics=judged, inputs=inputs)
-    with atomic_path(folder / PAGE) as temporary:
-        temporary.write_text(page(content, folder, names.name))
-    return content
+    return write_stage(folder / "run.json", "run", params=given, metrics=judged, inputs=inputs)
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -110,7 +97,8 @@ def typed(command: str) -> str:
 def text(judged: Mapping[str, Any]) -> str:
     """The verdict for a terminal, in lines."""
     lines = [f"Verdict: {judged['headline']}", *(f"  {line}" for line in judged["why"]), ""]
-    lines += align(columns(judged)) + _worth(judged)
+    lines += align(columns(judged))
+    lines += [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
     if judged["failed"]:
         lines += ["", "What failed:"]
         for row in judged["failed"]:
@@ -122,7 +110,7 @@ def text(judged: Mapping[str, Any]) -> str:
 
 
 def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The modes beside each other, a header first: for a terminal and for a page. A dash where nothing was measured."""
+    """The modes beside each other, a header first: for a terminal and for a card. A dash where nothing was measured."""
     actions = list(dict.fromkeys(action for row in judged["modes"] for action in row["errors_pct"]))
     counted = ("10^9 instructions",) if any(row["instructions_g"] for row in judged["modes"]) else ()
     errors = (f"{action} error, %" for action in actions)
@@ -134,10 +122,6 @@ def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
         cells += [number(row["times_faster"]), *(number(row["instructions_g"], ".3g") for _ in counted)]
         lines.append(tuple(cells))
     return lines
-
-
-def _worth(judged: Mapping[str, Any]) -> list[str]:
-    return [f"{CALLED[row['mode']]}: {row['because']}" for row in judged["modes"]]
 
 
 def write_card(run_dir: Path | str, **given: str | None) -> Path:
@@ -158,34 +142,5 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
     hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
     values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
-    path.write_text(_pages(escaped=False).get_template("card.md").render(values))
+    path.write_text(Template(Path(__file__).with_name("card.md").read_text()).render(values))
     return path
-
-
-def page(content: Mapping[str, Any], folder: Path, name: str) -> str:
-    """run.json as one HTML page that needs no other file. folder: of the run, with its figures. name: the run's."""
-    judged, env = content["metrics"], content["env"]
-    header, *rows = zip(*columns(judged), strict=True)  # a column for each mode: a phone shows all without scrolling
-    drawn = {words: folder / "figures" / f"{figure}.png" for figure, words in FIGURES.items()}
-    return (
-        _pages(escaped=True)
-        .get_template(PAGE)
-        .render(
-            {"name": name, "judged": judged, "header": header, "rows": rows, "against": against, "typed": typed},
-            kinds=["", *("deploy" if mode["mode"] == judged["deploy"] else "" for mode in judged["modes"])],
-            worth=_worth(judged),
-            figures=[(words, b64encode(path.read_bytes()).decode()) for words, path in drawn.items() if path.is_file()],
-            files=[path.name for kind in ("*.ipynb", "*.json") for path in sorted(folder.glob(kind))],
-            made=", ".join(f"{key} {env[key]}" for key in ("host", "machine", "torch", "commit") if env.get(key)),
-        )
-    )
-
-
-def _pages(*, escaped: bool) -> Environment:
-    pages = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=escaped)
-    pages.filters["words"] = _to_html
-    return pages
-
-
-def _to_html(line: str) -> Markup:  # what is between backticks as code
-    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(line))))
