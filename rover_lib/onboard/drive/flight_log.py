@@ -236,16 +236,16 @@ class Flight:
     """One drive, as read from its log.
 
     header: empty if it was damaged; header["drive"] is what the drive was started with. ticks: an array per field of
-    Tick, (n,) float64 with NaN for "not known"; state and reason are text. machine: t_s and temperature_c, (m,)
-    float64, and throttled, a list of texts and None. drive: its index among the `drives` of these files. damaged: lines
-    that were skipped.
+    Tick, (n,) float64 with NaN for "not known"; state and reason are text. machine: (t_s, temperature_c, throttled) of
+    each reading, None where it was not known. drive: its index among the `drives` of these files. damaged: lines that
+    were skipped.
     """
 
     path: Path
     header: dict[str, Any]
     ticks: dict[str, np.ndarray]
     events: list[Event]
-    machine: dict[str, Any]
+    machine: list[tuple[float, float | None, str | None]]
     drive: int
     drives: int
     damaged: int
@@ -271,7 +271,7 @@ class Flight:
         t_s, late_ms, plans = ticks["t_s"], ticks["late_ms"], ticks["plan"]
         _, first = np.unique(plans, return_index=True)  # the first tick of each plan
         latency_ms = ticks["latency_ms"][first][plans[first] > 0] if len(plans) else plans
-        throttled = next((v for v in reversed(self.machine["throttled"]) if v is not None), None)
+        throttled = next((bits for *_, bits in reversed(self.machine) if bits is not None), None)
         missed = None
         if period_ms:
             passed = np.rint(np.diff(t_s * 1000 - late_ms) / period_ms) - 1
@@ -281,11 +281,9 @@ class Flight:
             "seconds": float(t_s[-1] - t_s[0]) if len(t_s) else 0.0,
             "ticks": len(t_s),
             "missed": missed,
-            **{f"jitter_{name}_ms": _percentile(late_ms, q) for name, q in (("p50", 50), ("p99", 99), ("max", 100))},
+            **figures(late_ms, ticks["plan_age_ms"], latency_ms),
             "plans": len(latency_ms),
-            "plan_age_p95_ms": _percentile(ticks["plan_age_ms"], 95),
-            **{f"latency_p{q}_ms": _percentile(latency_ms, q) for q in (50, 95)},
-            "temperature_max_c": _percentile(self.machine["temperature_c"], 100),
+            "temperature_max_c": _percentile([heat for _, heat, _ in self.machine if heat is not None], 100),
             "throttled": throttled,
             "throttled_means": throttled_means(throttled),
             "events": [{"t_s": e.t_s, "event": e.text} for e in self.events],
@@ -295,9 +293,16 @@ class Flight:
         }
 
 
-def _percentile(values: np.ndarray, q: float) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(np.percentile(values, q)) if len(values) else None
+def figures(late_ms: Any, plan_age_ms: Any, latency_ms: Any) -> dict[str, float | None]:
+    """Return how late commands were, how old plans, and how long they took, each in ms; None for none."""
+    jitter = {f"jitter_{name}_ms": _percentile(late_ms, q) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
+    latency = {f"latency_p{q}_ms": _percentile(latency_ms, q) for q in (50, 95)}
+    return {**jitter, "plan_age_p95_ms": _percentile(plan_age_ms, 95), **latency}
+
+
+def _percentile(values: Any, q: float) -> float | None:
+    known = np.asarray(values)[np.isfinite(values)]
+    return round(float(np.percentile(known, q)), 3) if len(known) else None
 
 
 def read_log(path: Path | str, drive: int = -1) -> Flight:
@@ -315,17 +320,12 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     ticks = [row for row in chosen if isinstance(row, list)]
     machine = [row for row in chosen if type(row) is tuple]
     columns = zip(*ticks, strict=True) if ticks else [()] * len(Tick._fields)
-    times_s, temperatures_c, throttled = zip(*machine, strict=True) if machine else ((), (), ())
     return Flight(
         path=path,
         header=header,
         ticks={n: np.array(c, str if n in _TEXTS else float) for n, c in zip(Tick._fields, columns, strict=True)},
         events=sorted((row for row in chosen if isinstance(row, Event)), key=lambda e: e.t_s),
-        machine={
-            "t_s": np.array(times_s, float),
-            "temperature_c": np.array(temperatures_c, float),  # None becomes NaN
-            "throttled": list(throttled),
-        },
+        machine=machine,
         drive=drive % len(drives),
         drives=len(drives),
         damaged=rows.count(None),

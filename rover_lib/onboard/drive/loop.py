@@ -16,12 +16,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
-from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick
-from rover_lib.onboard.drive.pilot import Order, Pilot
+from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick, figures
+from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
 
 RATES_HZ = (10.0, 100.0)
@@ -87,18 +85,10 @@ class Report:
 
     def summary(self) -> dict[str, Any]:
         """Return the summary, for JSON: ticks, missed, jitter_p50_ms, jitter_p99_ms, jitter_max_ms, ..."""
-
-        def at(values: array, pct: float) -> float | None:
-            return round(float(np.percentile(values, pct)), 3) if len(values) else None
-
-        jitter = {f"jitter_{name}_ms": at(self.late_ms, pct) for name, pct in (("p50", 50), ("p99", 99), ("max", 100))}
         return {
             "ticks": self.ticks,
             "missed": self.missed,
-            **jitter,
-            "plan_age_p95_ms": at(self.plan_age_ms, 95),
-            "latency_p50_ms": at(self.latency_ms, 50),
-            "latency_p95_ms": at(self.latency_ms, 95),
+            **figures(self.late_ms, self.plan_age_ms, self.latency_ms),
             "resent": self.resent,
             "seconds": round(self.seconds, 3),
             "ended": self.ended,
@@ -107,7 +97,7 @@ class Report:
 
 
 def drive(
-    pilot: Pilot,
+    pilot: PolicyPilot,
     link: ServoLink | None,
     log: FlightLog,
     *,
@@ -154,7 +144,7 @@ def drive(
 
 @dataclass
 class _Loop:
-    pilot: Pilot
+    pilot: PolicyPilot
     link: ServoLink | None
     log: FlightLog
     period_s: float

@@ -331,7 +331,7 @@ def arm_car(
     before arming; may raise.
     """
     state = ask_service(ask="state")
-    if model and state["model"] != model.partition("-")[0]:  # a release's name may end in -2
+    if model and state["model"] != model:
         what = f"{UNIT} has loaded another model than {model[:12]}"
         raise RoverError(what, found=state["model"][:12], remedy="did somebody else deploy meanwhile?")
     confirm(state)

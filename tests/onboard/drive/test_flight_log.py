@@ -63,7 +63,7 @@ def test_what_goes_in_comes_out(path, pi_host):
     assert flight.ticks["steering_us"].tolist() == [1204, 1500]
     for unknown in ("plan_age_ms", "pins_steering_us"):
         assert np.isnan(flight.ticks[unknown]).tolist() == [True, False]
-    assert flight.machine["temperature_c"].tolist() == [61.35] and flight.machine["throttled"] == ["0x50000"]
+    assert [reading[1:] for reading in flight.machine] == [(61.35, "0x50000")]
     assert (flight.drive, flight.drives, flight.damaged, flight.events) == (0, 1, 0, [])
 
 
@@ -270,7 +270,7 @@ def test_summary(path, pi_host):
     json.dumps(found, allow_nan=False)
     assert (found["ticks"], found["missed"], found["plans"]) == (100, 3, 9)
     assert (found["jitter_p50_ms"], found["jitter_max_ms"]) == (0.1, 30.0)
-    assert found["plan_age_p95_ms"] == pytest.approx(np.percentile(np.arange(10, 100), 95))
+    assert found["plan_age_p95_ms"] == pytest.approx(np.percentile(np.arange(10, 100), 95), abs=1e-3)
     assert (found["latency_p50_ms"], found["latency_p95_ms"]) == (105.0, pytest.approx(108.6))
     assert found["seconds"] == pytest.approx(3.4009)
     assert found["temperature_max_c"] == 61.35
