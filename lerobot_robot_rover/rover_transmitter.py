@@ -72,13 +72,13 @@ class RoverTransmitter(CarPart, Teleoperator):
         link = self._connected()
         telemetry = link.latest()
         sticks = _sticks(telemetry)
-        actions = link.calibration.actions_from_pulses(*sticks) if sticks else None
-        if telemetry is None or actions is None or actions.steering is None or actions.throttle is None:
+        steering, throttle = link.calibration.actions(*sticks) if sticks else (None, None)
+        if telemetry is None or steering is None or throttle is None:
             what = f"{self.config.port}: the transmitter's signal was lost, and LeRobot cannot record that"
             raise LinkError(what, remedy=f"{link.remedy('s')} and record this episode again; those before it are kept")
         self._check_passed_on(telemetry, link.calibration.throttle)
         self._line.humans_action = True
-        return named(actions.steering, actions.throttle)
+        return named(steering, throttle)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing."""

@@ -94,8 +94,8 @@ class VirtualPad(gamepad.Gamepad):
 
     def _where(self, fd: int, axis: int) -> tuple[int, int, int]:
         car = self._world.car
-        actions = car.pwm.actions_from_pulses(*self._world.hand.sticks)
-        x = -car.left * (actions.steering or 0.0) if axis == gamepad.STEERING else -(actions.throttle or 0.0) / car.cap
+        steering, throttle = car.pwm.actions(*self._world.hand.sticks)
+        x = -car.left * (steering or 0.0) if axis == gamepad.STEERING else -(throttle or 0.0) / car.cap
         way = gamepad.DEAD + (1 - gamepad.DEAD) * min(abs(x), 1.0) if x else 0.0
         return round(math.copysign(way, x) * self.FULL), -self.FULL, self.FULL
 

@@ -137,7 +137,7 @@ def test_what_is_drawn(tmp_path):
     empty = flight_figure(read_log(drive(tmp_path, pictures=False, recorded=False, seconds=0.0)))
     for drawn in (figure, empty):
         drawn.draw_without_rendering()
-    top = PwmCalibration().actions_from_pulses(steering.get_ylim()[1], 120).steering
+    top = PwmCalibration().steering.action(steering.get_ylim()[1])
     assert steering.child_axes[0].get_ylim()[1] == pytest.approx(top, abs=1e-3)
 
 

@@ -8,7 +8,6 @@ import contextlib
 import math
 import numbers
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from rover_lib.onboard.errors import CarError
 
@@ -104,13 +103,6 @@ class Pulses:
     throttle_us: int
 
 
-class Actions(NamedTuple):
-    """The actions read from the transmitter; None for a channel without a measured pulse."""
-
-    steering: float | None
-    throttle: float | None
-
-
 @dataclass(frozen=True)
 class PwmCalibration:
     """A car's two channels; by default those of the user's car."""
@@ -134,14 +126,6 @@ class PwmCalibration:
         """Return the pulses for "straight and stopped"."""
         return self.pulses(*NEUTRAL)
 
-    def actions_from_pulses(
-        self,
-        steering_us: float,
-        throttle_us: float,
-        steering_period_us: float | None = None,
-        throttle_period_us: float | None = None,
-    ) -> Actions:
+    def actions(self, steering_us: float, throttle_us: float) -> tuple[float | None, float | None]:
         """Return the actions that two measured pulses stand for, as Channel.action() does."""
-        return Actions(
-            self.steering.action(steering_us, steering_period_us), self.throttle.action(throttle_us, throttle_period_us)
-        )
+        return self.steering.action(steering_us), self.throttle.action(throttle_us)

@@ -1,5 +1,6 @@
 """Run an artifact, with whichever engine it needs: it turns a frame and a state into a chunk of actions."""
 
+import ctypes
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,6 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
-from rover_lib.onboard.policy.memory import give_back_freed
 from rover_lib.onboard.policy.preprocess import prepare_frame
 
 
@@ -129,6 +129,13 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
         raise ArtifactError(f"{path}: predicts differently without its original weights", remedy="do not drive")
     give_back_freed()
     return policy
+
+
+def give_back_freed() -> None:
+    """Give the kernel the memory that malloc keeps for later. After loading an artifact, that is tens of MB."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "malloc_trim"):  # glibc has it
+        libc.malloc_trim(0)
 
 
 def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> tuple[np.ndarray, list[float | None]]:

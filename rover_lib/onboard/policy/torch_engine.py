@@ -1,6 +1,13 @@
-"""Run artifacts in torch: TorchScript, whose INT8 operators run in the engine that the manifest names."""
+"""Run artifacts in torch: TorchScript, whose INT8 operators run in the engine that the manifest names.
 
-from collections.abc import Sequence
+XNNPACK packs the weights of an INT8 convolution when it first runs. torch keeps the original, 66 MB of the full-size
+policy, and has no way to drop it; so its pages are given back to the kernel.
+"""
+
+import ctypes
+import mmap
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,7 +15,9 @@ import torch
 from rover_lib.onboard.artifact.archive import refused
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.policy.memory import give_back_packed_weights
+
+DONT_NEED = 4  # Linux's MADV_DONTNEED: the kernel takes the pages back, and they read as zeros
+PACKED = "__torch__.torch.classes.quantized.Conv2dPackedParamsBase"
 
 
 class TorchEngine:
@@ -46,3 +55,28 @@ def load(artifact: Artifact, threads: int | None) -> TorchEngine:
     except (RuntimeError, UnicodeEncodeError) as e:  # torch cannot open any name
         raise refused(path, f"TorchScript cannot load it ({str(e).splitlines()[0][:200]})") from None
     return TorchEngine(module)
+
+
+def give_back_packed_weights(module: torch.jit.ScriptModule) -> int:
+    """Give the pages of the convolutions' original weights back to the kernel; return the number of bytes freed.
+
+    module: frozen, and has run once, so that its weights are packed. It cannot be saved afterwards, and the caller must
+    check that it still predicts the same.
+    """
+    libc, given = ctypes.CDLL(None), 0
+    for weight in _originals(module.graph):
+        start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
+        first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, because others may share the rest
+        length = (start + size) // mmap.PAGESIZE * mmap.PAGESIZE - first
+        if length > 0 and libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), DONT_NEED) == 0:
+            given += length
+    return given
+
+
+def _originals(block: Any) -> Iterator[torch.Tensor]:
+    """Yield the original weights, which the packed parameters among a frozen graph's constants still hold."""
+    for node in block.nodes():
+        if node.kind() == "prim::Constant" and str(node.output().type()) == PACKED:
+            yield torch.ops.quantized.conv2d_unpack(node.output().toIValue())[0]
+        for inner in node.blocks():
+            yield from _originals(inner)

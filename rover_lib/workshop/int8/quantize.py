@@ -28,7 +28,7 @@ from torch.ao.quantization.quantize_fx import convert_fx
 from torch.fx import GraphModule
 
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.policy.memory import give_back_freed
+from rover_lib.onboard.policy.load import give_back_freed
 from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, example_inputs, inputs_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import observe

@@ -53,8 +53,8 @@ def test_what_is_no_number_never_becomes_a_pulse(bad):
     for refused in (
         lambda: PWM.pulses(bad, 0.0),
         lambda: PWM.pulses(0.0, bad),
-        lambda: PWM.actions_from_pulses(bad, 120),
-        lambda: PWM.actions_from_pulses(1456, 120, math.nan if bad is None else bad, 1016),  # None: the nominal period
+        lambda: PWM.actions(bad, 120),
+        lambda: PWM.steering.action(1456, math.nan if bad is None else bad),  # None: the nominal period
     ):
         with pytest.raises(CarError):
             refused()
