@@ -20,7 +20,6 @@ from balloon_world.drives import SEED, count_hits, drive_in, everywhere, judge, 
 from balloon_world.world import World
 from rover_learn.distill import errors_of, shape_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
-from rover_lib.onboard.care.pi5 import Work, estimate_ms, predict_ms
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import TrainingError
@@ -41,6 +40,7 @@ ARTIFACT = f"policy_{GATED}.pt"
 HOW = {"": "left alone", "pushed_": "pushed"}  # how a row's keys begin, and the words for that kind of drive
 COUNTS = ("hits", "trials", "hits_wilson_low", "hits_wilson_high", "missed")
 COUNTED = "Pushed at the high end of the time that was computed for a Raspberry Pi 5 from counted work."
+GMAC_PER_S = 78.02  # in 10**9, of a Pi 5 with INT8 that was not counted: the high end for published policies
 ESTIMATED = "Pushed at an estimate for a Raspberry Pi 5 by multiply-accumulates: the teacher is not counted."
 NOBODY_DROVE = "Nobody drove: judged by errors on recordings alone."
 
@@ -68,8 +68,8 @@ class _Run:
         row |= {key: shape.get(key) for key in ("decoder_layers", "feedforward", "backbone_channels")}
         row |= {"gmac": manifest["gmac"], "size_mb": artifact.stat().st_size / 1e6}
         row |= {key: counts.get(key) for key in ("instructions_g", "simd_g")}
-        span = predict_ms(Work.of(counts)) if "cycles_g" in counts else None
-        return cls(name, artifact, manifest, row | {"computed_ms": span and [span.low, span.high]})
+        span = counts.get("computed_pi5_ms")
+        return cls(name, artifact, manifest, row | {"computed_ms": span and [span["low"], span["high"]]})
 
 
 def judge_students(
@@ -99,7 +99,7 @@ def judge_students(
     rows = []
     for run in runs:
         plans = _plans(run.artifact, run.name, samples, progress)
-        pushed_ms = (run.row["computed_ms"] or (None, None))[1] if counted else estimate_ms(run.manifest["gmac"])
+        pushed_ms = (run.row["computed_ms"] or (None, None))[1] if counted else 1e3 * run.manifest["gmac"] / GMAC_PER_S
         row = run.row | errors_of(plans, taught, samples, recordings.action_range())
         rows.append(row | _drives(run, worlds, pushed_ms, progress))
     metrics = {

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lab.a76.core import FOR_GUEST, Core, Emulation, emulate_artifact, fetch_wheels
+from lab.a76.pi5 import DRIVING, predict_ms
 from lab.a76.report import alone_of
 from lab.a76.symbols import GuestFunctions, by_kernel
 from rover_lib.onboard.artifact import engines
 from rover_lib.onboard.artifact.manifest import read_manifest
-from rover_lib.onboard.care.pi5 import DRIVING, Work, predict_ms
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
@@ -90,7 +90,7 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
         "peak_memory_loading_mb": done.peak_mb["load"],
         "threads": versions["threads"],
         "versions": versions,
-        "computed_pi5_ms": predict_ms(Work.of(work))._asdict() | {"threads": DRIVING},
+        "computed_pi5_ms": predict_ms(work) | {"threads": DRIVING},
     }
 
 

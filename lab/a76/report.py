@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from rover_lib.onboard.care.pi5 import DRIVING
+from lab.a76.pi5 import DRIVING
 from rover_lib.onboard.columns import align, number
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.recorded_range import worst

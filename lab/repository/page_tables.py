@@ -15,7 +15,7 @@ from typing import Any
 import nbformat
 
 from balloon_world.learn import HOW
-from rover_lib.onboard.care.pi5 import DRIVING
+from lab.a76.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import parameters_in

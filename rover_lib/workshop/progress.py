@@ -3,13 +3,10 @@
 import os
 import sys
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 RARELY: dict[str, Any] = {"delay": 20.0, "mininterval": 20.0}  # seconds: how a bar moves in a log
-TTY_VARIABLE = "ROVER_PROGRESS_TTY"  # the terminal where a run was started: the notebooks draw their bars there
 
 T = TypeVar("T")
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
@@ -28,13 +25,9 @@ def terminal_bar() -> Progress:
 
 
 def notebook_bar() -> Progress:
-    """A bar in the terminal where `rover run` was started, or in JupyterLab; else none."""
-    from tqdm import tqdm
+    """A bar in JupyterLab; else none, as `rover run` shows one of the cells."""
     from tqdm.auto import tqdm as widget
 
-    if name := os.environ.get(TTY_VARIABLE):
-        with suppress(OSError):  # open as long as the kernel lives
-            return partial(tqdm, file=Path(name).open("w"), leave=False)
     if "JPY_SESSION_NAME" in os.environ:
         return partial(widget, leave=False)  # else each step leaves red text below the cell
     return silent

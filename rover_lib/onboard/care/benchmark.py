@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.host import Host, usable_cores
-from rover_lib.onboard.care.pi5 import floor_ms
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.policy.confined import load_confined, run_confined
 
@@ -26,6 +25,9 @@ Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, tot
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 READ_S = 1.0  # between two readings of the host
+# Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
+# per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
+PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
 
 
 def peak_memory_alone_mb(path: Path | str, *, threads: int | None = None, timeout_s: float = 300) -> float | None:
@@ -143,6 +145,15 @@ def benchmark(
         paths = {name: path for name in policies if (path := getattr(policies[name], "path", None))}
         _add_memory(metrics, paths, metrics["threads"])
     return metrics
+
+
+def floor_ms(gmac: float | None, mode: str) -> float | None:
+    """Return the least time that a Pi 5 needs for one inference, by arithmetic alone; None where `gmac` is not known.
+
+    gmac: 10**9 multiply-accumulates of one inference. mode: an artifact's: `mixed` and `dynamic` count as INT8, a floor
+    that they cannot reach.
+    """
+    return None if gmac is None else gmac / PI5_GMAC_PER_S["fp32" if mode == "fp32" else "int8"] * 1000
 
 
 class _Run:

@@ -14,7 +14,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path
-from rover_lib.workshop.progress import TTY_VARIABLE, Progress, silent
+from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import run_folder
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
@@ -169,9 +169,9 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
     from nbclient.exceptions import DeadKernelError
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
-    place = {TTY_VARIABLE: _terminal_of(sys.stderr) if bars else ""}
-    how = {"cwd": str(folder), "progress_bar": False, "kernel_name": "python3", "kernel_manager_class": ThisPython}
-    with set_environment({**place, **KERNEL_ENVIRONMENT}), atomic_path(folder / source.name) as temporary:
+    bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
+    how = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "kernel_manager_class": ThisPython}
+    with set_environment(KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
@@ -208,13 +208,6 @@ def set_environment(values: dict[str, str]) -> Iterator[None]:
         for key in values:
             del os.environ[key]
         os.environ.update(before)
-
-
-def _terminal_of(stream: Any) -> str:
-    """The terminal that a stream writes to, where a kernel shows its progress; empty if it is none."""
-    with suppress(AttributeError, OSError, ValueError):
-        return os.ttyname(stream.fileno())
-    return ""
 
 
 def _sentence(error: Any) -> str:

@@ -12,12 +12,12 @@ from policies import memory_samples
 
 from lab.a76 import core as a76
 from lab.a76 import count_run as counting
+from lab.a76 import pi5
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, emulate, prepare
 from lab.a76.count import STEADY, Counted, count_artifact
 from lab.a76.count_run import count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
-from rover_lib.onboard.care import pi5
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.act import ACT
@@ -201,7 +201,7 @@ def test_a_run_is_counted(report, tiny_run):
     assert 100 < static["peak_memory_mb"] < 500
     assert static["threads"] == 1 and (static["frames_on_the_core"], fp32["frames_on_the_core"]) == (12, STEADY)
     assert 0 < static["far_lines_g"] < static["near_lines_g"] < 0.1 * static["instructions_g"]
-    assert static["computed_pi5_ms"] == pi5.predict_ms(pi5.Work.of(static))._asdict() | {"threads": pi5.DRIVING}
+    assert static["computed_pi5_ms"] == pi5.predict_ms(static) | {"threads": pi5.DRIVING}
     assert "policy_static" in reports.table(report)
     warm = [static[f"{n}_g"] for n in ("first", "second", "tenth")]
     assert warm == pytest.approx([static["instructions_g"]] * 3, rel=0.01)
