@@ -22,7 +22,7 @@ import numpy as np
 
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
-from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.drive.loop import Until, drive
 from rover_lib.onboard.drive.pilot import Order, PolicyPilot
 from rover_lib.onboard.drive.plan import OFF, Commanded, Plan, Settings
@@ -331,3 +331,9 @@ def _hits_in(policy: Any, world: World, replan_every: int) -> bool:
             if world.done:
                 break
     return world.hit
+
+
+def car_in_key() -> dict[str, Any]:
+    """What a key says of the car that drives or limits actions: its car.yml, nothing for the one without a car.yml."""
+    car = this_car()
+    return {} if car.drives_like(Car()) else {"car": car.description()}

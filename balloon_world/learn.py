@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from balloon_world.drives import SEED, count_hits, drive_in, drive_missing, judge
+from balloon_world.drives import SEED, car_in_key, count_hits, drive_in, drive_missing, judge
 from balloon_world.record import BETWEEN_DRIVES, WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
@@ -28,7 +28,7 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import plain, sha256_of, write_stage
-from rover_lib.workshop.cache import car_in_key, key_of
+from rover_lib.workshop.cache import key_of
 from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.pairs import sign_test
 from rover_lib.workshop.notebook_table import Table

@@ -129,7 +129,7 @@ class WorldEpisode:
         measured = _round_us(pulses.steering_us), _round_us(pulses.throttle_us)
         at_s = self._start_s + t_s + CONTROL_LATENCY_S
         self.writer.control(at_s, round(1000 * t_s), *measured, *self._periods, **extra)
-        sent_steering, sent_throttle = self._pwm.actions(*measured)
+        sent_steering, sent_throttle = self._pwm.actions(*measured, *self._periods)
         assert sent_steering is not None and sent_throttle is not None, "what is commanded is measurable"
         return sent_steering, sent_throttle
 

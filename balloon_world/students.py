@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from balloon_world import drives, world
-from balloon_world.drives import SEED, count_hits, drive_in, everywhere, judge, run_trials
+from balloon_world.drives import SEED, car_in_key, count_hits, drive_in, everywhere, judge, run_trials
 from balloon_world.world import World
 from rover_learn.distill import errors_of, shape_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
@@ -26,7 +26,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
-from rover_lib.workshop.cache import cache_root, car_in_key, key_of
+from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.judge.compare import GATED, gate
 from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, worst
 from rover_lib.workshop.notebook_table import Table

@@ -25,11 +25,10 @@ from torch import Tensor, nn
 
 from rover_learn import training as loop
 from rover_learn.phases import VERSIONS, Recipe
-from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Best, Frames, Given, Phase, Resumable, RowFile
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Best, Frames, Given, Phase, Resumable, RowFile, normalise
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
-from rover_lib.onboard.policy.preprocess import normalise
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop import act as act_module
 from rover_lib.workshop import act_config

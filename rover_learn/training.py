@@ -20,7 +20,7 @@ from filelock import Timeout
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.onboard.policy.preprocess import normalise, prepare_frame
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 from rover_lib.onboard.stage import private_lock
 from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY, save_torch
 from rover_lib.workshop.progress import Progress, silent
@@ -351,3 +351,15 @@ def to_cpu(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: to_cpu(v) for k, v in value.items()}
     return value.cpu() if isinstance(value, Tensor) else value
+
+
+def normalise(
+    frame_rgb: np.ndarray, mean: tuple[float, ...] = IMAGENET_MEAN, std: tuple[float, ...] = IMAGENET_STD
+) -> np.ndarray:
+    """Normalise a frame from `prepare_frame`, as LeRobot's forward expects it.
+
+    frame_rgb: (..., height, width, 3) uint8 RGB. Returns (..., 3, height, width) float32, (pixel / 255 - mean) / std.
+    """
+    x = frame_rgb.astype(np.float32) / np.float32(255)
+    x = (x - np.asarray(mean, np.float32)) / np.asarray(std, np.float32)
+    return np.ascontiguousarray(np.moveaxis(x, -1, -3))

@@ -9,7 +9,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.durable import build_folder
 
 
@@ -24,12 +23,6 @@ def key_of(params: dict[str, Any], *sources: ModuleType | Path) -> str:
     for source in sources:
         digest.update((source if isinstance(source, Path) else Path(inspect.getfile(source))).read_bytes())
     return digest.hexdigest()[:16]
-
-
-def car_in_key() -> dict[str, Any]:
-    """What a key says of the car that drives or limits actions: its car.yml, nothing for the one without a car.yml."""
-    car = this_car()
-    return {} if car.drives_like(Car()) else {"car": car.description()}
 
 
 def cache_folder(kind: str, key: str, make: Callable[[Path], None]) -> Path:

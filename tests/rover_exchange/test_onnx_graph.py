@@ -13,9 +13,8 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, ActConfig, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.int8.graph import graph_of
 from rover_lib.workshop.int8.observe import calibrate
-from rover_lib.workshop.int8.quantize import int8_layers, quantize
+from rover_lib.workshop.int8.quantize import graph_of, int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
 
 SHAPES = {

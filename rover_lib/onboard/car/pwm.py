@@ -126,6 +126,11 @@ class PwmCalibration:
         """Return the pulses for "straight and stopped"."""
         return self.pulses(*NEUTRAL)
 
-    def actions(self, steering_us: float, throttle_us: float) -> tuple[float | None, float | None]:
-        """Return the actions that two measured pulses stand for, as Channel.action() does."""
-        return self.steering.action(steering_us), self.throttle.action(throttle_us)
+    def actions(self, *measured_us: float) -> tuple[float | None, float | None]:
+        """Return the actions that pulses of steering and throttle stand for, as Channel.action() does.
+
+        measured_us: the two pulses, and then their periods, or none.
+        """
+        steering_us, throttle_us, *periods_us = measured_us
+        periods = periods_us or (None, None)
+        return self.steering.action(steering_us, periods[0]), self.throttle.action(throttle_us, periods[1])

@@ -19,7 +19,7 @@ from typing import Any
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
 from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick, figures
-from rover_lib.onboard.drive.pilot import Order, PolicyPilot
+from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
 
 RATES_HZ = (10.0, 100.0)
@@ -97,7 +97,7 @@ class Report:
 
 
 def drive(
-    pilot: PolicyPilot,
+    pilot: Pilot,
     link: ServoLink | None,
     log: FlightLog,
     *,
@@ -144,7 +144,7 @@ def drive(
 
 @dataclass
 class _Loop:
-    pilot: PolicyPilot
+    pilot: Pilot
     link: ServoLink | None
     log: FlightLog
     period_s: float

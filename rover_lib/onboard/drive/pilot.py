@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 from rover_lib.onboard.car.camera import Camera, Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -46,6 +47,19 @@ class Order:
     fade: float = 1.0
     frame: int = 0
     strange: float | None = None
+
+
+class Pilot(Protocol):
+    """Something that says what to send at each tick."""
+
+    def ready(self, stop: threading.Event) -> None:
+        """Wait until there is something to drive by, or `stop` is set. Raises RoverError if it does not come."""
+
+    def order(self, now_s: float) -> Order | None:
+        """Return the order for this tick; None if the drive is done. Raises RoverError for what must stop the car."""
+
+    def sent(self, at_s: float, order: Order) -> None:
+        """Take note that the order was sent at that time."""
 
 
 class Sight:
@@ -125,14 +139,12 @@ class PolicyPilot:
         return (plan, self._follower.rate_hz) if plan else None
 
     def ready(self, stop: threading.Event) -> None:
-        """Wait until there is a plan, or `stop` is set. Raises RoverError if it does not come."""
         end = time.monotonic() + FIRST_PLAN_S
         while self._planner.wait(0.1) is None and not stop.is_set():
             if time.monotonic() > end:
                 raise PolicyError(f"no plan within {FIRST_PLAN_S:g} s", remedy="does 'rover benchmark' run on it?")
 
     def order(self, now_s: float) -> Order | None:
-        """Return the order for this tick; None if the drive is done. Raises RoverError for what must stop the car."""
         frame = self._camera.latest()
         if frame:
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
@@ -170,7 +182,6 @@ class PolicyPilot:
             raise RoverError(unfamiliar(plan.strange), remedy=RECORD_HERE, kind="not armed")
 
     def sent(self, at_s: float, order: Order) -> None:
-        """Take note that the order was sent at that time."""
         self._commanded.add(at_s, order.steering, order.throttle)
         self.sight.sent(at_s, order.throttle)
 

@@ -27,15 +27,3 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
         how = cv2.INTER_AREA if height < h or width < w else cv2.INTER_LINEAR
         frame_bgr = cv2.resize(frame_bgr, (width, height), interpolation=how)
     return cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)
-
-
-def normalise(
-    frame_rgb: np.ndarray, mean: tuple[float, ...] = IMAGENET_MEAN, std: tuple[float, ...] = IMAGENET_STD
-) -> np.ndarray:
-    """Normalise a frame from `prepare_frame`, as LeRobot's forward expects it.
-
-    frame_rgb: (..., height, width, 3) uint8 RGB. Returns (..., 3, height, width) float32, (pixel / 255 - mean) / std.
-    """
-    x = frame_rgb.astype(np.float32) / np.float32(255)
-    x = (x - np.asarray(mean, np.float32)) / np.asarray(std, np.float32)
-    return np.ascontiguousarray(np.moveaxis(x, -1, -3))

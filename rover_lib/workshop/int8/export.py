@@ -27,9 +27,8 @@ from rover_lib.onboard.wheel_version import VERSION
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.familiar import Drives, fit
-from rover_lib.workshop.int8.graph import graph_of, with_embedding
 from rover_lib.workshop.int8.observe import Calibration
-from rover_lib.workshop.int8.quantize import QuantizedPolicy, int8_layers
+from rover_lib.workshop.int8.quantize import QuantizedPolicy, graph_of, int8_layers, with_embedding
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
 REASONS = {  # why another processor may answer otherwise: of FP32, and of INT8

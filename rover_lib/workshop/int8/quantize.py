@@ -25,7 +25,7 @@ from torch.ao.nn.quantized import modules as int8
 from torch.ao.quantization import per_channel_dynamic_qconfig, quantize_dynamic
 from torch.ao.quantization.backend_config import get_qnnpack_backend_config
 from torch.ao.quantization.quantize_fx import convert_fx
-from torch.fx import GraphModule
+from torch.fx import Graph, GraphModule, Node, Tracer
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import give_back_freed
@@ -206,3 +206,26 @@ def most_clipped(
     shares = {name: 100 * clipped[name] / count for name, count in seen.items()}
     layer = max(shares, key=lambda name: shares[name])
     return {"layer": layer, "clipped_pct": shares[layer]}
+
+
+class _Leaves(Tracer):
+    def is_leaf_module(self, m: nn.Module, module_qualified_name: str) -> bool:
+        return isinstance(m, Columns) or super().is_leaf_module(m, module_qualified_name)
+
+
+def graph_of(module: nn.Module) -> GraphModule:
+    """Trace a float module of ours with FX. The module of a quantized policy is a graph already."""
+    return module if isinstance(module, GraphModule) else GraphModule(module, _Leaves().trace(module))
+
+
+def with_embedding(module: nn.Module) -> GraphModule:
+    """Return a policy's graph that gives, beside the actions, the encoder's output averaged over the tokens: (1, D).
+
+    Its weights are the module's own. The actions are computed by the same operators.
+    """
+    source = graph_of(module)
+    copied, nodes = Graph(), dict[Node, Node]()
+    actions = copied.graph_copy(source.graph, nodes)
+    encoded = next(nodes[node] for node in source.graph.nodes if node.target == "encoder_norm")
+    copied.output((actions, copied.call_method("mean", (encoded, 1))))
+    return GraphModule(source, copied)

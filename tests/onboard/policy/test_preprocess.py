@@ -6,8 +6,9 @@ import pytest
 import torch
 from policies import smooth_frame
 
+from rover_learn.training import normalise
 from rover_lib.onboard.errors import PolicyError
-from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, normalise, prepare_frame
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 
 
 def lerobots(frame_bgr, height, width):
