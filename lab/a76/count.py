@@ -14,8 +14,7 @@ from lab.a76.core import FOR_GUEST, Core, Emulation, emulate_artifact, fetch_whe
 from lab.a76.pi5 import DRIVING, predict_ms
 from lab.a76.report import alone_of
 from lab.a76.symbols import GuestFunctions, by_kernel
-from rover_lib.onboard.artifact import engines
-from rover_lib.onboard.artifact.manifest import read_manifest
+from rover_lib.onboard.artifact.manifest import ONNXRUNTIME, read_manifest
 from rover_lib.workshop.cache import cache_folder, key_of
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.wheelhouse import REQUIREMENTS
@@ -27,7 +26,7 @@ SDOT_MACS = 16  # multiply-accumulates of one SDOT; the floor is the count if no
 
 def packages_of(artifact: Path) -> Path | None:
     """Return what comes before the Pi's own packages: for an ONNX Runtime artifact, those of a Pi without torch."""
-    if read_manifest(artifact)["engine"] != engines.ONNXRUNTIME:
+    if read_manifest(artifact)["engine"] != ONNXRUNTIME:
         return None
     wheels = REQUIREMENTS["onnxruntime"]
     key = key_of({"for": FOR_GUEST}, wheels)

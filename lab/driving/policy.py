@@ -5,8 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rover_lib.onboard.artifact.engines import TORCH
-from rover_lib.onboard.artifact.manifest import SCHEMA, save_artifact
+from rover_lib.onboard.artifact.manifest import SCHEMA, TORCH, save_artifact
 
 SIZE = (160, 320)  # height and width of the camera's pictures
 CHUNK, RATE_HZ = 32, 30.0

@@ -85,7 +85,7 @@ def show(value: Any, as_json: bool) -> None:
 
 def _print_versions(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
     if asked and not ctx.resilient_parsing:
-        from rover_lib.onboard.artifact.engines import PACKAGES
+        from rover_lib.onboard.artifact.manifest import PACKAGES
         from rover_lib.onboard.stage import version_of
 
         click.echo(f"rover {version_of('rover-policy') or 'not installed'}\nPython {platform.python_version()}")

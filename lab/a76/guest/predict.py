@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard import load_policy
-from rover_lib.onboard.artifact.engines import PACKAGES
+from rover_lib.onboard.artifact.manifest import PACKAGES
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import Policy
 

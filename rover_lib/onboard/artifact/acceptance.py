@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.archive import ONNX, refused
-from rover_lib.onboard.artifact.engines import PACKAGES, TORCH
-from rover_lib.onboard.artifact.manifest import Artifact
+from rover_lib.onboard.artifact.manifest import PACKAGES, TORCH, Artifact
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import version_of
 

@@ -1,4 +1,4 @@
-"""The artifact: one zip with a policy for an engine (see engines.py), its manifest and its parity vectors.
+"""The artifact: one zip with a policy for an engine, its manifest and its parity vectors.
 
 Beside the policy's own records it contains `extra/manifest.json` (see RULES) and `extra/parity.npz` (inputs, and the
 chunks that they must give), and no pickled Python objects. A policy that tells how unfamiliar a picture is has
@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rover_lib.onboard.artifact.archive import MANIFEST, ONNX, PARITY, kind_of, open_archive, read_record, refused
-from rover_lib.onboard.artifact.engines import ONNXRUNTIME
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.checked import Rule, broken_rule, is_number, is_whole, number, of_type, one_of, whole
 from rover_lib.onboard.errors import ArtifactError, CarError
@@ -31,6 +30,8 @@ if TYPE_CHECKING:  # only who writes an artifact needs it
 
 Vectors = dict[str, np.ndarray]  # state, chunk, and frame_<camera>: see save_artifact
 SCHEMA = 1
+TORCH, ONNXRUNTIME = "qnnpack", "onnxruntime"  # the engines that run artifacts
+PACKAGES = {TORCH: "torch", ONNXRUNTIME: "onnxruntime"}  # the package each engine needs
 ONNX_SUFFIX = ".onnx.zip"  # of artifacts for ONNX Runtime, as .pt is of torch's; readers go by the content instead
 MANGLED = re.compile(rb"___torch_mangle_\d+")
 MODES = ("fp32", "dynamic", "static", "mixed")
@@ -76,7 +77,7 @@ RULES = {
     "schema": Rule(lambda value: value == SCHEMA, f"{SCHEMA} for this rover_lib"),
     "mode": one_of(MODES),
     "scheme": one_of(SCHEMES),
-    "engine": of_type(str),  # see engines.py
+    "engine": of_type(str),  # of PACKAGES
     # [{name, height, width}], in the graph's order, and recorded, see seen_size
     "cameras": Rule(_are_cameras, f"a name, and a height and width in {SIDE_PX} pixels, of each camera"),
     "state_names": _NAMES,

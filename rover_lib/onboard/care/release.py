@@ -179,7 +179,9 @@ class Releases:
             where = printable(origin or f"{socket.gethostname()}:{source.absolute()}")
             about = {"schema": 1, "name": release.name, "sha256": arrived, "origin": where}
             (new / ORIGIN).write_text(json.dumps(about | {"mode": artifact.manifest["mode"]}, indent=1) + "\n")
-            _let_service_read(new)
+            for path, mode in ((new / POLICY, 0o644), (new / ORIGIN, 0o644), (new, 0o755)):
+                path.chmod(mode)  # for the service's user, whatever the umask is
+                sync(path)
             if release.exists():
                 for file in (POLICY, ORIGIN):
                     (new / file).replace(release / file)
@@ -217,7 +219,9 @@ class Releases:
         """Switch to the newest earlier release that passes its checks. Returns its name. Raises RoverError."""
         with self._lock():
             refused = []
-            for name in self._used_before():
+            for name in dict.fromkeys(reversed(_up_to_last(self._history(), self.current))):  # the newest first
+                if name == self.current or not self.path_of(name).exists():
+                    continue
                 try:
                     self.check(name)
                 except RoverError as error:
@@ -301,11 +305,6 @@ class Releases:
             new.replace(self.models / "history.json")
             sync(self.models)
 
-    def _used_before(self) -> list[str]:
-        """Return the releases that were in use before the present one and still exist: the newest first, each once."""
-        history = _up_to_last(self._history(), self.current)
-        return [n for n in dict.fromkeys(reversed(history)) if n != self.current and self.path_of(n).exists()]
-
     def _by_use(self) -> list[str]:
         names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))
         used = dict.fromkeys([self.current, *reversed(self._history())])
@@ -323,15 +322,6 @@ def check_in_sandbox(name: str) -> None:
         ask = ["journalctl", "--unit", unit, "--output=cat", "--grep=^rover: ", "--lines=1"]
         said = subprocess.run(ask, capture_output=True, text=True).stdout.strip().removeprefix("rover: ")
         raise RoverError(f"{unit}: {said or started.stderr.strip() or f'exit code {started.returncode}'}")
-
-
-def _let_service_read(folder: Path) -> None:
-    """Let the service's user read a release, whatever the umask is, and write all of it to the disk."""
-    for file in folder.iterdir():
-        file.chmod(0o644)
-        sync(file)
-    folder.chmod(0o755)
-    sync(folder)
 
 
 def _up_to_last(history: list[str], name: str | None) -> list[str]:

@@ -71,7 +71,8 @@ def confine(limit_mb: float) -> str:
     limit_mb: memory that the process may allocate from now on, so import torch first. Returns "", or the reason why the
     kernel cannot filter the system calls; the limit of memory holds in any case.
     """
-    _lower(resource.RLIMIT_DATA, _bytes_with(limit_mb))
+    data_kib = int(Path("/proc/self/status").read_text().partition("VmData:")[2].split()[0])
+    _lower(resource.RLIMIT_DATA, data_kib * 1024 + int(limit_mb * 1e6))
     _lower(resource.RLIMIT_CORE, 0)
     try:
         library = ctypes.CDLL(LIBRARY)
@@ -96,12 +97,6 @@ def confine(limit_mb: float) -> str:
     failed = next((code for code in codes if code), 0) or library.seccomp_load(context)
     library.seccomp_release(context)
     return f"the kernel takes no filter of system calls ({os.strerror(-failed)})" if failed else ""
-
-
-def _bytes_with(limit_mb: float) -> int:
-    """Return the size in bytes that this process's data will have once it has allocated limit_mb more."""
-    status = Path("/proc/self/status").read_text()
-    return int(status.partition("VmData:")[2].split()[0]) * 1024 + int(limit_mb * 1e6)
 
 
 def forbid_opening() -> None:

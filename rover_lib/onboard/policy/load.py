@@ -4,18 +4,40 @@ import ctypes
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from rover_lib.onboard.artifact.archive import refused
-from rover_lib.onboard.artifact.engines import MODULES, PACKAGES, Engine
-from rover_lib.onboard.artifact.manifest import Artifact, car_of
+from rover_lib.onboard.artifact.manifest import ONNXRUNTIME, PACKAGES, TORCH, Artifact, car_of
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
 from rover_lib.onboard.policy.preprocess import prepare_frame
+
+# Each module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact here.
+# threads: None lets the engine choose.
+MODULES = {
+    TORCH: "rover_lib.onboard.policy.torch_engine",
+    ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
+}
+
+
+class Engine(Protocol):
+    """An artifact's graph in one engine. threads: how many compute."""
+
+    threads: int
+
+    def run(self, state: np.ndarray, frames_rgb: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """(S,) float32 and one (height, width, 3) uint8 per camera in. Raises RuntimeError.
+
+        Returns (1, chunk, A), and (1, D) if the artifact gives an embedding.
+        """
+
+    def give_back(self) -> bool:
+        """Free the memory that only loading needed, after a first run; return whether to check predictions again."""
+        return False
 
 
 def action_limits(names: Sequence[str], car: Car) -> np.ndarray:

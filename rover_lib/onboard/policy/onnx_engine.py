@@ -7,9 +7,9 @@ import numpy as np
 import onnxruntime
 
 from rover_lib.onboard.artifact.archive import ONNX, refused
-from rover_lib.onboard.artifact.engines import Engine
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.car.host import usable_cores
+from rover_lib.onboard.policy.load import Engine
 
 onnxruntime.disable_telemetry_events()  # nobody has agreed to it
 ERRORS_ONLY = 3  # log level; ONNX Runtime warns of what a machine without a graphics card lacks

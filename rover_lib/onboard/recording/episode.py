@@ -248,9 +248,11 @@ class EpisodeWriter:
         known = {*CONTROL_FIELDS, *FLAG_FIELDS}
         for kind, time in KINDS.items():
             for row in _rows(part, kind):
-                if row and kind == "frame" and not _is_whole_picture(part / str(row.get("image_path"))):
-                    self._damaged.add(row.get("image_path"))
-                    row = None
+                if row and kind == "frame":
+                    picture = _data_of(part / str(row.get("image_path")))
+                    if not (picture.startswith(b"\xff\xd8") and picture.endswith(b"\xff\xd9")):
+                        self._damaged.add(row.get("image_path"))
+                        row = None
                 if row is None:
                     self._left_out += 1
                     continue
@@ -259,8 +261,8 @@ class EpisodeWriter:
                 self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in known)
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
                 if kind == "frame" and self.resolution is None:
-                    picture = cv2.imread(str(part / row["image_path"]))
-                    self.resolution = None if picture is None else (picture.shape[1], picture.shape[0])
+                    image = cv2.imread(str(part / row["image_path"]))
+                    self.resolution = None if image is None else (image.shape[1], image.shape[0])
         damaged = f"; {self._left_out} damaged rows and pictures are left out" if self._left_out else ""
         self.metadata["fault"] = f"the recording was cut off{damaged}"
 
@@ -405,11 +407,6 @@ def _rows(part: Path, kind: str) -> Iterator[dict[str, Any] | None]:
             except ValueError:
                 row = None
             yield row if isinstance(row, dict) and KINDS[kind] in row else None
-
-
-def _is_whole_picture(path: Path) -> bool:
-    data = _data_of(path)
-    return data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")
 
 
 def number_of(value: object) -> float | None:

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.artifact import manifest as artifact
-from rover_lib.onboard.artifact.engines import ONNXRUNTIME, TORCH
-from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
+from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, ONNXRUNTIME, TORCH
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import ArtifactError

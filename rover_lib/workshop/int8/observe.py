@@ -246,19 +246,15 @@ def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | Non
     if unknown := [b for b in scheme.float_blocks if b not in known]:
         raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
     wanted = set(known) - set(scheme.float_blocks) if only is None else set(only)
-    mapping = QConfigMapping().set_global(None)
-    for block in known:
-        qconfig = _qconfig(scheme) if block in wanted else None
-        mapping.set_module_name_regex(_pattern(block, config.activation == "relu"), qconfig)
-    return mapping
-
-
-def _qconfig(scheme: Scheme) -> QConfig:
     activation = RangeObserver.with_args(choice=scheme.observer)
     weight = PerChannelMinMaxObserver.with_args(
         dtype=torch.qint8, qscheme=torch.per_channel_symmetric, quant_min=-127, quant_max=127, eps=SMALLEST_SCALE
     )
-    return QConfig(activation, weight)
+    mapping = QConfigMapping().set_global(None)
+    for block in known:
+        qconfig = QConfig(activation, weight) if block in wanted else None
+        mapping.set_module_name_regex(_pattern(block, config.activation == "relu"), qconfig)
+    return mapping
 
 
 def _prepare(model: ACT, scheme: Scheme) -> GraphModule:
