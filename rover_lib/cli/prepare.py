@@ -69,11 +69,16 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
 
     --only 03 --name try1: execute one notebook on that run again, whose results are replaced; `rover report` judges it.
     """
+    import yaml
+
     from rover_lib.workshop.run import run_folder
     from rover_lib.workshop.run.run import execute, find_notebook
     from rover_lib.workshop.run.run import run as run_notebooks
 
-    given = _values_of(turned)
+    try:
+        given = {key: yaml.safe_load(value) for key, value in turned}
+    except yaml.YAMLError as error:
+        raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
     if only and not (checkpoint or episodes):
         folder = run_folder(options["runs_dir"], options["name"], RoverError)
         return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
@@ -81,15 +86,6 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
     given = {k: v for k, v in options.items() if v is not None} | given
     _judge(run_notebooks(checkpoint, episodes, progress=terminal_bar(), **given))
-
-
-def _values_of(turned: Turned) -> dict[str, Any]:
-    import yaml
-
-    try:
-        return {key: yaml.safe_load(value) for key, value in turned}
-    except yaml.YAMLError as error:
-        raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
 
 
 @click.command(short_help="Judge an existing run again.")

@@ -114,8 +114,3 @@ def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "A
     if weights:
         policy.model.load_state_dict({name: w.to(torch.float32, copy=True) for name, w in weights.items()}, assign=True)
     return policy
-
-
-def expected_shapes(c: ActConfig) -> dict[str, tuple[int, ...]]:
-    """Return the name and shape of every weight that LeRobot's ACT of this config has."""
-    return {name: tuple(w.shape) for name, w in lerobot_act(c, {}).model.state_dict().items()}

@@ -9,7 +9,7 @@ from policies import memory_samples
 from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, TrainingError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
-from rover_lib.workshop.act_config import expected_shapes
+from rover_lib.workshop.act_config import lerobot_act
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def test_at_another_size_it_is_the_teacher(tiny):
     config = student_config(tiny, StudentShape(54, 96))
     weights = initial_weights(tiny, config, [])
     assert (config.image_sizes, config.vae_layers) == (((54, 96),), 0)
-    assert shapes(weights) == expected_shapes(config)
+    assert shapes(weights) == shapes(lerobot_act(config, {}).model.state_dict())
     smaller = tiny.at_size(54, 96)
     observations = [inputs_of(s, config) for s in memory_samples(2)]
     expected = predictions(ACT(smaller.config, smaller.weights), observations)

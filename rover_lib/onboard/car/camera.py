@@ -21,7 +21,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from rover_lib.onboard.car.csi import is_csi, newest_jpegs, read_csi
+from rover_lib.onboard.car.csi import newest_jpegs, read_csi
 from rover_lib.onboard.car.picture import (
     COLUMNS,
     LEAST,
@@ -256,7 +256,7 @@ def path_of(source: str) -> Path:
 
 
 def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threading.Event) -> Reader:
-    if is_csi(source):
+    if source == "csi" or source.startswith(("csi:", "csi,")):
         return read_csi(source, size, rate_hz, closing)
     for kind in entry_points(group="rover_lib.cameras", name=source.partition(":")[0]):
         return kind.load()().read(source, size, rate_hz, closing)

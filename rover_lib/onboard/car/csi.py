@@ -25,11 +25,6 @@ END_S = 1.0
 Jpegs = Generator[tuple[bytes, None], None, None]
 
 
-def is_csi(source: str) -> bool:
-    """Whether a camera's name means a Raspberry Pi camera."""
-    return source == "csi" or source.startswith(("csi:", "csi,"))
-
-
 def command(source: str, size: tuple[int, int], rate_hz: float) -> list[str]:
     """Return rpicam-vid's command line. size: (width, height). Raises CameraError for another source."""
     found = SOURCE.fullmatch(source)

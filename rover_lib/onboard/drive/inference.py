@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -39,16 +39,6 @@ UNTOLD = 99.0  # Plan.strange where the process tells no number, which a page co
 TERMINALS = {signal.SIGINT, signal.SIGHUP, signal.SIGQUIT}  # signals of a terminal to all its programs
 
 
-class Predictor(Protocol):
-    """What a planner asks. rate_hz: actions per second of a plan. strange: Plan.strange of the newest prediction."""
-
-    rate_hz: float
-    strange: float | None
-
-    def predict(self, frame_bgr: np.ndarray, state: np.ndarray, /) -> np.ndarray:
-        """Return (chunk, 2) actions, unclipped, for a frame (h, w, 3) uint8 BGR and a state (2,), or raise."""
-
-
 class Planner:
     """Keeps planning from the newest frame, in a thread; a context manager.
 
@@ -59,7 +49,7 @@ class Planner:
     def __init__(
         self,
         camera: Camera,
-        policy: Predictor,
+        policy: "PolicyProcess",
         commanded: Commanded,
         *,
         rest_s: float = 0.0,
