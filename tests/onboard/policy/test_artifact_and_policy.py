@@ -11,7 +11,7 @@ from policies import memory_samples
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.acceptance import inspect_artifact
 from rover_lib.onboard.errors import ArtifactError, PolicyError
-from rover_lib.onboard.policy import torch_engine
+from rover_lib.onboard.policy.torch_engine import _originals, give_back_packed_weights
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)
@@ -74,10 +74,10 @@ def test_weights_that_torch_holds_twice_are_given_back_and_predictions_stay(tiny
     policy = load_policy(tmp_path / "p.pt")
     before = policy.predict_chunk(frame, state)
     (module,) = asked
-    weights = list(torch_engine._originals(module.graph))
+    weights = list(_originals(module.graph))
     total = sum(w.untyped_storage().nbytes() for w in weights)
     assert all(w.int_repr().any() for w in weights)
-    given = torch_engine.give_back_packed_weights(module)
+    given = give_back_packed_weights(module)
     assert 0.9 * total < given <= total  # all but the two ends, which are no whole pages
     largest = max(weights, key=torch.Tensor.numel)
     assert largest.numel() > 1e6 and largest.int_repr().count_nonzero() <= 2 * mmap.PAGESIZE  # only the ends are left
