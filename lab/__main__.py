@@ -48,7 +48,7 @@ def arm(run_dir: Path) -> None:
     Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of lab/params.yml hold. Needs Debian
     12 with qemu-user, mmdebstrap and gcc, which it installs if you are root.
     """
-    from lab.a76.count_run import count_run
+    from lab.a76.count import count_run
     from lab.a76.report import table
     from rover_lib.onboard.stage import read_stage
     from rover_lib.workshop.run.run import execute

@@ -11,12 +11,11 @@ import pytest
 from policies import memory_samples
 
 from lab.a76 import core as a76
-from lab.a76 import count_run as counting
+from lab.a76 import count as counting
 from lab.a76 import pi5
 from lab.a76 import report as reports
 from lab.a76.core import BLOCK, Core, emulate, prepare
-from lab.a76.count import STEADY, Counted, count_artifact
-from lab.a76.count_run import count_run
+from lab.a76.count import STEADY, Counted, count_artifact, count_run
 from lab.a76.symbols import Functions, GuestFunctions, by_kernel
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage

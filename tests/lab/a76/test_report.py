@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from executed import shown
 
-from lab.a76 import count_run as counting
+from lab.a76 import count as counting
 from lab.a76 import report
 from lab.params import lab_params
 from rover_lib.workshop.run import run as runs

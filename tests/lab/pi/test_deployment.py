@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from lab.pi import deployment, emulation, playbooks
+from lab.pi import deployment, emulation
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 
@@ -13,9 +13,9 @@ RECAP = "rover1     : ok=42   changed=20   unreachable=0    failed=0    skipped=
 
 
 def test_a_play_says_how_much_changed_and_where_it_ended():
-    play = playbooks.Play(0, f"ok: [rover1]\n\nPLAY RECAP ****\n{RECAP}\n")
+    play = deployment.Play(0, f"ok: [rover1]\n\nPLAY RECAP ****\n{RECAP}\n")
     assert play.ok and play.changed == 20 and play.end == "ok: [rover1]"
-    assert not playbooks.Play(2, play.output).ok and not playbooks.Play(0, "ERROR! no such playbook").ok
+    assert not deployment.Play(2, play.output).ok and not deployment.Play(0, "ERROR! no such playbook").ok
 
 
 def test_it_begins_only_with_an_artifact_and_as_root(tmp_path, monkeypatch):
