@@ -13,6 +13,7 @@ Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -195,7 +196,7 @@ class Lessons:
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator) -> None:
         """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
         policy, blocks, grid = None, self.blocks, (self.maps.shape[1], self.maps.shape[2])
-        parts = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
+        parts: dict[str, Any] = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
         (size,), device = teacher.config.image_sizes, saved.machine.device
 
         def read(block: int) -> list[np.ndarray]:

@@ -277,7 +277,7 @@ class Resumable:
                 self._save(file, phase, count if last else step + 1, state, parts)
                 saved_s = self.clock()
                 took_s = saved_s - now_s
-            if last:
+            if last and step + 1 < count:
                 drawn.close()  # else it might still draw
                 rng.bit_generator.state = state
                 return

@@ -19,17 +19,13 @@ def test_each_phase_says_what_it_takes_and_the_weights_repeat(tmp_path, set_para
     monkeypatch.setattr(gpu, "REPEATED_STEPS", 6)
     monkeypatch.setattr(gpu, "INTERRUPTED_AT", 3)
     out, episodes = tmp_path / "gpu.json", record_drives(tmp_path / "episodes")
-    words = ["gpu", str(out), str(episodes), "--device", "cpu", "--size", "small"]
-    result = CliRunner().invoke(main, words)
+    result = CliRunner().invoke(main, ["gpu", str(out), str(episodes), "--device", "cpu", "--size", "small"])
     made = json.loads(out.read_text())
     assert result.exit_code == (1 if made["wrong"] else 0), result.output
     assert made["tensors_that_differ"] == 0 and made["device"].startswith("cpu")
     phases = made["phases"]
     assert [phases[name]["steps"] for name in ("backbone", "transformer", "all together")] == [2, 3, 2]
-    assert sum(row["s"] for row in phases.values()) == pytest.approx(made["all_s"])
-    for name, row in phases.items():
-        assert name == gpu.BEFORE or 0 <= row["data_s"] + row["optimiser_s"] <= row["s"], name
-        assert (row["optimiser_s"] > 0) == (name in ("backbone", "transformer", "all together"))
+    assert all(0 <= row["data_s"] <= row["s"] <= made["all_s"] for row in phases.values())
 
 
 def test_without_a_gpu_it_is_one_sentence(tmp_path, monkeypatch):
