@@ -39,6 +39,11 @@ def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+def _recipes(options: dict[str, Any]) -> dict[str, Any]:
+    """Take a recipe's own numbers out of the options."""
+    return {name: options.pop(name) for name in ("steps", "batch")}
+
+
 def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
     from rover_lib.onboard.stage import read_stage
 
@@ -58,14 +63,7 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
 )
 @of_a_recipe
 @with_source
-def distill(
-    checkpoint: Path,
-    episodes: "Source",
-    size: tuple[int, int] | None,
-    steps: int | None,
-    batch: int | None,
-    **options: Any,
-) -> None:
+def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, **options: Any) -> None:
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and distill.json in the run's folder. Run it
@@ -77,7 +75,7 @@ def distill(
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
-    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(steps=steps, batch=batch)}
+    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(**_recipes(options))}
     folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary)
 
@@ -86,9 +84,7 @@ def distill(
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @of_a_recipe
-def finetune(
-    checkpoint: Path, episodes: tuple[Path, ...], steps: int | None, batch: int | None, **options: Any
-) -> None:
+def finetune(checkpoint: Path, episodes: tuple[Path, ...], **options: Any) -> None:
     """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
@@ -98,7 +94,7 @@ def finetune(
     from rover_learn.finetune import FinetuneRecipe, summary
     from rover_learn.finetune import finetune as learn_on
 
-    recipe = FinetuneRecipe.of(steps=steps, batch=batch)
+    recipe = FinetuneRecipe.of(**_recipes(options))
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
 

@@ -73,11 +73,6 @@ class Recipe:
             raise TrainingError(f"params.yml: {where}: {name} must be {words}", found=found)
         return cls(**values)
 
-    def of_batch(self, batch: int) -> Self:
-        """Return the same recipe with that many samples in a step of every phase. Raises TrainingError."""
-        sizes = {each.name: batch for each in fields(self) if each.name.endswith("batch")}
-        return self.read("batch", asdict(self) | sizes)
-
     def of_steps(self, steps: int) -> Self:
         """Return the same recipe with that many steps in all, at least one in each phase that has any.
 
@@ -224,7 +219,7 @@ class Work(ABC):
 
     def write_policy(self, folder: Path, name: str, learned: Learned, loss: float, recordings: str) -> dict[str, str]:
         """Write best_model.pth, pretrained_model/ and the curves of a run of that name; return the files' sha256."""
-        leave_curves(folder / "training", learned.losses, {})
+        leave_curves(folder / "curves", learned.losses, {})
         settings = {"learning_rate": self.recipe.rate, "batch_size": self.recipe.batch, "seed": self.recipe.seed}
         settings |= {"data_dir": recordings, "output_dir": name, "device": self.machine.device.type}
         origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}

@@ -127,11 +127,10 @@ def train(
     size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
     None: the recipe's. device, workers, amp: as of `Machine.of`. say: is told what it trains on, and how that went.
 
-    Returns out_path, which appears complete or not at all; beside it <its name>-training.json and .png and, with
-    TensorBoard, -tensorboard. On one machine's processor the same input gives the same weights, even if training was
-    ended at any moment and started again; a GPU may add in another order. A checkpoint that was made before is taken
-    from the cache. Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for
-    recordings.
+    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/. On one machine's processor
+    the same input gives the same weights, even if training was ended at any moment and started again; a GPU may add in
+    another order. A checkpoint that was made before is taken from the cache.
+    Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     out_path, source = Path(out_path), Source.of(episodes)
     machine = Machine.of(device, workers, amp)
@@ -143,7 +142,8 @@ def train(
         raise TrainingError("training needs a seed from 0", found=seed)
     recipe = TrainingRecipe.of(size, kind)
     recipe = recipe if steps is None else recipe.of_few(steps)
-    recipe = recipe if batch is None else recipe.of_batch(batch)
+    if batch is not None:
+        recipe = replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch)
     p = params()["calibration"]
     recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
@@ -161,18 +161,17 @@ def train(
         with machine.computing(), Resumable(unfinished, machine, progress) as saved:
             began_s = time.monotonic()
             trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, saved)
-            took_s = time.monotonic() - began_s
-            say(f"{took_s:.0f} s on {machine.words()}; held-out error {trained['best_val_loss']:.4f}")
-            leave_curves(folder / "training", saved.losses, saved.judged)
+            say(f"in {time.monotonic() - began_s:.0f} s, held-out error {trained['best_val_loss']:.4f}")
+            leave_curves(folder / "curves", saved.losses, saved.judged)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
 
     made = cache_folder("checkpoint", key_of({**made_of, "device": kind}, *sources), make)
     shutil.rmtree(unfinished, ignore_errors=True)
-    for file in sorted(made.iterdir(), key=lambda path: path.suffix == ".pth"):  # that one last
-        goes = out_path if file.suffix == ".pth" else out_path.with_name(f"{out_path.stem}-{file.name}")
-        with atomic_path(goes) as temporary:
-            shutil.copyfile(file, temporary)
+    if (curves := made / "curves").is_dir():
+        shutil.copytree(curves, out_path.with_name(f"{out_path.stem}_curves"), dirs_exist_ok=True)
+    with atomic_path(out_path) as temporary:
+        shutil.copyfile(made / "best_model.pth", temporary)
     return out_path
 
 
@@ -368,10 +367,7 @@ def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, 
 
 
 def _train_together_or_not(training: _Training, name: str, steps: int) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: all parameters at a tenth of the rate; the result stays only if it is no worse than what was before.
-
-    Returns the optimiser and scheduler, to be saved.
-    """
+    """Phase three: all parameters at a tenth of the rate; the result stays only if it is no worse than what was."""
     policy, saved = training.policy, training.saved
     apart, before = {k: v.clone() for k, v in policy.state_dict().items()}, training.judge()
     made = saved.train(

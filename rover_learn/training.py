@@ -77,14 +77,13 @@ class Machine:
             torch.use_deterministic_algorithms(True, warn_only=True)  # pooling has no repeatable gradient
         try:
             yield
-        except torch.OutOfMemoryError as error:
-            remedy = "end what else uses it (nvidia-smi) and run again to resume, or begin anew with a smaller --batch"
-            raise TrainingError(f"{self.device}: its memory is full", remedy=remedy) from error
         except RuntimeError as error:
-            if "CUDA error" not in str(error) and "cuDNN error" not in str(error):
+            full, found = isinstance(error, torch.OutOfMemoryError), str(error).partition("\n")[0]
+            if not full and "CUDA error" not in found and "cuDNN error" not in found:
                 raise
-            remedy = "run again to resume; if it stays lost, nvidia-smi or dmesg say why"
-            raise TrainingError(f"{self.device}: lost", found=str(error).splitlines()[0], remedy=remedy) from error
+            what = "its memory is full" if full else "lost"
+            remedy = "run again to resume: nvidia-smi shows what else uses it; or begin anew with a smaller --batch"
+            raise TrainingError(f"{self.device}: {what}", found=found, remedy=remedy) from error
         finally:
             torch.use_deterministic_algorithms(repeatable)
 

@@ -81,9 +81,9 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     assert killed["best_val_loss"] == whole["best_val_loss"]
     assert killed["optimizer_state_dict"]["state"][0]["step"] == 2
     assert not list((tmp_path / "cache").glob("training-*")), "what was saved on the way is of no use any more"
-    curves = json.loads((tmp_path / "killed-training.json").read_text())
+    curves = json.loads((tmp_path / "killed_curves/curves.json").read_text())
     assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [2, 3, 2]
-    assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed-training.png").stat().st_size > 1000
+    assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
     with monkeypatch.context() as patch:  # now it is taken from the cache
         patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
         assert train(drives, tmp_path / "again.pth", device="cpu").read_bytes() == out.read_bytes()
