@@ -1,5 +1,6 @@
 """The laboratory's commands: python -m lab COMMAND, from a checkout."""
 
+import json
 import os
 from collections.abc import Sequence
 from functools import partial
@@ -76,6 +77,24 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], car_f
     metrics = run_faults(output, only, read_car(car_file) if car_file else Car(), click.echo)
     show(metrics["summary"], False)
     _end(ctx, metrics["wrong"])
+
+
+@main.command("gpu")
+@click.argument("output", type=FILE)
+@click.argument("episodes", type=FILE, required=False)
+@click.option("--device", default="cuda", show_default=True)
+@click.option("--size", type=click.Choice(["small", "full"]), default="full", show_default=True)
+@click.pass_context
+def measure_gpu(ctx: click.Context, output: Path, episodes: Path | None, device: str, size: str) -> None:
+    """Train on a GPU, on EPISODES or on 128 drives recorded for it, and write what it takes to OUTPUT, as JSON.
+
+    The exit code is 1 if it takes longer than it should, or an interruption changes the weights.
+    """
+    from lab.gpu import measure, record
+
+    made = measure(episodes or record(device, terminal_bar()), device, size)
+    output.write_text(json.dumps(made, indent=2) + "\n")
+    _end(ctx, made["wrong"])
 
 
 @main.command("mutants")

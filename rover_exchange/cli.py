@@ -29,8 +29,9 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
     """Write our RECORDINGS, or a donkeycar tub, as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
     lerobot-train trains at the size of the pictures: at the recorded size it takes 25 times as long as with sides a
-    fifth as long. What is repaired in the recordings or left out is printed, and kept in OUT/rover_export.json. In a
-    drive of a policy, each frame says whether a human had taken over: LeRobot's `intervention`.
+    fifth as long. On a GPU it waits for pictures unless lerobot-edit-dataset has made videos of them. What is repaired
+    in the recordings or left out is printed, and kept in OUT/rover_export.json. In a drive of a policy, each frame says
+    whether a human had taken over: LeRobot's `intervention`.
 
     A tub's steering and throttle become those of this machine's car (car.yml). Its deleted records and those at which a
     pilot drove are left out, and episodes end where records are missing.

@@ -15,16 +15,33 @@ if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
 
 
-def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a training whose recipe is a section of params.yml."""
+def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
+    """Add what every training can be told: how long it lasts, and what it computes on."""
     for option in (
-        click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]"),
+        click.option("--amp/--no-amp", default=False, show_default=True, help="Mixed precision, in bfloat16."),
+        click.option("--workers", type=click.IntRange(min=0), help="Threads that read ahead [default: all for a GPU]."),
+        click.option("--device", metavar="cpu|cuda|cuda:N", help="[default: cuda where there is one]"),
+        click.option("--batch", type=click.IntRange(min=1), help="Samples in each step [default: params.yml]."),
         click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml]."),
+    ):
+        command = option(command)
+    return command
+
+
+def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of a training that leaves a run's folder."""
+    for option in (
+        of_a_training,
         click.option("--runs-dir", type=FILE, default="runs", show_default=True),
         click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/."),
     ):
         command = option(command)
     return command
+
+
+def _recipes(options: dict[str, Any]) -> dict[str, Any]:
+    """Take a recipe's own numbers out of the options."""
+    return {name: options.pop(name) for name in ("steps", "batch")}
 
 
 def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
@@ -46,9 +63,7 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
 )
 @of_a_recipe
 @with_source
-def distill(
-    checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, steps: int | None, **options: Any
-) -> None:
+def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, **options: Any) -> None:
     """Teach a smaller policy what CHECKPOINT plans on the recordings in EPISODES.
 
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and distill.json in the run's folder. Run it
@@ -60,7 +75,7 @@ def distill(
 
     height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
-    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(steps=steps)}
+    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(**_recipes(options))}
     folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary)
 
@@ -69,7 +84,7 @@ def distill(
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @of_a_recipe
-def finetune(checkpoint: Path, episodes: tuple[Path, ...], steps: int | None, **options: Any) -> None:
+def finetune(checkpoint: Path, episodes: tuple[Path, ...], **options: Any) -> None:
     """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
@@ -79,34 +94,9 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], steps: int | None, **
     from rover_learn.finetune import FinetuneRecipe, summary
     from rover_learn.finetune import finetune as learn_on
 
-    recipe = FinetuneRecipe.of(steps=steps)
+    recipe = FinetuneRecipe.of(**_recipes(options))
     folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
-
-
-@click.command(short_help="Make many runs from one sheet.")
-@click.argument("sheet", type=FILE)
-@click.option("--out", type=FILE, help="The sweep's folder [default: runs/<the sheet's name>].")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes on this machine [default: one for two cores].")
-@click.option("--scheduler", metavar="tcp://HOST:8786", help="A Dask cluster instead of this machine.")
-def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | None) -> None:
-    """Make all runs that the file SHEET asks for; `rover inspect` of the sweep's folder compares them.
-
-    SHEET names checkpoints, recordings, students to teach and settings to vary. Every combination is a run with its own
-    folder inside the sweep's. Run it again to resume. Runs that fail are named at the end.
-    """
-    from rover_learn import sweep as sweeping
-
-    if workers and scheduler:
-        raise click.UsageError("--workers are this machine's; a cluster has its own")
-    jobs, folder = sweeping.read_sheet(sheet), out or Path("runs") / sheet.stem
-    with sweeping.open_cluster(scheduler, workers) as client:
-        failed = sweeping.sweep(jobs, folder, client, progress=terminal_bar())
-    click.echo(f"done: {len(jobs) - len(failed)} runs; compare them: rover inspect {folder}")
-    for name, sentence in failed.items():
-        click.echo(f"rover: {name} failed: {sentence}", err=True)
-    if failed:
-        raise click.exceptions.Exit(1)
 
 
 @click.command(short_help="Train a policy, LeRobot's ACT, on recordings.")
@@ -120,18 +110,17 @@ def sweep(sheet: Path, out: Path | None, workers: int | None, scheduler: str | N
     help="full is the size of the real car's policy.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps [default: the recipe's].")
-@click.option("--device", type=click.Choice(["cpu", "cuda"]), help="[default: cuda where there is one]")
+@of_a_training
 @with_source
 def train(episodes: "Source", output: Path, **options: Any) -> None:
     """Train LeRobot's ACT on the recordings in EPISODES and write the checkpoint OUTPUT, as a trainer's .pth.
 
-    `small` takes minutes on two cores, `full`, the policy of the real car, about an hour: it is trained at a
-    quarter of its pixels and then carried to 640x360. The rate of its plans is that of the recordings, whose held-out
-    part is left for `rover run`. Run it again to resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or
-    ~/.cache/rover.
+    `small` takes minutes on two cores, `full`, the policy of the real car, about an hour, or minutes on a GPU: it is
+    trained at a quarter of its pixels and then carried to 640x360. The rate of its plans is that of the recordings,
+    whose held-out part is left for `rover run`. Beside OUTPUT are its curves. Run it again to resume; for that it keeps
+    up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
     """
     from rover_learn.train import train as train_policy
 
-    click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), **options)}")
+    click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
     click.echo(f"next: rover run {output} {episodes.path} --name mine")

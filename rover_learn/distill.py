@@ -20,17 +20,17 @@ import torch
 from torch import Tensor
 
 from rover_learn.channels import without_channels
-from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Pool, plans_of
+from rover_learn.lessons import PLANNED, VIEWS, BatchedPolicy, Lessons, Pool, lit, plans_of
 from rover_learn.phases import Learned, LessonRecipe, Work, cache_for, free_folder
 from rover_learn.student import StudentShape, gmac, initial_weights, student_config
-from rover_learn.training import Resumable
+from rover_learn.training import ACTION, IS_PAD, Batch, Machine, Resumable
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.recordings.samples import Source, pick_evenly
-from rover_lib.workshop.run.session import Opened, load, training_device
+from rover_lib.workshop.run.session import Opened, load
 
 SLOWER = 10  # the last phase's rate is this much smaller
 
@@ -62,6 +62,8 @@ def distill(
     runs_dir: Path | str = "runs",
     recipe: DistillRecipe | None = None,
     device: str | None = None,
+    workers: int | None = None,
+    amp: bool = False,
     progress: Progress = silent,
 ) -> Path:
     """Teach a student of that shape what the checkpoint plans on these recordings. Returns the run's folder.
@@ -70,7 +72,7 @@ def distill(
     again with the same arguments, it goes on and gives the same student. The folder appears only when it is complete.
     Raises TrainingError for a student, a device or recordings that cannot be, and for a run that is there.
     """
-    folder, where = free_folder(runs_dir, name), training_device(device, TrainingError)
+    folder, machine = free_folder(runs_dir, name), Machine.of(device, workers, amp)
     recipe = recipe or DistillRecipe.of()
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
@@ -78,7 +80,13 @@ def distill(
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     if share is None and config == replace(teacher.config, vae_layers=0):
         raise TrainingError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
-    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress, "opened": opened, "share": share}
+    given: dict[str, Any] = {
+        "recipe": recipe,
+        "machine": machine,
+        "progress": progress,
+        "opened": opened,
+        "share": share,
+    }
     action_range = opened.recordings.action_range()
     return Distillation(origin=teacher, config=config, action_range=action_range, **given).make(folder)
 
@@ -94,9 +102,9 @@ class Distillation(Work):
 
     def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """plans: (B, C, A), the student's. Mean absolute errors to the teacher's and to what was recorded, weighted."""
-        recipe, driven, units = self.recipe, batch.driven(), self.units
-        to_teacher = ((plans - batch.planned()).abs() * units).mean()
-        to_recorded = ((plans - batch.recorded()).abs() * units * driven).sum() / (driven.sum() * len(units))
+        recipe, driven, units = self.recipe, ~batch[IS_PAD][..., None], self.units
+        to_teacher = ((plans - batch[PLANNED]).abs() * units).mean()
+        to_recorded = ((plans - batch[ACTION]).abs() * units * driven).sum() / (driven.sum() * len(units))
         return recipe.to_teacher * to_teacher + recipe.to_recorded * to_recorded
 
     def learn(self) -> Learned:
@@ -107,14 +115,14 @@ class Distillation(Work):
         folder = cache_for("lessons", sees)
         whole = {"student": asdict(self.config), "share": self.share, "units": self.ranges.tolist()}
         own = cache_for("student", sees | whole | {"whole": asdict(recipe)})
-        with Resumable(folder, self.progress) as saved:
+        with Resumable(folder, self.machine, self.progress) as saved:
             lessons = Lessons.open(folder, samples, self.config, self.origin, self.rng("states"))
-            lessons.ask(saved, self.origin, self.rng("teacher"), self.device)
+            lessons.ask(saved, self.origin, self.rng("teacher"))
             backbone = self._train_backbone(lessons, saved)
             losses = dict(saved.losses)
-        with Resumable(own, self.progress) as saved:
+        with Resumable(own, self.machine, self.progress) as saved:
             weights = self._start(lessons, backbone)
-            policy = BatchedPolicy(self.config, weights).to(self.device)
+            policy = BatchedPolicy(self.config, weights).to(self.machine.device)
             if self.share is not None:
                 lessons = lessons.apart(own)
                 lessons.see(saved, policy, self.rng("tokens"))
@@ -127,15 +135,16 @@ class Distillation(Work):
         it is to lose channels. Returns its weights; at the teacher's own size they are the teacher's.
         """
         teacher = self.origin.at_size(*self.config.image_sizes[0])
-        policy = BatchedPolicy(teacher.config, teacher.weights).to(self.device)
+        policy = BatchedPolicy(teacher.config, teacher.weights).to(self.machine.device)
         policy.thaw()
 
         def off(batch: Batch) -> Tensor:
-            shown = batch.seen()
-            return (policy.features(batch.pictures()) - shown).square().mean() / shown.square().mean()
+            shown = batch["maps"].float()
+            return (policy.features(lit(batch)) - shown).square().mean() / shown.square().mean()
 
         if self.config.image_sizes != self.origin.config.image_sizes:
-            self.train(saved, "backbone", policy.backbone, self.recipe.rate, Pool([(lessons, False)]), off)
+            pool, rate = Pool([(lessons, False)]), self.recipe.rate
+            self.train(saved, "backbone", policy.backbone, rate, pool, off, "frames", "maps")
         if self.share is None:
             lessons.see(saved, policy, self.rng("tokens"))
         return {name: value for name, value in policy.weights().items() if name.startswith("backbone.")}
@@ -148,8 +157,8 @@ class Distillation(Work):
         seeing = replace(self.origin, weights=self.origin.weights | backbone)
         weights = initial_weights(seeing, self.config, inputs)
         if self.share is not None:
-            pictures = self.progress(lessons.each_once(), desc="channels", total=len(lessons.blocks))
-            shown = (torch.from_numpy(block) for block in pictures)
+            blocks = self.progress(lessons.blocks, desc="channels", total=len(lessons.blocks))
+            shown = (torch.from_numpy(lessons.pictures(rows, rows % len(VIEWS))) for rows in blocks)
             weights = without_channels(weights, self.config, self.share, shown, self.rng("channels"))
         return weights
 
@@ -160,7 +169,7 @@ class Distillation(Work):
         of_teacher = "teacher", teacher.config, teacher.weights, None
         every, students = [], []
         for named, config, weights, share in (of_teacher, (name, self.config, learned.weights, self.share)):
-            policy = BatchedPolicy(config, weights).to(self.device)
+            policy = BatchedPolicy(config, weights).to(self.machine.device)
             row = {"name": named, **dict(zip(("height", "width"), config.image_sizes[0], strict=True))}
             row |= {"decoder_layers": config.decoder_layers, "feedforward": config.feedforward}
             row |= {"backbone_channels": share, "gmac": gmac(config, weights)}
@@ -168,7 +177,7 @@ class Distillation(Work):
             students.append(row | errors_of(every[-1], every[0], held_out, self.action_range))
         chosen, driven = plans_of(policy, choosing, self.progress), ~np.stack([s.is_pad for s in choosing])
         loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
-        hashes = self.write_policy(new, name, learned.weights, loss, recordings.root.name)
+        hashes = self.write_policy(new, name, learned, loss, recordings.root.name)
         metrics: dict[str, Any] = {"students": students, "losses": learned.losses, "files_sha256": hashes}
         metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
         metrics |= {"note": "Judged on recordings alone: nobody drove.", "warnings": not_judged(self.action_range)}

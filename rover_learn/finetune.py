@@ -26,10 +26,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from rover_learn.lessons import Batch, BatchedPolicy, Lessons, Pool, plans_of
+from rover_learn.lessons import OLD as IS_OLD
+from rover_learn.lessons import PLANNED, BatchedPolicy, Lessons, Pool, plans_of
 from rover_learn.phases import Learned, LessonRecipe, Work, cache_for, free_folder
 from rover_learn.student import refuse_no_car
-from rover_learn.training import Resumable
+from rover_learn.training import ACTION, IS_PAD, Batch, Machine, Resumable
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
@@ -41,7 +42,6 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, pick_evenly
-from rover_lib.workshop.run.session import training_device
 
 SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = TAUGHT = ("demonstrations", "new_demonstrations", "corrections")
@@ -74,6 +74,8 @@ def finetune(
     runs_dir: Path | str = "runs",
     recipe: FinetuneRecipe | None = None,
     device: str | None = None,
+    workers: int | None = None,
+    amp: bool = False,
     progress: Progress = silent,
 ) -> Path:
     """Let a checkpoint go on learning from old and new recordings, and return the run's folder.
@@ -83,13 +85,13 @@ def finetune(
     params.yml. device: 'cpu', 'cuda', or None for the best that there is. It resumes as `distill` does.
     Raises TrainingError for a name, a device or recordings that cannot be used; CheckpointError, EpisodeError.
     """
-    folder, where = free_folder(runs_dir, name), training_device(device, TrainingError)
+    folder, machine = free_folder(runs_dir, name), Machine.of(device, workers, amp)
     recipe = recipe or FinetuneRecipe.of()
     parent, read = _open(checkpoint, [Source.of(each) for each in episodes], progress)
     material = _part_episodes(read, recipe)
     ranges = [r.action_range() for r in read]
     both = {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
-    given: dict[str, Any] = {"recipe": recipe, "device": where, "progress": progress, "action_range": both}
+    given: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "action_range": both}
     return Finetuning(origin=parent, config=parent.config, material=material, **given).make(folder)
 
 
@@ -219,15 +221,15 @@ class Finetuning(Work):
         every = []
         for kind, samples in self.material.taught:
             folder = cache_for("lessons", self.sees(samples) | {"kind": kind})
-            with Resumable(folder, self.progress) as saved:
+            with Resumable(folder, self.machine, self.progress) as saved:
                 lessons = Lessons.open(folder, samples, parent.config, parent, self.rng(f"states, {kind}"))
-                lessons.ask(saved, parent, self.rng(kind), self.device)
+                lessons.ask(saved, parent, self.rng(kind))
             every.append((kind, lessons))
         whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
         weights = np.concatenate([_weights(recipe, kind, each, 1 / self.ranges) for kind, each in every])
         pool = Pool([(each, kind != DEMONSTRATIONS) for kind, each in every], weights)
-        with Resumable(cache_for("finetune", whole), self.progress) as saved:
-            policy = BatchedPolicy(parent.config, parent.weights).to(self.device)
+        with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
+            policy = BatchedPolicy(parent.config, parent.weights).to(self.machine.device)
             policy.thaw()
             self.train_policy(saved, policy, pool, self.loss, seen="maps", slower=SLOWER)
         made = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
@@ -235,9 +237,9 @@ class Finetuning(Work):
 
     def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """The mean absolute error, in units of the recorded range. plans: (B, C, A)."""
-        units, share, driven = self.units, batch.share_of_old(self.recipe.to_parent), batch.driven()
-        to_parent = ((plans - batch.planned()).abs() * units * share).sum()
-        to_recorded = ((plans - batch.recorded()).abs() * units * driven * (1 - share)).sum()
+        units, share, driven = self.units, self.recipe.to_parent * batch[IS_OLD], ~batch[IS_PAD][..., None]
+        to_parent = ((plans - batch[PLANNED]).abs() * units * share).sum()
+        to_recorded = ((plans - batch[ACTION]).abs() * units * driven * (1 - share)).sum()
         counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
         return (to_parent + to_recorded) / (counted * len(units))
 
@@ -245,7 +247,7 @@ class Finetuning(Work):
         """Judge each held-out episode with the policy as it was before and after: finetune.json's rows."""
         held_out, rows = self.material.held_out, []
         policies = {"before": self.origin.weights, "after": weights}
-        asked = {when: BatchedPolicy(self.config, each).to(self.device) for when, each in policies.items()}
+        asked = {when: BatchedPolicy(self.config, each).to(self.machine.device) for when, each in policies.items()}
         for name, kind, every in self.progress(held_out, desc="judging", total=len(held_out)):
             samples = pick_evenly(every, self.recipe.judged_frames)
             driven, actions = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
@@ -263,7 +265,7 @@ class Finetuning(Work):
         old = [(key, row[key]) for row in rows if row["kind"] == OLD for key in row]
         errors = [error for key, error in old if key.startswith("after_") and error is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
-        hashes = self.write_policy(new, name, learned.weights, loss, material.recordings[-1].root.name)
+        hashes = self.write_policy(new, name, learned, loss, material.recordings[-1].root.name)
         counts = dict.fromkeys(TAUGHT, 0) | {"not_imitated": material.left_out}
         for kind, samples in material.taught:
             counts[kind] += len(samples)

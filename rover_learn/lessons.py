@@ -1,8 +1,8 @@
 """Keep on disk what a student learns from: recorded frames, and what its teacher sees and plans on them.
 
     lessons = Lessons.open(folder, samples, config, teacher, rng)
-    lessons.ask(saved, teacher, rng, device)          # or go on where that was interrupted
-    frames = lessons.pictures(rows, views)
+    lessons.ask(saved, teacher, rng)          # or go on where that was interrupted
+    batch = Pool([(lessons, False)]).batch(16, rng, device, "frames")
 
 Every sample is there twice, as it is and mirrored with its steering negated, and the teacher plans on both. Half of the
 states in motion are replaced by another sample's.
@@ -10,17 +10,30 @@ states in motion are replaced by another sample's.
 Letters: B batch, C chunk, A actions, D channels of the feature map, h and w of it.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_learn.training import Frames, Given, Resumable, RowFile, swap_states
+from rover_learn.training import (
+    ACTION,
+    GAIN,
+    IMAGE,
+    IS_PAD,
+    STATE,
+    Batch,
+    Frames,
+    Given,
+    Resumable,
+    RowFile,
+    on_device,
+    swap_states,
+)  # fmt: skip
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine
@@ -33,6 +46,7 @@ BLOCK = 8  # a policy plans on this many samples at once
 VIEWS = PLAIN, MIRRORED = 0, 1
 MIRROR = np.array([-1, 1], np.float32)  # a mirrored view multiplies steering and throttle by this
 LIGHT, COLOUR = (0.8, 1.25), (0.9, 1.1)  # a picture is multiplied by the first as a whole, by the second per colour
+PLANNED, OLD = "planned", "old"  # of a batch, beside LeRobot's keys
 FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering, drawn from this range
 
 
@@ -159,23 +173,41 @@ class Lessons:
         frames = self.frames[rows]
         return np.where((views == MIRRORED)[:, None, None, None], frames[:, :, ::-1], frames)
 
-    def each_once(self) -> Iterator[np.ndarray]:
-        """Yield every sample's picture once, each second one mirrored, in blocks of (B, height, width, 3) uint8."""
-        for rows in self.blocks:
-            yield self.pictures(rows, rows % len(VIEWS))
+    def show(
+        self, rows: np.ndarray, views: np.ndarray, new: bool, rng: np.random.Generator, *shown: str
+    ) -> dict[str, np.ndarray]:
+        """Return these samples in these views as arrays with a row for each, as `Pool.batch` joins them.
+
+        With the state of new recordings goes a random share of the steering, because if nothing to steer to is in
+        sight, only the state says on which side it was.
+        """
+        both, mirror = 2 * rows + views, np.where((views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
+        states = self.asked[both]
+        if new:
+            states = self.data.states[rows] * mirror
+            states[:, 0] *= rng.uniform(*FADED, len(rows))
+        arrays = {STATE: states, PLANNED: self.plans[both], ACTION: self.data.chunks[rows] * mirror[:, None]}
+        arrays |= {IS_PAD: self.data.is_pad[rows], OLD: np.full((len(rows), 1, 1), not new, np.float32)}
+        if "frames" in shown:
+            arrays[IMAGE] = self.pictures(rows, views)
+        return arrays | {name: getattr(self, name)[both] for name in shown if name != "frames"}
 
     @torch.inference_mode()
-    def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator, device: torch.device) -> None:
+    def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator) -> None:
         """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
         policy, blocks, grid = None, self.blocks, (self.maps.shape[1], self.maps.shape[2])
-        parts = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
-        for block in saved.steps("teacher", len(blocks), rng, **parts):
+        parts: dict[str, Any] = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
+        (size,), device = teacher.config.image_sizes, saved.machine.device
+
+        def read(block: int) -> list[np.ndarray]:
+            pictures = [self.data.samples[i].frame_bgr() for i in blocks[block]]
+            return [np.stack([prepare_frame(p, *at) for p in pictures]) for at in (self.data.size, size)]
+
+        for block, (own, teachers) in saved.steps("teacher", len(blocks), rng, read, **parts):
             policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
             rows = blocks[block]
-            pictures = [self.data.samples[i].frame_bgr() for i in rows]
-            self.frames.append(np.stack([prepare_frame(p, *self.data.size) for p in pictures]))
-            (size,) = teacher.config.image_sizes
-            seen = policy.features(_in_both_views(np.stack([prepare_frame(p, *size) for p in pictures]), device))
+            self.frames.append(own)
+            seen = policy.features(_in_both_views(teachers, device))
             states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
             self.maps.append(F.adaptive_avg_pool2d(seen, grid).half().cpu())
             self.plans.append(policy.plan(seen, states).cpu())
@@ -184,86 +216,15 @@ class Lessons:
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
         """Compute the student's own feature maps of every sample in both views, as far as they are missing."""
         blocks = self.blocks
-        for block in saved.steps("tokens", len(blocks), rng, tokens=self.tokens):
-            frames = _in_both_views(self.frames[blocks[block]], student.image_scale.device)
-            self.tokens.append(student.features(frames).half().cpu())
+        steps = saved.steps("tokens", len(blocks), rng, lambda block: self.frames[blocks[block]], tokens=self.tokens)
+        for _, frames in steps:
+            self.tokens.append(student.features(_in_both_views(frames, saved.machine.device)).half().cpu())
 
 
 def _in_both_views(frames: np.ndarray, device: torch.device) -> Tensor:
     """Return frames, (B, height, width, 3), each followed by itself mirrored, (2 B, height, width, 3)."""
     plain = torch.from_numpy(frames).to(device)
     return torch.stack([plain, plain.flip(2)], 1).flatten(0, 1)
-
-
-class Part(NamedTuple):
-    """Samples of a batch from the same lessons. rows, views: (b,). new: recorded after the teacher was trained."""
-
-    lessons: Lessons
-    rows: np.ndarray
-    views: np.ndarray
-    new: bool
-
-    @property
-    def mirror(self) -> np.ndarray:
-        """(b, 2) float32: what the view multiplies steering and throttle by."""
-        return np.where((self.views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
-
-    def by_view(self, rows: RowFile | np.ndarray) -> np.ndarray:
-        """Return these samples' rows of what has a row for each view."""
-        return rows[2 * self.rows + self.views]
-
-
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """The samples of one step, of one or several lessons."""
-
-    parts: Sequence[Part]
-    rng: np.random.Generator
-    device: torch.device
-
-    def _join(self, each: Iterable[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.concatenate(list(each))).to(self.device)
-
-    def seen(self, what: str = "maps") -> Tensor:
-        """The teacher's feature maps, or the student's own tokens, (B, D, h, w) float32."""
-        return self._join(p.by_view(getattr(p.lessons, what)) for p in self.parts).float()
-
-    def pictures(self) -> Tensor:
-        """The pictures, each made lighter or darker, and tinted: (B, height, width, 3) uint8 RGB."""
-        frames = np.concatenate([p.lessons.pictures(p.rows, p.views) for p in self.parts])
-        gain = self.rng.uniform(*LIGHT, (len(frames), 1, 1, 1)) * self.rng.uniform(*COLOUR, (len(frames), 1, 1, 3))
-        frames = np.minimum(frames * gain.astype(np.float32) + 0.5, 255).astype(np.uint8)
-        return torch.from_numpy(frames).to(self.device)
-
-    def states(self) -> Tensor:
-        """The states, (B, 2), with which the teacher planned; of new recordings, with a random share of the steering.
-
-        If nothing to steer to is in sight, only the state says on which side it was.
-        """
-        each = []
-        for p in self.parts:
-            states = p.by_view(p.lessons.asked)
-            if p.new:
-                states = p.lessons.data.states[p.rows] * p.mirror
-                states[:, 0] *= self.rng.uniform(*FADED, len(p.rows))
-            each.append(states)
-        return self._join(each)
-
-    def share_of_old(self, share: float) -> Tensor:
-        """The given share for old recordings, 0 for new ones, (B, 1, 1)."""
-        return self._join(np.full((len(p.rows), 1, 1), 0.0 if p.new else share, np.float32) for p in self.parts)
-
-    def planned(self) -> Tensor:
-        """What the teacher planned, (B, C, A)."""
-        return self._join(p.by_view(p.lessons.plans) for p in self.parts)
-
-    def recorded(self) -> Tensor:
-        """What was driven, (B, C, A)."""
-        return self._join(p.lessons.data.chunks[p.rows] * p.mirror[:, None] for p in self.parts)
-
-    def driven(self) -> Tensor:
-        """Whether that was driven and is no padding, (B, C, 1)."""
-        return self._join(~p.lessons.data.is_pad[p.rows, :, None] for p in self.parts)
 
 
 class Pool:
@@ -279,14 +240,28 @@ class Pool:
         self._rows = np.concatenate([np.arange(count) for count in counts])
         self._shares = None if weights is None else weights / weights.sum()
 
-    def batch(self, count: int, rng: np.random.Generator, device: torch.device) -> Batch:
-        """Draw samples, each at most once and in one of its views."""
+    def batch(self, count: int, rng: np.random.Generator, device: torch.device, *shown: str) -> Batch:
+        """Draw samples, each at most once and in one of its views, as tensors with a row for each.
+
+        STATE: (B, 2), with which the teacher planned. PLANNED: (B, C, A), the teacher's. ACTION: (B, C, A), driven.
+        IS_PAD: (B, C). OLD: (B, 1, 1), 0 for new recordings, else 1. shown: `frames` become IMAGE and GAIN, its light
+        and tint, for `lit`; `maps` and `tokens` stay what they are.
+        """
         most = len(self._rows)
         chosen = rng.choice(most, min(count, most), replace=False, p=self._shares)
         views = rng.integers(len(VIEWS), size=len(chosen))
+        arrays = {}
+        if "frames" in shown:
+            gain = rng.uniform(*LIGHT, (len(chosen), 1, 1, 1)) * rng.uniform(*COLOUR, (len(chosen), 1, 1, 3))
+            arrays[GAIN] = gain.astype(np.float32)
         parts = []
         for place, (lessons, new) in enumerate(self.lessons):
             own = self._places[chosen] == place
             if own.any():
-                parts.append(Part(lessons, self._rows[chosen][own], views[own], new))
-        return Batch(parts, rng, device)
+                parts.append(lessons.show(self._rows[chosen][own], views[own], new, rng, *shown))
+        return on_device(arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device)
+
+
+def lit(batch: Batch) -> Tensor:
+    """Return a batch's pictures in their light and tint, (B, height, width, 3) uint8 RGB."""
+    return (batch[IMAGE] * batch[GAIN] + 0.5).clamp_(max=255).byte()

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rover_learn.lessons import Batch, BatchedPolicy, Pool
+from rover_learn.curves import leave_curves
+from rover_learn.lessons import BatchedPolicy, Pool, lit
 from rover_learn.student import gmac
-from rover_learn.training import Phase, Resumable, threads
+from rover_learn.training import STATE, Batch, Machine, Phase, Resumable, threads
 from rover_lib.onboard.checked import Rule, broken_rule, number, whole
 from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import TrainingError
@@ -126,7 +127,7 @@ class Work(ABC):
     origin: Checkpoint
     config: ActConfig  # of the policy that is made
     recipe: Any  # of the training's own kind of LessonRecipe
-    device: torch.device
+    machine: Machine
     action_range: dict[str, Range]  # the recorded one
     progress: Progress
 
@@ -140,7 +141,8 @@ class Work(ABC):
 
     def make(self, folder: Path) -> Path:
         """Learn, and leave the run's folder, which appears when it is complete. Returns it."""
-        with build_folder(folder) as new, threads(1 if gmac(self.config) < SMALL_GMAC else torch.get_num_threads()):
+        count = 1 if gmac(self.config) < SMALL_GMAC else torch.get_num_threads()
+        with self.machine.computing(), build_folder(folder) as new, threads(count):
             learned = self.learn()
             self.leave(new, folder.name, learned)
             free_folder(folder.parent, folder.name)  # another command may have made it meanwhile
@@ -156,7 +158,7 @@ class Work(ABC):
     @functools.cached_property
     def units(self) -> Tensor:
         """(A,) float32: what an error of 1 in each action counts."""
-        return torch.from_numpy(1 / self.ranges).to(self.device)
+        return torch.from_numpy(1 / self.ranges).to(self.machine.device)
 
     def rng(self, phase: str) -> np.random.Generator:
         """Return a phase's source of random numbers, the same in every process."""
@@ -169,16 +171,24 @@ class Work(ABC):
             "policy": self.origin.identity,
             "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
             "recorded": [zlib.crc32(np.stack([getattr(s, name) for s in samples]).tobytes()) for name in recorded],
-            "at": [self.device.type, self.recipe.seed],
+            "at": [self.machine.device.type, self.recipe.seed],
             "versions": [version(package) for package in VERSIONS],
         }
 
     def train(
-        self, saved: Resumable, phase: str, module: nn.Module, rate: float, pool: Pool, loss: Callable[[Batch], Tensor]
+        self,
+        saved: Resumable,
+        phase: str,
+        module: nn.Module,
+        rate: float,
+        pool: Pool,
+        loss: Callable[[Batch], Tensor],
+        *shown: str,
     ) -> None:
         """Train a module for the phase's number of steps in the recipe, or continue where that was interrupted."""
         rng, steps, count = self.rng(phase), getattr(self.recipe, f"{phase}_steps"), self.recipe.batch
-        saved.train(Phase(phase, steps, rate), module, rng, lambda _: pool.batch(count, rng, self.device), loss)
+        draw = functools.partial(pool.batch, count, rng, self.machine.device, *shown)
+        saved.train(Phase(phase, steps, rate), module, rng, lambda _: draw(), loss)
 
     def train_policy(
         self,
@@ -191,23 +201,29 @@ class Work(ABC):
         slower: float,
     ) -> None:
         """Train the transformer on what its backbone sees, `seen` of the lessons, then all together so much slower."""
-        model, rate = policy.model, self.recipe.rate
-        self.train(saved, "transformer", model, rate, pool, lambda b: loss(policy.plan(b.seen(seen), b.states()), b))
-        self.train(saved, "together", policy, rate / slower, pool, lambda b: loss(policy(b.pictures(), b.states()), b))
+        rate = self.recipe.rate
+
+        def of_transformer(batch: Batch) -> Tensor:
+            return loss(policy.plan(batch[seen].float(), batch[STATE]), batch)
+
+        def of_all(batch: Batch) -> Tensor:
+            return loss(policy(lit(batch), batch[STATE]), batch)
+
+        self.train(saved, "transformer", policy.model, rate, pool, of_transformer, seen)
+        self.train(saved, "together", policy, rate / slower, pool, of_all, "frames")
 
     @property
     def described(self) -> dict[str, Any]:
         """The recipe and the device, as a stage's params."""
-        return asdict(self.recipe) | {"device": self.device.type}
+        return asdict(self.recipe) | {"device": self.machine.device.type} | ({"amp": True} if self.machine.amp else {})
 
-    def write_policy(
-        self, folder: Path, name: str, weights: dict[str, Tensor], loss: float, recordings: str
-    ) -> dict[str, str]:
-        """Write best_model.pth and pretrained_model/ of a run of that name, and return their files' sha256."""
+    def write_policy(self, folder: Path, name: str, learned: Learned, loss: float, recordings: str) -> dict[str, str]:
+        """Write best_model.pth, pretrained_model/ and the curves of a run of that name; return the files' sha256."""
+        leave_curves(folder / "curves", learned.losses, {})
         settings = {"learning_rate": self.recipe.rate, "batch_size": self.recipe.batch, "seed": self.recipe.seed}
-        settings |= {"data_dir": recordings, "output_dir": name, "device": self.device.type}
+        settings |= {"data_dir": recordings, "output_dir": name, "device": self.machine.device.type}
         origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}
-        return write_both(folder, self.config, weights, loss, origin | {self.VERB: self.described}, **settings)
+        return write_both(folder, self.config, learned.weights, loss, origin | {self.VERB: self.described}, **settings)
 
 
 def cache_for(kind: str, made_of: Mapping[str, Any]) -> Path:

@@ -14,6 +14,8 @@ not learn from, and the best weights are kept. Recordings that are mirrored besi
 import math
 import shutil
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,8 +26,9 @@ import torch
 from torch import Tensor, nn
 
 from rover_learn import training as loop
+from rover_learn.curves import leave_curves
 from rover_learn.phases import VERSIONS, Recipe
-from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Best, Frames, Given, Phase, Resumable, RowFile, normalise
+from rover_learn.training import ACTION, GAIN, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Machine, Phase, Resumable
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -44,7 +47,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source, pick_evenly
 from rover_lib.workshop.recordings.turning import measure_sides
-from rover_lib.workshop.run.session import training_device
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
@@ -112,49 +114,64 @@ def train(
     steps: int | None = None,
     device: str | None = None,
     progress: Progress = silent,
+    *,
+    batch: int | None = None,
+    workers: int | None = None,
+    amp: bool = False,
+    say: Callable[[str], object] = silent,
 ) -> Path:
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
 
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
     part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
-    size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together; None: the recipe's.
-    device: 'cpu', 'cuda', or None for the best there is.
+    size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
+    None: the recipe's. device, workers, amp: as of `Machine.of`. say: is told what it trains on, and how that went.
 
-    Returns out_path, which appears complete or not at all. On one machine the same input gives the same weights, even
-    if training was ended at any moment and started again. A checkpoint that was made before is taken from the cache.
+    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/. On one machine's processor
+    the same input gives the same weights, even if training was ended at any moment and started again; a GPU may add in
+    another order. A checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     out_path, source = Path(out_path), Source.of(episodes)
-    device = training_device(device, TrainingError).type
+    machine = Machine.of(device, workers, amp)
+    kind = machine.device.type
+    say(f"training on {machine.words()}")
     if size not in SIZES:
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if seed < 0:
         raise TrainingError("training needs a seed from 0", found=seed)
-    recipe = TrainingRecipe.of(size, device)
-    if steps is not None:
-        recipe = recipe.of_few(steps)
+    recipe = TrainingRecipe.of(size, kind)
+    recipe = recipe if steps is None else recipe.of_few(steps)
+    if batch is not None:
+        recipe = replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch)
     p = params()["calibration"]
     recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
-    made_of = {"size": asdict(SIZES[size]), "recipe": asdict(recipe), "seed": seed, "device": device, "split": p}
+    made_of = {"size": asdict(SIZES[size]), "recipe": asdict(recipe), "seed": seed, "split": p}
     made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
-    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz}
-    sources = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
-    key = key_of(made_of, *(() if size == "full" and steps is None else sources))
-    unfinished = cache_root() / f"training-{key}"
+    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if amp else {})
+    learners = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
+    sources = () if size == "full" and steps is None else learners
+    unfinished = cache_root() / f"training-{key_of(made_of, *sources)}"  # another device goes on, if its recipe is this
 
     def make(folder: Path) -> None:
-        known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": device, "seed": seed}
+        known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": kind, "seed": seed}
         known |= {"data_dir": "episodes", "output_dir": "checkpoints", "rate_hz": int(rate_hz)}
-        with Resumable(unfinished, progress) as saved:
-            trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, torch.device(device), saved)
+        known |= {"pretrained_backbone": False}
+        with machine.computing(), Resumable(unfinished, machine, progress) as saved:
+            began_s = time.monotonic()
+            trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, saved)
+            say(f"in {time.monotonic() - began_s:.0f} s, held-out error {trained['best_val_loss']:.4f}")
+            leave_curves(folder / "curves", saved.losses, saved.judged)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
 
-    made = cache_folder("checkpoint", key, make) / "best_model.pth"
+    made = cache_folder("checkpoint", key_of({**made_of, "device": kind}, *sources), make)
     shutil.rmtree(unfinished, ignore_errors=True)
+    if (curves := made / "curves").is_dir():
+        shutil.copytree(curves, out_path.with_name(f"{out_path.stem}_curves"), dirs_exist_ok=True)
     with atomic_path(out_path) as temporary:
-        shutil.copyfile(made, temporary)
+        shutil.copyfile(made / "best_model.pth", temporary)
     return out_path
 
 
@@ -200,15 +217,17 @@ class _Training:
     def device(self) -> torch.device:
         return self.weights.device
 
-    def batch(self, count: int) -> dict[str, Tensor]:
+    def batch(self, count: int) -> Batch:
         """Draw the next batch of `count` frames, each at most once."""
         rows = self.rng.choice(len(self.data), min(count, len(self.data)), replace=False)
         return loop.batch_of(self.data, rows, self.rng, self.device)
 
-    def loss(self, batch: dict[str, Tensor]) -> Tensor:
-        return loop.policy_loss(self.policy, batch, self.weights)
+    def loss(self, batch: Batch) -> Tensor:
+        """Return the policy's loss; pictures in their light become its input, feature maps are that already."""
+        seen = loop.normalised(batch[IMAGE], batch[GAIN]) if GAIN in batch else batch[IMAGE]
+        return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
 
-    def judge(self, maps: RowFile | None = None) -> float:
+    def judge(self, maps: loop.RowFile | None = None) -> float:
         """Return the policy's mean error on the judges, in units of the spreads. maps: their feature maps, if taken."""
         judges, units = self.judges, self.weights.cpu().numpy()
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
@@ -218,16 +237,15 @@ class _Training:
 
 
 def _train(
-    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, device: torch.device, saved: Resumable
+    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, saved: Resumable
 ) -> dict[str, Any]:
     """Train, and return everything in the checkpoint except its config."""
-    p = params()["calibration"]
+    p, device, workers = params()["calibration"], saved.machine.device, saved.machine.workers
     parts = split(recordings, p["held_out_share"], p["seed"])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
     samples, judging = pick_evenly(parts.calibration, recipe.samples), pick_evenly(parts.choosing, recipe.judged)
-    data, judges = Frames.of(samples, first.image_sizes[0]), Frames.of(judging, size.image_sizes[0])
-    if not recipe.at:  # a small policy's step is so short that reading its frames from the disk would take longer
-        data.read_all(saved.progress)
+    data = Frames.of(samples, first.image_sizes[0], workers)
+    judges = Frames.of(judging, size.image_sizes[0], workers)
     spread = np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)  # of each action, (2,): errors count in it
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
@@ -238,16 +256,16 @@ def _train(
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
         policy.to(device)
         weights, rng = torch.from_numpy(1 / spread).to(device), np.random.default_rng([seed, 77])
-        judged = Frames.of(judging, first.image_sizes[0])
+        judged = Frames.of(judging, first.image_sizes[0], workers) if recipe.at else judges
         training = _Training(first, policy, data, judged, recipe, weights, rng, saved)
         _train_backbone(training)
         _train_transformer(training)
         if recipe.at:
-            _train_together(training, "all together", recipe.together_steps)
-            training = replace(training, data=Frames.of(samples, size.image_sizes[0]))
-            optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
+            _train_together_or_not(training, "all together", recipe.together_steps)
+            training = replace(training, data=Frames.of(samples, size.image_sizes[0], workers), judges=judges)
+            optimizer, scheduler = _train_together_or_not(training, "at full size", recipe.carry_steps)
         else:
-            optimizer, scheduler = _train_together_or_not(training)
+            optimizer, scheduler = _train_together_or_not(training, "all together", recipe.together_steps)
     firsts = range(0, len(judges), recipe.batch)
     errors = [loop.driving_error(policy, judges, np.arange(len(judges))[a : a + recipe.batch]) for a in firsts]
     return {
@@ -288,15 +306,19 @@ def _train_backbone(training: _Training) -> None:
         model,
         training.rng,
         batch=lambda _: training.batch(recipe.batch),
-        loss=lambda batch: loop.error_of(model(batch[IMAGE]), batch, training.weights),
+        loss=lambda batch: loop.error_of(model(loop.normalised(batch[IMAGE], batch[GAIN])), batch, training.weights),
     )
     for norm in (m for m in live.modules() if isinstance(m, nn.BatchNorm2d)):
         norm.reset_running_stats()
         norm.momentum = None  # torch then takes the plain mean over the batches below
     count = 16 if len(training.data) >= 16 * recipe.batch else 4
-    for _ in training.saved.steps("statistics", count, training.rng, backbone=live):
+
+    def draw(_: int) -> Batch:
+        return training.batch(recipe.batch)
+
+    for _, batch in training.saved.steps("statistics", count, training.rng, draw, backbone=live):
         with torch.no_grad():
-            live(training.batch(recipe.batch)[IMAGE])
+            live(loop.normalised(batch[IMAGE], batch[GAIN]))
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 
@@ -309,7 +331,7 @@ def _train_transformer(training: _Training) -> None:
     views = [_features(training, view, data, chosen, backbone) for view in ("plain", "mirrored")]
     judged = _features(training, "judges", training.judges, np.arange(len(training.judges)), backbone)
 
-    def batch(step: int) -> dict[str, Tensor]:
+    def batch(step: int) -> Batch:
         kept = training.rng.choice(len(chosen), min(recipe.transformer_batch, len(chosen)), replace=False)
         rows = chosen[kept]
         states, chunks = loop.swap_states(data, rows, training.rng), data.chunks[rows].copy()
@@ -319,7 +341,7 @@ def _train_transformer(training: _Training) -> None:
         arrays = {IMAGE: views[step % 2][kept], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
         return loop.on_device(arrays, training.device)
 
-    policy.model.backbone = Given()
+    policy.model.backbone = loop.Given()
     policy.train()
     phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
     with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
@@ -328,38 +350,35 @@ def _train_transformer(training: _Training) -> None:
     policy.model.backbone = backbone
 
 
-def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> RowFile:
+def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> loop.RowFile:
     """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file. chosen: (n,) row numbers."""
     batch, (size,) = training.recipe.batch, training.size.image_sizes
-    maps = RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
-    for step in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, maps=maps):
+    maps = loop.RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
+
+    def read(step: int) -> np.ndarray:
         images = data.pictures(chosen[step * batch : (step + 1) * batch])
-        images = images[:, :, ::-1] if view == "mirrored" else images
+        return np.ascontiguousarray(images[:, :, ::-1]) if view == "mirrored" else images
+
+    count = -(-len(chosen) // batch)
+    for _, images in training.saved.steps(f"features, {view}", count, training.rng, read, maps=maps):
         with torch.no_grad():
-            maps.append(backbone(torch.from_numpy(normalise(images)).to(training.device))["feature_map"].cpu())
+            maps.append(backbone(loop.normalised(torch.from_numpy(images).to(training.device)))["feature_map"].cpu())
     return maps
 
 
-def _train_together(training: _Training, name: str, steps: int) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: train all parameters at a tenth of the rate. Returns the optimiser and scheduler, to be saved."""
-    training.policy.train()
-    return training.saved.train(
+def _train_together_or_not(training: _Training, name: str, steps: int) -> tuple[torch.optim.Optimizer, Any]:
+    """Phase three: all parameters at a tenth of the rate; the result stays only if it is no worse than what was."""
+    policy, saved = training.policy, training.saved
+    apart, before = {k: v.clone() for k, v in policy.state_dict().items()}, training.judge()
+    made = saved.train(
         Phase(name, steps, training.recipe.transformer_rate / 10),
-        training.policy,
+        policy,
         training.rng,
         batch=lambda _: training.batch(training.recipe.together_batch),
         loss=training.loss,
     )
-
-
-def _train_together_or_not(training: _Training) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three, whose result stays only if it is no worse than what was before."""
-    policy = training.policy
-    apart = {k: v.clone() for k, v in policy.state_dict().items()}
-    made = _train_together(training, "all together", training.recipe.together_steps)
-    together = training.judge()
-    after = {k: v.clone() for k, v in policy.state_dict().items()}
-    policy.load_state_dict(apart)
-    if together <= training.judge():
-        policy.load_state_dict(after)
+    after = training.judge()
+    saved.judged[name] = [[0, before], [steps, after]]
+    if after > before:
+        policy.load_state_dict(apart)
     return made

@@ -1,14 +1,18 @@
 """What every training on recordings needs: frames, batches, the loss, and a way to go on after it was killed.
 
-with Resumable(folder) as saved:
+with Resumable(folder, Machine.of("cuda")) as saved:
     saved.train(Phase("backbone", 200, 1e-3), model, rng, batch, loss)
+
+Pictures go to the device as bytes; light and normalisation follow there. A thread draws batches ahead, in their order,
+and others read its pictures, so that no number of them changes a weight.
 """
 
 import math
 import os
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,25 +29,71 @@ from rover_lib.onboard.stage import private_lock
 from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY, save_torch
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.run.session import training_device
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-B = TypeVar("B")
+T = TypeVar("T")
+Batch = dict[str, Tensor]
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
+GAIN = "gain"  # what a batch's pictures are multiplied by
 SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
-JUDGE_EVERY, PATIENCE = 50, 8  # steps; judgements without a better one, after which it learns by heart
+JUDGE_EVERY = 50  # steps
+PATIENCE, PATIENT_SHARE = 8, 0.2  # judgements, or this share of all, without a better one: then it learns by heart
 SAVING_SHARE = 0.05  # saving takes at most this share of the time, however slow the disk
+AHEAD = 3  # batches
+MEMORY_SHARE = 1 / 8  # of the machine's memory: pictures that need more are read anew each time
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a training computes on. workers: threads that read pictures ahead. amp: mixed precision, in bfloat16."""
+
+    device: torch.device
+    workers: int = 0
+    amp: bool = False
+
+    @classmethod
+    def of(cls, device: str | None = None, workers: int | None = None, amp: bool = False) -> "Machine":
+        """Choose a device, and workers for it: a thread for each core if it is a GPU. Raises TrainingError."""
+        where = training_device(device, TrainingError)
+        cores = (os.cpu_count() or 1) if where.type == "cuda" else 0
+        return cls(where, cores if workers is None else workers, amp)
+
+    def words(self) -> str:
+        if self.device.type == "cuda":
+            return f"{self.device}, {torch.cuda.get_device_name(self.device)}"
+        return f"{self.device}, {torch.get_num_threads()} threads" + ("" if torch.cuda.is_available() else ", no GPU")
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Compute as repeatably as a GPU can. Raises TrainingError if its memory is full, or if it is lost."""
+        repeatable = torch.are_deterministic_algorithms_enabled()
+        if self.device.type == "cuda":
+            os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it starts
+            torch.use_deterministic_algorithms(True, warn_only=True)  # pooling has no repeatable gradient
+        try:
+            yield
+        except RuntimeError as error:
+            full, found = isinstance(error, torch.OutOfMemoryError), str(error).partition("\n")[0]
+            if not full and "CUDA error" not in found and "cuDNN error" not in found:
+                raise
+            what = "its memory is full" if full else "lost"
+            remedy = "run again to resume: nvidia-smi shows what else uses it; or begin anew with a smaller --batch"
+            raise TrainingError(f"{self.device}: {what}", found=found, remedy=remedy) from error
+        finally:
+            torch.use_deterministic_algorithms(repeatable)
 
 
 @dataclass
 class Frames:
     """Samples as arrays with a row for each, and their pictures at one size.
 
-    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. images: all
-    pictures, if they are in memory; else they are read from their files when asked for.
+    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. workers:
+    threads that read pictures. kept: by row, those that were read, unless all of them need too much memory.
     """
 
     samples: tuple[Sample, ...]
@@ -51,28 +101,35 @@ class Frames:
     states: np.ndarray
     chunks: np.ndarray
     is_pad: np.ndarray
-    images: np.ndarray | None = None
+    workers: int
+    kept: dict[int, np.ndarray] | None
 
     @classmethod
-    def of(cls, samples: tuple[Sample, ...], size: tuple[int, int]) -> "Frames":
-        """Return the samples, with pictures that are read when asked for."""
+    def of(cls, samples: tuple[Sample, ...], size: tuple[int, int], workers: int = 0) -> "Frames":
+        """Return the samples; no picture is read yet."""
         states, chunks = (np.stack([getattr(s, name) for s in samples]) for name in ("state", "chunk"))
         is_pad = np.stack([s.is_pad for s in samples])
-        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad)
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        kept: dict[int, np.ndarray] | None = {} if 3 * len(samples) * math.prod(size) <= memory * MEMORY_SHARE else None
+        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad, workers, kept)
 
     def __len__(self) -> int:
         return len(self.samples)
 
     def pictures(self, rows: np.ndarray) -> np.ndarray:
         """Return these rows' pictures, (n, height, width, 3) uint8 RGB. Raises EpisodeError if one is gone."""
-        if self.images is not None:
-            return self.images[rows]
-        return np.stack([prepare_frame(self.samples[i].frame_bgr(), *self.size) for i in rows])
+        if not self.workers:
+            return np.stack([self._picture(row) for row in rows.tolist()])
+        with ThreadPoolExecutor(self.workers) as pool:  # decoders and OpenCV release the interpreter's lock
+            return np.stack(list(pool.map(self._picture, rows.tolist())))
 
-    def read_all(self, progress: Progress = silent) -> None:
-        """Keep all pictures in memory: small ones take longer to read than to train on."""
-        rows = progress(np.arange(len(self))[:, None], desc="reading frames", total=len(self))
-        self.images = np.concatenate([self.pictures(row) for row in rows])
+    def _picture(self, row: int) -> np.ndarray:
+        if self.kept is not None and row in self.kept:
+            return self.kept[row]
+        picture = prepare_frame(self.samples[row].frame_bgr(), *self.size)
+        if self.kept is not None:
+            self.kept[row] = picture
+        return picture
 
 
 class RowFile:
@@ -128,23 +185,28 @@ class Phase:
 
 @dataclass
 class Best:
-    """The best weights so far. judge: returns the module's error now. stale: how often they were not beaten since."""
+    """The best weights so far. judge: returns the module's error now. stale: how often they were not beaten since.
+
+    seen: [step, error] of each judgement.
+    """
 
     judge: Callable[[], float]
     error: float = math.inf
     stale: int = 0
     weights: dict[str, Tensor] = field(default_factory=dict)
+    seen: list[list[float]] = field(default_factory=list)
 
-    def see(self, module: nn.Module) -> None:
+    def see(self, module: nn.Module, step: int) -> None:
         """Judge the module, and keep its weights if they are better than all before."""
         error = self.judge()
+        self.seen.append([step, error])
         self.stale += 1
         if error < self.error:
             self.error, self.stale = error, 0
             self.weights = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"error": self.error, "stale": self.stale, "weights": self.weights}
+        return {"error": self.error, "stale": self.stale, "weights": self.weights, "seen": self.seen}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -153,18 +215,21 @@ class Best:
 class Resumable:
     """A training in phases, in a folder, that resumes to the last bit after a power cut at any moment.
 
-    every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase.
+    every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase. judged: [step, error] of
+    each judgement, by phase.
     """
 
     def __init__(
         self,
         folder: Path,
+        machine: Machine,
         progress: Progress = silent,
         every_s: float = SAVE_EVERY_S,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self.folder, self.progress, self.every_s, self.clock = folder, progress, every_s, clock
+        self.folder, self.machine, self.progress, self.every_s, self.clock = folder, machine, progress, every_s, clock
         self.losses: dict[str, list[float]] = defaultdict(list)
+        self.judged: dict[str, list[list[float]]] = {}
 
     def __enter__(self) -> "Resumable":
         """Make the folder and lock it. Raises TrainingError if another process trains in it."""
@@ -181,53 +246,77 @@ class Resumable:
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def steps(self, phase: str, count: int, rng: np.random.Generator, **parts: Any) -> Iterator[int]:
-        """Yield the numbers of the steps of a phase that are still to be done; the loop's body does one of them.
+    def steps(
+        self,
+        phase: str,
+        count: int,
+        rng: np.random.Generator,
+        batch: Callable[[int], T],
+        enough: Callable[[], bool] = lambda: False,
+        **parts: Any,
+    ) -> Iterator[tuple[int, T]]:
+        """Yield the steps of a phase that are still to be done, each with its batch; the loop's body does one of them.
 
-        parts: everything that a step changes, each with state_dict() and load_state_dict(). They, rng and torch's own
-        random numbers are restored as they were saved.
+        batch: draws a step's from rng, maybe in another thread, before earlier steps are done. enough: whether the
+        phase ends after this step. parts: everything that a step changes, each with state_dict() and load_state_dict().
+        They, rng and torch's own random numbers are restored as they were saved.
         """
         file = self.folder / f"{phase}.pt"
         done = self._restore(file, phase, rng, parts) if file.exists() else 0
         saved_s, took_s = self.clock(), 0.0
-        for step in self.progress(range(done, count), desc=f"training, {phase}", total=count, initial=done):
-            yield step
-            now_s = self.clock()
-            if step + 1 == count or now_s - saved_s >= max(self.every_s, took_s / SAVING_SHARE):
-                self._save(file, phase, step + 1, rng, parts)
+
+        def draw(step: int) -> tuple[int, T, Any]:
+            return step, batch(step), rng.bit_generator.state
+
+        drawn = ahead(draw, range(done, count), AHEAD if self.machine.workers else 0)
+        for step, given, state in self.progress(drawn, desc=f"training, {phase}", total=count, initial=done):
+            yield step, given
+            now_s, last = self.clock(), step + 1 == count or enough()
+            if last or now_s - saved_s >= max(self.every_s, took_s / SAVING_SHARE):
+                self._save(file, phase, count if last else step + 1, state, parts)
                 saved_s = self.clock()
                 took_s = saved_s - now_s
+            if last and step + 1 < count:
+                drawn.close()  # else it might still draw
+                rng.bit_generator.state = state
+                return
 
     def train(
         self,
         phase: Phase,
         module: nn.Module,
         rng: np.random.Generator,
-        batch: Callable[[int], B],
-        loss: Callable[[B], Tensor],
+        batch: Callable[[int], T],
+        loss: Callable[[T], Tensor],
         best: Best | None = None,
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
         """Train a module for the steps of a phase that are still to be done; return the optimiser and its scheduler.
 
-        batch: draws a step's batch from rng. loss: of such a batch. best: if given, the module ends with the weights
-        that it judged best, and learns no longer once they are not beaten.
+        batch: as of `steps`. loss: of such a batch. best: if given, the module ends with the weights that it judged
+        best, and learns no longer once they are not beaten.
         """
         optimizer, scheduler = optimiser(phase, module.parameters())
         parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
         parts |= {"best": best} if best else {}
-        for step in self.steps(phase.name, phase.steps, rng, **parts):
-            if best and best.stale >= PATIENCE:
-                continue
-            self.losses[phase.name].append(descend(loss(batch(step)), module, optimizer, scheduler))
+        patience = max(PATIENCE, PATIENT_SHARE * phase.steps / JUDGE_EVERY)
+
+        def by_heart() -> bool:
+            return best is not None and best.stale >= patience
+
+        for step, given in self.steps(phase.name, phase.steps, rng, batch, by_heart, **parts):
+            with torch.autocast(self.machine.device.type, torch.bfloat16, enabled=self.machine.amp):
+                value = loss(given)
+            self.losses[phase.name].append(descend(value, module, optimizer, scheduler))
             if best and (step + 1) % JUDGE_EVERY == 0:
-                best.see(module)
+                best.see(module, step + 1)
         if best and best.weights:
             module.load_state_dict(best.weights)
+            self.judged[phase.name] = best.seen
         return optimizer, scheduler
 
-    def _save(self, file: Path, phase: str, step: int, rng: np.random.Generator, parts: dict[str, Any]) -> None:
+    def _save(self, file: Path, phase: str, step: int, drawn: Any, parts: dict[str, Any]) -> None:
         content = {"step": step, "parts": {name: part.state_dict() for name, part in parts.items()}}
-        content |= {"numpy": rng.bit_generator.state, "torch": torch.get_rng_state(), "losses": self.losses[phase]}
+        content |= {"numpy": drawn, "torch": torch.get_rng_state(), "losses": self.losses[phase]}
         save_torch(file, content | {"cuda": torch.cuda.get_rng_state_all()})
 
     def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Any]) -> int:
@@ -241,9 +330,27 @@ class Resumable:
             raise TrainingError(f"{file}: cannot resume from it", found=found, remedy=remedy) from error
         rng.bit_generator.state = content["numpy"]
         torch.set_rng_state(content["torch"])
-        torch.cuda.set_rng_state_all(content["cuda"])
+        if len(content["cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(content["cuda"])
         self.losses[phase] = content["losses"]
         return content["step"]
+
+
+def ahead(make: Callable[[int], T], items: Iterable[int], count: int) -> Generator[T, None, None]:
+    """Yield make(item) of each in their order; a thread, if count is not 0, makes as many before they are asked for."""
+    if not count:
+        yield from map(make, items)
+        return
+    pool, waiting = ThreadPoolExecutor(1), deque[Future[T]]()
+    try:
+        for item in items:
+            waiting.append(pool.submit(make, item))
+            if len(waiting) > count:
+                yield waiting.popleft().result()
+        for made in waiting:
+            yield made.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
@@ -257,21 +364,36 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> dict[str, Tensor]:
-    """Return a batch to train on: in another light, half of the samples mirrored, and half of the states swapped."""
+def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> Batch:
+    """Return a batch to train on: half of the samples mirrored, half of the states swapped, and GAIN, another light."""
     flipped = rng.random(len(rows)) < 0.5
     images, states, chunks = data.pictures(rows), swap_states(data, rows, rng), data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
     states[flipped, 0] *= -1
     chunks[flipped, :, 0] *= -1
     gain = rng.uniform(0.8, 1.25, (len(rows), 1, 1, 1)).astype(np.float32)
-    images = normalise(np.minimum(images * gain, 255))
-    return on_device({IMAGE: images, STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}, device)
+    arrays = {IMAGE: images, GAIN: gain, STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
+    return on_device(arrays, device)
 
 
-def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> dict[str, Tensor]:
-    """Return arrays by name as tensors on the device."""
-    return {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
+def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> Batch:
+    """Return arrays by name as tensors on the device; a GPU copies from pinned memory while it computes."""
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    if device.type == "cuda":
+        return {name: tensor.pin_memory().to(device, non_blocking=True) for name, tensor in tensors.items()}
+    return tensors
+
+
+def normalised(images: Tensor, gain: Tensor | None = None) -> Tensor:
+    """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them: as `normalise` does.
+
+    gain: (B, 1, 1, 1), multiplies each.
+    """
+    x = images.permute(0, 3, 1, 2).contiguous().float()
+    if gain is not None:
+        x = (x * gain).clamp_(max=255)
+    mean, std = (torch.tensor(each, device=x.device)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
+    return (x / 255 - mean) / std
 
 
 def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -284,14 +406,14 @@ def swap_states(data: Frames, rows: np.ndarray, rng: np.random.Generator) -> np.
     return states
 
 
-def error_of(predicted: Tensor, batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
+def error_of(predicted: Tensor, batch: Batch, loss_weights: Tensor) -> Tensor:
     """Return the mean absolute error over the recorded actions, without padding, times loss_weights, (2,)."""
     recorded = ~batch[IS_PAD][..., None]
     error = (predicted - batch[ACTION]).abs() * loss_weights * recorded
     return error.sum() / (recorded.sum() * loss_weights.numel())
 
 
-def policy_loss(policy: "ACTPolicy", batch: dict[str, Tensor], loss_weights: Tensor) -> Tensor:
+def policy_loss(policy: "ACTPolicy", batch: Batch, loss_weights: Tensor) -> Tensor:
     """Return ACT's loss as LeRobot's forward computes it, but with each action in its own unit."""
     actions, (mean, log_variance) = policy.model({**batch, "observation.images": [batch[IMAGE]]})
     divergence = -0.5 * (1 + log_variance - mean.pow(2) - log_variance.exp()).sum(-1).mean()
@@ -314,21 +436,21 @@ def optimiser(
 
 def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, scheduler: Any) -> float:
     """Do one step of the optimiser, and return the loss before it. Raises TrainingError if that is not finite."""
-    value = loss.item()
-    if not math.isfinite(value):
-        raise TrainingError("training went wrong: the loss is not finite", found=value, remedy="try another seed")
     optimizer.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(module.parameters(), GRAD_CLIP)
     optimizer.step()
     scheduler.step()
+    value = loss.item()  # last, because the processor waits here for a GPU
+    if not math.isfinite(value):
+        raise TrainingError("training went wrong: the loss is not finite", found=value, remedy="try another seed")
     return value
 
 
 class Given(nn.Module):
     """Takes the backbone's place while the transformer trains: its input is already the feature map."""
 
-    def forward(self, features: Tensor) -> dict[str, Tensor]:
+    def forward(self, features: Tensor) -> Batch:
         return {"feature_map": features}
 
 
@@ -340,8 +462,9 @@ def driving_error(
     maps: feature maps to take instead of the pictures.
     """
     policy.eval()
-    images = normalise(data.pictures(rows)) if maps is None else maps[rows]
-    batch = on_device({IMAGE: images, STATE: data.states[rows]}, next(policy.parameters()).device)
+    seen = data.pictures(rows) if maps is None else maps[rows]
+    batch = on_device({IMAGE: seen, STATE: data.states[rows]}, next(policy.parameters()).device)
+    batch[IMAGE] = normalised(batch[IMAGE]) if maps is None else batch[IMAGE]
     chunks = policy.predict_action_chunk(batch)
     return float((np.abs(chunks.cpu().numpy() - data.chunks[rows]) * units)[~data.is_pad[rows]].mean())
 
@@ -351,15 +474,3 @@ def to_cpu(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: to_cpu(v) for k, v in value.items()}
     return value.cpu() if isinstance(value, Tensor) else value
-
-
-def normalise(
-    frame_rgb: np.ndarray, mean: tuple[float, ...] = IMAGENET_MEAN, std: tuple[float, ...] = IMAGENET_STD
-) -> np.ndarray:
-    """Normalise a frame from `prepare_frame`, as LeRobot's forward expects it.
-
-    frame_rgb: (..., height, width, 3) uint8 RGB. Returns (..., 3, height, width) float32, (pixel / 255 - mean) / std.
-    """
-    x = frame_rgb.astype(np.float32) / np.float32(255)
-    x = (x - np.asarray(mean, np.float32)) / np.asarray(std, np.float32)
-    return np.ascontiguousarray(np.moveaxis(x, -1, -3))

@@ -3,6 +3,7 @@
 # LeRobot takes ten seconds to import, and every process that collects tests would pay for it: import it in functions.
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
+
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -211,3 +214,9 @@ def memory_samples(count: int, height: int = 72, width: int = 128, seed: int = 0
         MemorySample(rng.uniform(-0.5, 0.5, 2).astype(np.float32), smooth_frame(rng, height, width), row)
         for row in range(count)
     ]
+
+
+def normalise(frames: np.ndarray, mean: Sequence[float] = IMAGENET_MEAN) -> np.ndarray:
+    """What LeRobot expects of pictures, (..., height, width, 3) uint8 RGB: (..., 3, height, width) float32."""
+    x = (frames.astype(np.float32) / np.float32(255) - np.float32(mean)) / np.float32(IMAGENET_STD)
+    return np.ascontiguousarray(np.moveaxis(x, -1, -3))

@@ -16,7 +16,7 @@ PLACES = (  # where the user's params.yml may be; the first one that exists is u
     Path("/etc/rover/params.yml"),  # an installed rover's
     Path(__file__).parents[1] / "params.yml",  # an installed workstation's
 )
-FOR_THIS_RUN = "ROVER_PARAMS"  # environment variable: a file over all others; `rover sweep` sets it for each run
+FOR_THIS_RUN = "ROVER_PARAMS"  # environment variable: a file over all others
 
 
 def params() -> dict[str, Any]:

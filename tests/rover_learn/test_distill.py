@@ -47,7 +47,7 @@ def test_what_is_left_is_one_policy_in_two_formats_judged_on_held_out_episodes(t
     origin = json.loads((taught / "pretrained_model" / "origin.json").read_text())
     assert origin == ours.report["trainer_config"]["origin"] | {"rate_hz": 30.0}
     assert origin["teacher_sha256"] == load_checkpoint(car_policy).sha256
-    assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "distill.json", "pretrained_model"]
+    assert sorted(p.name for p in taught.iterdir()) == ["best_model.pth", "curves", "distill.json", "pretrained_model"]
     content = json.loads((taught / "distill.json").read_text())
     of_teacher, of_student = content["metrics"]["students"]
     assert of_teacher["teacher_steering_pct"] == of_teacher["teacher_throttle_pct"] == 0

@@ -1,5 +1,7 @@
 """A tiny training of LeRobot's ACT leaves a checkpoint of the user's trainer, the same after a kill in any phase."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -63,20 +65,25 @@ def test_the_checkpoint_is_the_trainers(trained):
 
 
 def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, tmp_path, monkeypatch):
+    """Also with threads that read ahead, of which the one that was not ended had none."""
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     torch.rand(3)  # the state of the global generator must not matter, nor change
     before, out = torch.get_rng_state(), tmp_path / "killed.pth"
     for kill_at in (2, 4, 6):  # in the second of backbone's steps, then of the transformer's and of all together's
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training_module, "descend", kill_at)
-            train(drives, out, device="cpu")
+            train(drives, out, device="cpu", workers=2)
         assert not out.exists()
-    killed, whole = (torch.load(path, weights_only=False) for path in (train(drives, out, device="cpu"), trained))
+    resumed = train(drives, out, device="cpu", workers=2)
+    killed, whole = (torch.load(path, weights_only=False) for path in (resumed, trained))
     assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(v, killed["model_state_dict"][k]) for k, v in whole["model_state_dict"].items())
     assert killed["best_val_loss"] == whole["best_val_loss"]
     assert killed["optimizer_state_dict"]["state"][0]["step"] == 2
     assert not list((tmp_path / "cache").glob("training-*")), "what was saved on the way is of no use any more"
+    curves = json.loads((tmp_path / "killed_curves/curves.json").read_text())
+    assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [2, 3, 2]
+    assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
     with monkeypatch.context() as patch:  # now it is taken from the cache
         patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
         assert train(drives, tmp_path / "again.pth", device="cpu").read_bytes() == out.read_bytes()

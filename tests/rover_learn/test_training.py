@@ -6,32 +6,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from policies import normalise
 from torch import nn
 
 from rover_learn import training
-from rover_learn.training import Best, Phase, Resumable, RowFile
+from rover_learn.training import Best, Machine, Phase, Resumable, RowFile, normalised
 from rover_lib.onboard.errors import TrainingError
 
-STEPS = 6
+STEPS, CPU = 6, Machine(torch.device("cpu"))
 
 
 class Killed(Exception):
     pass
 
 
-def train(folder: Path, kill_at: int = -1, **options) -> tuple[list[float], torch.Tensor, float]:
+def train(folder: Path, kill_at: int = -1, workers: int = 0, **options) -> tuple[list[float], torch.Tensor, float]:
     """Two phases of a small network with dropout. Returns all losses, its weights, and what is drawn after them.
 
     kill_at: the step, of both phases together, in whose middle it ends; the file of rows has that step's already.
+    workers: with any, batches are drawn ahead by a thread.
     """
     rng = np.random.default_rng(0)
     made = 0
     torch.manual_seed(0)
-    with Resumable(folder, **{"every_s": 0.0, **options}) as saved:
+    with Resumable(folder, Machine(torch.device("cpu"), workers), **{"every_s": 0.0, **options}) as saved:
         model = nn.Sequential(nn.Linear(3, 8), nn.Dropout(0.5), nn.Linear(8, 1))
         rows = RowFile(folder / "rows", (3,))
-        for _ in saved.steps("features", STEPS, rng, rows=rows):
-            rows.append(rng.normal(size=(2, 3)))
+        for _, drawn in saved.steps("features", STEPS, rng, lambda _: rng.normal(size=(2, 3)), rows=rows):
+            rows.append(drawn)
             made += 1
             if made == kill_at:
                 raise Killed
@@ -54,12 +56,12 @@ def whole(tmp_path_factory):
     return train(tmp_path_factory.mktemp("whole"))
 
 
-@pytest.mark.parametrize("every_s", [0.0, 3.0])
-def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, every_s):
+@pytest.mark.parametrize(("every_s", "workers"), [(0.0, 0), (3.0, 0), (3.0, 2)])
+def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, every_s, workers):
     """every_s by a clock that goes one second a look: saved after each step, after some, at each phase's end."""
     for kill_at in range(1, 2 * STEPS + 1):
         ticks = iter(range(10_000))
-        options = {"every_s": every_s, "clock": lambda ticks=ticks: float(next(ticks))}
+        options = {"workers": workers, "every_s": every_s, "clock": lambda ticks=ticks: float(next(ticks))}
         with pytest.raises(Killed):
             train(tmp_path / str(kill_at), kill_at, **options)
         losses, weights, after = train(tmp_path / str(kill_at), **options)
@@ -68,9 +70,9 @@ def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, ev
 
 
 def test_two_processes_do_not_train_the_same(tmp_path):
-    with Resumable(tmp_path), pytest.raises(TrainingError, match="another process"), Resumable(tmp_path):
+    with Resumable(tmp_path, CPU), pytest.raises(TrainingError, match="another process"), Resumable(tmp_path, CPU):
         pass
-    with Resumable(tmp_path):
+    with Resumable(tmp_path, CPU):
         pass
 
 
@@ -92,7 +94,7 @@ def test_a_damaged_file_is_named(tmp_path, name, left, says):
 def learn(folder, steps, loss, best=None):
     """A phase of a network of one weight, which it returns."""
     model, rng = nn.Linear(1, 1), np.random.default_rng(0)
-    with Resumable(folder) as saved:
+    with Resumable(folder, CPU) as saved:
         saved.train(
             Phase("p", steps, 0.1), model, rng, lambda _: torch.ones(1, 1), lambda x: loss(model(x)), best(model)
         )
@@ -104,12 +106,58 @@ def test_a_loss_that_is_not_finite_ends_the_training(tmp_path):
         learn(tmp_path, 1, lambda y: y.sum() * math.nan, lambda _: None)
 
 
-def test_the_best_weights_are_kept_and_what_learns_by_heart_stops(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("steps", "judged"), [(20, 2 + training.PATIENCE), (100, 2 + 20)])
+def test_the_best_weights_are_kept_and_what_learns_by_heart_stops(tmp_path, monkeypatch, steps, judged):
+    """A longer phase is patient for longer: a fifth of its judgements."""
     monkeypatch.setattr(training, "JUDGE_EVERY", 1)
-    errors, weights = iter([3.0, 1.0, *[2.0] * 20]), []
+    errors, weights = iter([3.0, 1.0, *[2.0] * steps]), []
 
     def best(model):
         return Best(lambda: weights.append(model.weight.item()) or next(errors))
 
-    kept = learn(tmp_path, 20, lambda y: y.square().sum(), best)
-    assert len(weights) == 2 + training.PATIENCE and kept == weights[1] != weights[-1]
+    kept = learn(tmp_path, steps, lambda y: y.square().sum(), best)
+    assert len(weights) == judged and kept == weights[1] != weights[-1]
+    assert learn(tmp_path, steps, lambda _: pytest.fail("trained again"), best) == kept
+
+
+def test_pictures_become_a_policys_input_as_on_the_rover():
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 6, 5, 3), np.uint8)
+    assert np.array_equal(normalised(torch.from_numpy(pictures)).numpy(), normalise(pictures))
+    gain = np.array([0.8, 1.25], np.float32)[:, None, None, None]
+    lit = normalised(torch.from_numpy(pictures), torch.from_numpy(gain)).numpy()
+    assert np.array_equal(lit, normalise(np.minimum(pictures * gain, 255)))
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory. Tried"), "cuda:1: its memory is full.*run again.*--batch"),
+        (RuntimeError("CUDA error: unspecified launch failure\nCompile with"), "lost, found CUDA error.*failure; run"),
+    ],
+)
+def test_a_gpu_that_fails_is_a_sentence(monkeypatch, error, says):
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", "")
+    with pytest.raises(TrainingError, match=says), Machine(torch.device("cuda:1")).computing():
+        assert torch.are_deterministic_algorithms_enabled()
+        raise error
+    assert not torch.are_deterministic_algorithms_enabled()
+    with pytest.raises(RuntimeError, match="another"), CPU.computing():
+        raise RuntimeError("another error")
+
+
+@pytest.mark.parametrize(
+    ("asked", "gpus", "gives"),
+    [
+        *[(None, 0, "cpu"), (None, 2, "cuda:0"), ("cpu", 2, "cpu"), ("cuda", 1, "cuda:0"), ("cuda:1", 2, "cuda:1")],
+        *[("cuda", 0, None), ("cuda:2", 2, None), ("tpu", 2, None), ("cuda:x", 2, None), ("cpu:1", 2, None)],
+    ],
+)
+def test_a_device_is_chosen_or_refused(monkeypatch, asked, gpus, gives):
+    for name, value in {"is_available": gpus > 0, "device_count": gpus, "current_device": 0}.items():
+        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+    if gives is None:
+        with pytest.raises(TrainingError, match=f"{asked}"):
+            Machine.of(asked)
+    else:
+        machine = Machine.of(asked)
+        assert str(machine.device) == gives and (machine.workers > 0) == (machine.device.type == "cuda")

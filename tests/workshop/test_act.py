@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import FULL, TINY, lerobot_config, lerobot_policy, saved_processors, smooth_frame
+from policies import FULL, TINY, lerobot_config, lerobot_policy, normalise, saved_processors, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
-from rover_learn.training import normalise
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.workshop.act import (
     ACT,

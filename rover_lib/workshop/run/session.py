@@ -77,8 +77,12 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
 
 
 def training_device(asked: str | None, error: type[RoverError]) -> torch.device:
-    """Return the device to train on: "cpu" or "cuda" as asked, or cuda for None where torch finds it. Else `error`."""
-    there = torch.cuda.is_available()
-    if asked not in (None, "cpu", "cuda") or (asked == "cuda" and not there):
-        raise error("device must be cpu, or cuda where torch finds one", found=asked, remedy="leave it out")
-    return torch.device(asked or ("cuda" if there else "cpu"))
+    """Return the device to train on: cpu, cuda or cuda:N as asked; for None a GPU if torch finds one. Else `error`."""
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    name, _, number = (asked or ("cuda" if count else "cpu")).partition(":")
+    if name not in ("cpu", "cuda") or (number and (name == "cpu" or not number.isdecimal())):
+        raise error("a device is cpu, cuda, or a GPU's number as in cuda:1", found=asked, remedy="leave it out")
+    if name == "cuda" and int(number or 0) >= count:
+        what, remedy = f"{asked}: torch {torch.__version__} finds {count} GPUs", "does nvidia-smi show it?"
+        raise error(what, remedy=f"{remedy} if not, install its driver, or train on the CPU: --device cpu")
+    return torch.device(name if name == "cpu" else f"cuda:{number or torch.cuda.current_device()}")

@@ -1,0 +1,35 @@
+"""`python -m lab gpu` measures a training by phase; tried on the CPU, by a tiny recipe, through the same code."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from recorded import record_drives
+
+from lab import gpu
+from lab.__main__ import main
+
+TINY = "train: {small: {backbone_steps: 2, transformer_steps: 3, together_steps: 2, batch: 4, transformer_batch: 4, "
+TINY += "together_batch: 2, samples: 40, feature_samples: 12, judged: 8}}"
+
+
+@pytest.mark.slow
+def test_each_phase_says_what_it_takes_and_the_weights_repeat(tmp_path, set_params, monkeypatch):
+    set_params(TINY)
+    monkeypatch.setattr(gpu, "REPEATED_STEPS", 6)
+    monkeypatch.setattr(gpu, "INTERRUPTED_AT", 3)
+    out, episodes = tmp_path / "gpu.json", record_drives(tmp_path / "episodes")
+    result = CliRunner().invoke(main, ["gpu", str(out), str(episodes), "--device", "cpu", "--size", "small"])
+    made = json.loads(out.read_text())
+    assert result.exit_code == (1 if made["wrong"] else 0), result.output
+    assert made["tensors_that_differ"] == 0 and made["device"].startswith("cpu")
+    phases = made["phases"]
+    assert [phases[name]["steps"] for name in ("backbone", "transformer", "all together")] == [2, 3, 2]
+    assert all(0 <= row["data_s"] <= row["s"] <= made["all_s"] for row in phases.values())
+
+
+def test_without_a_gpu_it_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = CliRunner().invoke(main, ["gpu", str(tmp_path / "gpu.json")])
+    assert result.exit_code != 0 and result.output.startswith("rover: cuda: torch"), result.output
+    assert not list(tmp_path.iterdir())
