@@ -160,8 +160,8 @@ def main(output: Path, episodes: Path, *runs: Path) -> None:
     found |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
     found["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
     found["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
-    given = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S, "chance": CHANCE}
-    given |= {"versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
+    given: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
+    given |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
     inputs = {f"{run.name}/best_model.pth": sha256_of(run / "best_model.pth") for run in runs}
     write_stage(output, "judging", params=given, metrics=found | {"rows": rows}, inputs=inputs)
     print(json.dumps(plain(found), indent=1))
