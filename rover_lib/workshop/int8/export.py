@@ -5,7 +5,7 @@ Exporter(checkpoint, samples).export(quantized, "policy_static.pt", calibration)
 
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from importlib.metadata import entry_points
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +21,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.policy.familiar import TOLERANCE, Familiar
+from rover_lib.onboard.policy.familiar import TOLERANCE
 from rover_lib.onboard.wheel_version import VERSION
 from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -30,6 +30,8 @@ from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, graph_of, int8_layers, with_embedding
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
 
+BATCH = 8
+KEPT = 2**28  # bytes of pictures that are prepared once for all modes; larger ones take far longer to plan from
 REASONS = {  # why another processor may answer otherwise: of FP32, and of INT8
     False: "another processor sums in another order",
     True: "float parts round differently on another processor, and flipped INT8 roundings grow over layers",
@@ -120,6 +122,8 @@ class Exporter:
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
         self.gmac = sum(multiply_accumulates(self.float_policy).values()) / 1e9
+        picture = sum(3 * height * width for height, width in checkpoint.config.image_sizes)
+        self.prepared = lru_cache(KEPT // picture)(partial(inputs_of, config=checkpoint.config))
         self.inputs = [inputs_of(s, checkpoint.config) for s in samples]
         self.stored = np.unique(np.linspace(0, len(samples) - 1, self.parity["vectors"]).round().astype(int))
         for i in self.stored:
@@ -149,9 +153,9 @@ class Exporter:
         tells = drives is not None and not drives.warnings
         given = with_embedding(module) if tells else module
         form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(given, config)
-        # The eager policy is slow, so it answers only the stored samples.
-        expected = predictions(module, [self.inputs[i] for i in self.stored])
-        outputs = [form.run(x) for x in self.inputs]
+        with torch.inference_mode():  # the eager policy is slow, so it answers only the stored samples
+            eager = [_each(given(*self.inputs[i])) for i in self.stored]
+        expected, outputs = torch.cat([each[0] for each in eager]), [form.run(x) for x in self.inputs]
         actions = torch.cat([each[0] for each in outputs])
         if not torch.isfinite(actions).all():
             raise ArtifactError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
@@ -173,21 +177,31 @@ class Exporter:
         vectors |= {f"frame_{name}": np.stack(seen) for name, seen in zip(config.cameras, frames, strict=True)}
         described: dict[str, Any] = {}
         if drives is not None and tells:
-            familiar, described = fit(drives, lambda sample: form.run(inputs_of(sample, config))[1][0].numpy())
+            familiar, described = fit(drives, self._embeddings(module, type(form), drives.samples).__getitem__)
             sizes = dict(zip(("directions", "size"), familiar.directions.shape, strict=True))
             manifest["familiar"] = sizes | {"drives": described["drives"]}
             vectors |= familiar.arrays() | {"embedding": np.concatenate([outputs[i][1] for i in self.stored])}
-            self._check_embedding(given, familiar, vectors["embedding"], path)
+            wanted = np.concatenate([each[1] for each in eager])
+            gap = np.abs(familiar.strange(vectors["embedding"]) - familiar.strange(wanted)).max()
+            if not gap <= TOLERANCE[True]:
+                what = f"{path}: how familiar a picture is differs by {gap:.3g} in the written graph"
+                raise ArtifactError(f"{what}; nothing was written")
         return form.save(path, manifest, vectors), described
 
-    def _check_embedding(self, module: nn.Module, familiar: Familiar, found: np.ndarray, path: Path | str) -> None:
-        """Raise ArtifactError unless the eager module's embeddings of the stored samples are as familiar as `found`."""
-        with torch.inference_mode():
-            wanted = np.concatenate([module(*self.inputs[i])[1] for i in self.stored])
-        gap = np.abs(familiar.strange(found) - familiar.strange(wanted)).max()
-        if not gap <= TOLERANCE[True]:
-            what = f"{path}: how familiar a picture is differs by {gap:.3g} in the written graph; nothing was written"
-            raise ArtifactError(what)
+    def _embeddings(self, module: nn.Module, form: type[Form], samples: Sequence[Sample]) -> dict[Sample, np.ndarray]:
+        """Return each sample's embedding, (D,) float32. A float policy's are computed in batches: rounding differs."""
+        encoder, found = with_embedding(module, alone=True), list[Tensor]()
+        if isinstance(module, ACT):
+            together = torch.func.vmap(encoder)
+            with torch.inference_mode(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # attention has no rule for batches
+                for i in range(0, len(samples), BATCH):
+                    inputs = zip(*map(self.prepared, samples[i : i + BATCH]), strict=True)
+                    found += together(*map(torch.stack, inputs))[:, 0]
+        else:
+            run = form(encoder, self.checkpoint.config).run
+            found = [run(self.prepared(sample))[0][0] for sample in samples]
+        return dict(zip(samples, torch.stack(found).numpy(), strict=True))
 
     def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
         """Return the manifest without its parity."""

@@ -9,6 +9,7 @@ trained the policy nor fitted the scores. Of new drives like them, one in n + 1 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,10 @@ class Drives:
         every = {name: max(1, round((frame_rate_hz(of) or 1) * EVERY_S)) for name, of in chosen.items()}
         unseen = {name: tuple(of[:: every[name]]) for name, of in chosen.items()}
         return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen)
+
+    @property
+    def samples(self) -> tuple[Sample, ...]:
+        return (*self.known, *chain.from_iterable(self.unseen.values()))
 
     @property
     def warnings(self) -> list[str]:

@@ -218,14 +218,18 @@ def graph_of(module: nn.Module) -> GraphModule:
     return module if isinstance(module, GraphModule) else GraphModule(module, _Leaves().trace(module))
 
 
-def with_embedding(module: nn.Module) -> GraphModule:
+def with_embedding(module: nn.Module, *, alone: bool = False) -> GraphModule:
     """Return a policy's graph that gives, beside the actions, the encoder's output averaged over the tokens: (1, D).
 
-    Its weights are the module's own. The actions are computed by the same operators.
+    alone: without the actions, and what only they need. Its weights are the module's own, and its operators the same.
     """
     source = graph_of(module)
     copied, nodes = Graph(), dict[Node, Node]()
     actions = copied.graph_copy(source.graph, nodes)
     encoded = next(nodes[node] for node in source.graph.nodes if node.target == "encoder_norm")
-    copied.output((actions, copied.call_method("mean", (encoded, 1))))
-    return GraphModule(source, copied)
+    embedding = copied.call_method("mean", (encoded, 1))
+    copied.output(embedding if alone else (actions, embedding))
+    found = GraphModule(source, copied)
+    found.graph.eliminate_dead_code()
+    found.recompile()
+    return found

@@ -14,28 +14,9 @@ from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
-PHRASES = {  # what people call the parts of a gate's name
-    "mae_pct": "error, % of the recorded range",
-    "hits": "balloons hit",
-    "simd_g": "SIMD instructions, 10^9",
-    "instructions_g": "instructions, 10^9",
-    "model_size_mb": "size, MB, as the original promised",
-    "size_mb": "size, MB",
-    "peak_memory_loading_mb": "memory while loading, MB",
-    "peak_memory_mb": "memory, MB",
-    "memory_mb": "memory, MB",
-    "floor_ms": "time of a plan on a Pi 5 at the very best, ms (computed)",
-    "latency_mean_ms": "time of a plan, mean, ms",
-    "latency_p95_ms": "time of a plan, 95th percentile, ms",
-    "throughput_fps": "plans a second",
-    "control_rate_hz": "commands a second",
-    "cpu_pct": "processor, % of all cores",
-    "temperature_c": "temperature, Celsius",
-    "throttled": "what the Pi's firmware throttled",
-}
+UNITS = {"mb": "MB", "ms": "ms", "pct": "%", "g": "10^9", "fps": "1/s", "hz": "Hz", "c": "Celsius"}
 NEXT_COMMANDS, MOST_CAUTIONS = 3, 5
 MOST_EPISODES = 3  # a remedy names at most this many
-EARLY_FRAMES = 30  # odd frames below this number all belong to the beginning of a drive
 
 Stages = Mapping[str, Mapping[str, Any]]
 
@@ -62,9 +43,8 @@ def gate_in_words(gate: str) -> str:
     mode = subject.partition("_")[0].partition(".")[0]
     if mode in CALLED and key:
         gate = f"{subject.replace(mode, CALLED[mode], 1)}: {key}"
-    for known in [known for known in PHRASES if known in gate][:1]:
-        gate = gate.replace(known, PHRASES[known])
-    return gate.replace("_", " ")
+    words, _, unit = gate.replace("floor_ms", "time of a plan on a Pi 5 at the very best (computed)_ms").rpartition("_")
+    return f"{words}, {UNITS[unit]}".replace("_", " ") if unit in UNITS else gate.replace("_", " ")
 
 
 def against(row: Mapping[str, Any]) -> str:
@@ -88,9 +68,11 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:MOST_EPISODES]) + more
 
 
-def _lines(template: str, **values: Any) -> list[str]:
+def fill_in(template: str, **values: Any) -> list[str]:
     """Fill in a template of this folder, and return its lines that are not empty."""
     pages = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=ChainableUndefined)
+    # A name that breaks its line must not put a command of its own on the next one.
+    pages.filters |= {"quote": lambda name: shlex.quote(" ".join(name.splitlines())), "against": against}
     text = pages.get_template(template).render(
         some=_some, count=count, error_pct=error_pct, worst=judge.worst, **values
     )
@@ -101,19 +83,16 @@ def list_remedies(
     gate: str, stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """Say what to do about a gate that FP32 or static INT8 misses, the cheapest remedy first: remedies.txt."""
-    key, quantized = gate.partition(" ")[2], stages["quantize"]
-    alone = {block: judge.worst(errors) or 0.0 for block, errors in quantized.get("sensitivity", {}).items()}
-    worst = [w for w in stages["compare"].get("worst", []) if w["mode"] == GATED]
-    return _lines(
+    alone = {block: judge.worst(errors) or 0.0 for block, errors in stages["quantize"].get("sensitivity", {}).items()}
+    block = max(alone.items(), key=lambda item: item[1], default=None)
+    return fill_in(
         "remedies.txt",
+        **stages,
+        params=params,
         gate=gate,
-        key=key,
+        rows=rows,
+        worst_block=block,
         smaller=_smaller(stages, names),
-        mixed=rows.get("mixed", {}),
-        most_cost_pct=params["quantization"]["mixed_max_cost_pct"],
-        odd=quantized.get("odd"),
-        worst_block=max(alone.items(), key=lambda item: item[1], default=None),
-        episodes=list(dict.fromkeys(str(w["episode"]) for w in worst if w["episode"])),
     )
 
 
@@ -132,63 +111,24 @@ def list_cautions(
 
     best: the row of the mode that the rule takes. busy: what shows that the machine was.
     """
-    load, compared, quantized = stages["load"], stages["compare"], stages["quantize"]
-    clipped = quantized.get("clipped", {})
-    if quantized["modes"].get(GATED, {}).get("scheme", {}).get("observer") == "frames":
-        clipped = {}  # it clips odd frames on purpose
-    cautions = _lines(
-        "cautions.txt",
-        **stages,
-        judged=judged,
-        best=best,
-        busy=busy,
-        limits=params["verdict"],
-        early_frames=EARLY_FRAMES,
-        odd=quantized.get("odd"),
-        clipped=clipped if clipped.get("clipped_pct", 0) > params["quantization"]["clipped_warn_pct"] else {},
-        most_throttle=compared.get("action_range", {}).get("throttle", (0, 0))[1],
-        throttle_limit=params["drive"]["throttle_limit"],
-        held_out=load["split"]["held_out"],
-        shared=set(load["split"]["held_out"]) & set(load["split"]["calibration"]),
-        warnings=dict.fromkeys(w for stage in (compared, quantized) for w in stage.get("warnings", [])),
-        allowed=[why for kind, why in judged["refused"].items() if kind in MAY_DIFFER and kind != "mode"],
-    )
+    allowed = [why for kind, why in judged["refused"].items() if kind in MAY_DIFFER and kind != "mode"]
+    cautions = fill_in("cautions.txt", **stages, params=params, judged=judged, best=best, busy=busy, allowed=allowed)
     return cautions[:MOST_CAUTIONS]
 
 
 def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names) -> list[dict[str, str]]:
-    """Return at most three commands to type next, with the reason for each. No command drives what is not to drive."""
-    deploy, artifact = judged["deploy"], names.artifact(judged["deploy"] or best)
-    notebooks = f"make notebooks-open NAME={shlex.quote(names.name)}"
-    commands: list[tuple[str, str]] = []
-    if set(judged["refused"]) - set(MAY_DIFFER):
-        commands.append((shlex.join(["rover", "benchmark", artifact]), "how long a plan takes, on any machine"))
-    elif deploy is None:
-        inspect = shlex.join(["rover", "inspect", names.episodes])
-        commands += [
-            (notebooks, "look at notebook 01, what the car saw, and 04, what it plans"),
-            ("rover record --max-seconds 30 episodes", "more drives, with corrections; on the car"),
-            (inspect, "what is in the recordings, and what is wrong with them"),
-        ]
-    else:
-        commands += _to_drive(judged, stages, names, artifact)
-    if deploy and any(row["gate"].startswith(GATED) for row in judged["failed"]):
-        commands.append((notebooks, "notebook 03 has the blocks, 04 the frames"))
-    return [{"command": command, "why": why} for command, why in commands[:NEXT_COMMANDS]]
-
-
-def _to_drive(judged: Mapping[str, Any], stages: Stages, names: Names, artifact: str) -> list[tuple[str, str]]:
-    if stages["compare"]["fp32"]["trials"]:  # it learned in the balloon world, or would not drive there
-        watch = "make watch" if names.name == "demo" else shlex.join(["rover", "view", artifact])
-        record = "rover record --max-seconds 30 episodes"
-        return [(watch, "watch it drive, in your browser"), (record, "record your own drives, on the car")]
-    play = "ansible-playbook -i inventory.ini ansible/"
+    """Return at most three commands to type next, with the reason for each: next.txt."""
+    failed = [row["gate"] for row in judged["failed"] if row["gate"].startswith(GATED)]
     allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
-    deploying = f"{play}deploy.yml -e {shlex.quote(f'rover_artifact={artifact}')}" + (f" -e '{allow}'" if allow else "")
-    if not any(row["gate"].startswith(GATED) and not row["gate"].endswith("floor_ms") for row in judged["failed"]):
-        return [
-            (deploying, "put it on the rover"),
-            (f"{play}benchmark.yml", "measure its time there"),
-            (f"{play}drive.yml --limit rover1", "drive, transmitter in hand"),
-        ]
-    return [(deploying, "put it on the rover")] if judged["deploy"] == "mixed" else []
+    lines = fill_in(
+        "next.txt",
+        judged=judged,
+        compare=stages["compare"],
+        names=names,
+        artifact=names.artifact(judged["deploy"] or best),
+        other_robot=set(judged["refused"]) - set(MAY_DIFFER),
+        allow=f" -e '{allow}'" if allow else "",
+        failed=failed,
+    )
+    steps = [line.rpartition("  # ") for line in lines[:NEXT_COMMANDS]]
+    return [{"command": command, "why": why} for command, _, why in steps]

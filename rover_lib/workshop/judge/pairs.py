@@ -65,12 +65,3 @@ def compare_pairs(first: Sequence[bool], second: Sequence[bool]) -> dict[str, An
 def loses(pairs: Mapping[str, Any]) -> bool:
     """Whether the second policy hits fewer worlds than the first, beyond chance. pairs: of `compare_pairs`."""
     return pairs["only_first"] > pairs["only_second"] and pairs["p"] < CHANCE
-
-
-def pairs_in_words(pairs: Mapping[str, Any], worlds: int) -> str:
-    """Return `compare_pairs`'s comparison with FP32 in a sentence."""
-    return (
-        f"FP32 alone hits {pairs['only_first']}, it alone {pairs['only_second']}: exact McNemar p = {pairs['p']:.2g}, "
-        f"and a loss from {pairs['loss_low']:.1f} to {pairs['loss_high']:.1f} (95 %). {worlds} worlds could not have "
-        f"shown a loss of less than {pairs['least_loss']}."
-    )

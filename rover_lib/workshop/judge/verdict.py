@@ -18,7 +18,6 @@ from rover_lib.workshop.judge import advice
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.advice import CALLED, Names, Stages, count, error_pct, gate_in_words
 from rover_lib.workshop.judge.compare import GATED, MODES, WORLDS_LOST, error_ms, gate, gates, hits_needed
-from rover_lib.workshop.judge.pairs import pairs_in_words
 
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
@@ -43,10 +42,12 @@ def verdict(
     other_robot = [kind for kind in refused if kind not in MAY_DIFFER]
     deploy = None if unfit or other_robot else best["mode"]
     for row in rows.values():
-        row["because"] = _because(row, best, limits)
+        work = _work_key([row, best])
+        row["because"] = advice.fill_in("because.txt", row=row, best=best, limits=limits, work=work, called=CALLED)[0]
     if deploy is None:
         best["because"] = "the best of them"
-    why = unfit or [*_why(best, rows["fp32"]), *_familiar(stages["quantize"]["modes"].get(best["mode"], {}))]
+    familiar = stages["quantize"]["modes"].get(best["mode"], {}).get("familiar")
+    why = unfit or advice.fill_in("why.txt", best=best, fp32=rows["fp32"], familiar=familiar, counted=COUNTED)
     if other_robot:
         robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
         why.append(f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in other_robot)}.")
@@ -162,71 +163,17 @@ def _list_failures(
 
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
-    compared, lines = stages["compare"], []
-    warnings = compared.get("guesses", {}).get("warnings", []) + stages["load"].get("fit", {}).get("warnings", [])
-    for warning in warnings:
-        lines.append(f"{warning[0].upper()}{warning[1:]}{'' if warning.endswith('?') else '.'}")
-    looking = compared.get("looking", {})
+    compared, looking = stages["compare"], stages["compare"].get("looking", {})
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
-    if actions and not any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions):
-        lines.append("The policy ignores its camera, and copies its state or always plans the same.")
-    if any(row["gate"] == "fp32 hits" for row in failed):
-        fp32 = compared["fp32"]
-        lines.append(f"As it was trained, in FP32, it hits {fp32['hits']} of {fp32['trials']} balloons.")
-    if lines:
-        episodes = len({name for part in stages["load"]["split"].values() for name in part})
-        lines.append(f"What helps: its own dataset, more training steps, and more recordings than these {episodes}.")
-    return lines
-
-
-def _why(best: Mapping[str, Any], fp32: Mapping[str, Any]) -> list[str]:
-    """Say why this mode was chosen, each reason in a sentence."""
-    if best is fp32:
-        return ["No INT8 mode keeps every gate and is worth its cost, so this is FP32, the policy as it was trained."]
-    errors = [f"{action} {e:.2f} %" for action, e in best["errors_pct"].items() if e is not None]
-    differs = f": it differs from FP32 by {', '.join(errors)} of the recorded range" if errors else ""
-    if best["error_ms"] is not None:
-        differs += f", and in the worst tenth of frames as much as {best['error_ms']:.0f} ms of delay"
-    lines = [f"It keeps every gate{differs}."]
-    if best["recorded_pct"] is not None:
-        own = "FP32's own plans are up to {:.2f} % off the driver's, its {:.2f} %."
-        lines.append(own.format(fp32["recorded_pct"], best["recorded_pct"]))
-    if best["pairs"]:
-        lines.append(f"It hits {best['hits']} of {best['trials']} balloons; FP32 hits {fp32['hits']}.")
-        lines.append(pairs_in_words(best["pairs"], best["trials"]))
-    by = "The worlds decided" if best["worlds_decide"] else "Errors on recordings decided, by limits set by driving"
-    lines.append(f"{by}.")
-    size = f"It has {best['size_mb']:.1f} MB, {best['times_smaller']:.1f} times smaller than FP32"
-    if best["instructions_g"] and fp32["instructions_g"]:
-        size += f", and {fp32['instructions_g'] / best['instructions_g']:.1f} times fewer instructions ({COUNTED})"
-    elif best["times_faster"]:
-        size += f", and is {best['times_faster']:.1f} times as fast, measured here"
-    return [*lines, f"{size}."]
-
-
-def _familiar(made: Mapping[str, Any]) -> list[str]:
-    """Say how often it stops a good drive, and by what drives that is known; made: a mode in quantize.json."""
-    if not (found := made.get("familiar")):
-        return []
-    low, high = found["stopped_low_pct"], found["stopped_high_pct"]
-    drives, least = found["drives"], found["least"][0]
-    rate = f"It stops about 1 in {drives + 1} good drives ({low:.1f} to {high:.0f} %, from {drives} held-out ones)"
-    return [f"{rate}; it has seen nothing like {least['frame']} of {least['episode']}."]
-
-
-def _because(row: Mapping[str, Any], best: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
-    """Say in one phrase why a mode is the one to deploy, or why it is not worth it."""
-    if row is best:
-        return "the one to deploy"
-    if row["missed_gates"]:
-        return "misses " + "; ".join(advice.against(missed) for missed in row["missed_gates"])
-    key, other = _work_key([row, best]), CALLED[best["mode"]]
-    if key and row[key] > best[key] * (1 + limits["worth_pct"] / 100):
-        how = "takes {:.1f} times as long as {}" if key == "time_ms" else "needs {:.1f} times the instructions of {}"
-        return how.format(row[key] / best[key], other)
-    if error_pct(row) > error_pct(best) + limits["better_points"]:
-        return f"is no faster than {other}, and its error is {error_pct(row):.2f} %"
-    return f"is no better than {other}: as fast, as accurate and no smaller"
+    sees = any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions)
+    return advice.fill_in(
+        "unfit.txt",
+        warnings=compared.get("guesses", {}).get("warnings", []) + stages["load"].get("fit", {}).get("warnings", []),
+        blind=bool(actions) and not sees,
+        misses=any(row["gate"] == "fp32 hits" for row in failed),
+        fp32=compared["fp32"],
+        episodes=len({name for part in stages["load"]["split"].values() for name in part}),
+    )
 
 
 def headline(judged: Mapping[str, Any]) -> str:

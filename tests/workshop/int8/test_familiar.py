@@ -1,19 +1,20 @@
 """What is familiar to a policy: the threshold, and the artifacts that carry it, in each engine."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from policies import MemorySample, memory_samples
+from rover_lib.workshop.int8.graph import with_embedding
 
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.drive.inference import UNTOLD, PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.workshop.act import ACT
-from rover_lib.workshop.int8.export import Exporter
+from rover_lib.workshop.act import ACT, inputs_of
+from rover_lib.workshop.int8.export import Exporter, TorchScript
 from rover_lib.workshop.int8.familiar import Drives, fit
 from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import Scheme
@@ -26,6 +27,11 @@ MADE = ("policy_fp32.pt", "policy_static.pt", "policy_fp32.onnx.zip", "policy_st
 class Timed(MemorySample):
     time_s: float = 0.0
     frame_name: str = "picture.jpg"
+    decoded: list[int] = field(default_factory=list)
+
+    def frame_bgr(self):
+        self.decoded.append(1)
+        return super().frame_bgr()
 
 
 def drives_of(samples, each=2):
@@ -45,6 +51,7 @@ def made(thin, tmp_path_factory):
         module = quantize(policy, Scheme(), calibration) if static else ACT(policy.config, policy.weights)
         exporter.export(module, folder / name, calibration if static else None, drives)
     exporter.export(ACT(policy.config, policy.weights), folder / "without.pt")
+    assert all(len(sample.decoded) == 1 for sample in drives.samples)  # not once more for each mode
     return folder
 
 
@@ -70,6 +77,17 @@ def test_too_few_drives_and_parts_of_a_drive_set_no_threshold(thin, tmp_path):
     module, exporter = ACT(policy.config, policy.weights), Exporter(policy, memory_samples(2))
     plain = exporter.export(module, tmp_path / "plain.pt")
     assert exporter.export(module, tmp_path / "few.pt", drives=few) == plain
+
+
+def test_embeddings_are_those_that_the_artifact_gives(thin):
+    """A float policy's come in batches, INT8's from a graph without a decoder."""
+    (policy, calibration), samples = thin, memory_samples(11)
+    for module in (ACT(policy.config, policy.weights), quantize(policy, Scheme(), calibration).module):
+        found = Exporter(policy, samples)._embeddings(module, TorchScript, samples)
+        whole = TorchScript(with_embedding(module), policy.config)
+        for sample in samples:
+            wanted = whole.run(inputs_of(sample, policy.config))[1][0].numpy()
+            assert found[sample] == pytest.approx(wanted, abs=1e-5)
 
 
 @pytest.mark.slow

@@ -69,20 +69,13 @@ def test_what_must_be_known_before_it_drives(policy, says):
     assert len(warnings) == (says is not None) and (says is None or says in warnings[0])
 
 
-class Turns(Known):
-    """Follows the picture with its steering alone."""
-
-    def __init__(self):
-        super().__init__(looks=np.array([0.4, 0]), copies=0)
-
-
 def test_how_far_a_plan_moves_if_its_picture_is_older():
     """The k-th frame shows k: a picture that is 33 ms older moves steering by 0.004, which is 0.4 % of its range."""
-    samples = [seen(k, np.zeros(2)) for k in range(60)]
-    found = look(Turns(), fidelity(Turns(), {}, samples[1::2], RANGE), samples)
+    turns, samples = Known(looks=np.array([0.4, 0]), copies=0), [seen(k, np.zeros(2)) for k in range(60)]
+    found = look(turns, fidelity(turns, {}, samples[1::2], RANGE), samples)
     assert found.summary()["steering_by_100_ms_pct"] == pytest.approx(3 * 0.4)
     assert found.summary()["throttle_by_100_ms_pct"] == 0
-    assert looked(Turns()).moved_pct["steering"]["by_100_ms"] == 0  # no older picture is known
+    assert looked(turns).moved_pct["steering"]["by_100_ms"] == 0  # no older picture is known
 
 
 def test_an_action_that_never_changes_is_not_judged():

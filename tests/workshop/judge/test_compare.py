@@ -17,7 +17,7 @@ from rover_lib.workshop.plots.style import Note
 CHUNK = 3
 RANGE = {"steering": (-0.2, 0.6), "throttle": (0.0, 0.1)}
 LIMITS = {
-    "error_ms": 20, "error_pct": 1.0, "worlds_lost_pct": 2, "fp32_hits": 36,
+    "error_ms": 20, "error_ms_no_less_steering": 40, "error_pct": 1.0, "worlds_lost_pct": 2, "fp32_hits": 36,
     "size_mb": {"static": 70, "dynamic": 110},
 }  # fmt: skip
 
@@ -67,6 +67,7 @@ def test_errors_by_hand(report):
     assert found["throttle_mae_pct"] == pytest.approx(1.0, rel=1e-4)
     assert found["steering_max_pct"] == pytest.approx(1.0, rel=1e-4)
     assert found["steering_mae_per_step_pct"] == pytest.approx([0.5, 0, 0], abs=1e-4)
+    assert found["steering_less_pct"] == pytest.approx(-found["steering_mae_pct"])  # it steers more
     assert report.relative("static") == pytest.approx(0.008, rel=1e-4)  # of 1, as no plan is larger
 
 
@@ -84,10 +85,17 @@ def test_an_error_is_also_the_delay_that_moves_the_plan_as_far():
     """A policy that always plans nearly the same was once 0.01 % off, and so passed every gate."""
     found = metrics_of(worst_tenth_pct=0.03)
     assert compare.error_ms(found, "static") is None  # no picture is known to move a plan
-    found["looking"] = {"steering_by_100_ms_pct": 0.1, "throttle_by_100_ms_pct": None, "frames": 3}
+    looking = {"looking": {"steering_by_100_ms_pct": 0.1, "throttle_by_100_ms_pct": None, "frames": 3}}
+    found |= looking
     assert compare.error_ms(found, "static") == pytest.approx(30)
     rows = {r["gate"]: r["passed"] for r in compare.gates(found, LIMITS)}
     assert rows["static error, ms of delay"] is False and not any(IN_PCT in gate for gate in rows)
+    for less_pct, passed in ((0.1, False), (0.0, True), (-0.1, True)):  # those that lost worlds steered less
+        found["modes"]["static"]["steering_less_pct"] = less_pct
+        assert compare.gates(found, LIMITS)[0]["passed"] is passed
+    assert (
+        compare.gates(metrics_of(worst_tenth_pct=0.05, steering_less_pct=-0.1) | looking, LIMITS)[0]["passed"] is False
+    )
 
 
 def test_the_worst_tenth_and_the_highest_errors_by_hand():
@@ -110,7 +118,7 @@ def test_an_action_that_never_changed_is_neither_judged_nor_drawn(policies):
     metrics = compare.metrics(report, policies)
     static = metrics["modes"]["static"]
     shares = {k: v for k, v in static.items() if k.startswith("throttle") and k.endswith("_pct")}
-    assert len(shares) == 5 and set(shares.values()) == {None} and "NaN" not in json.dumps(plain(metrics["modes"]))
+    assert len(shares) == 6 and set(shares.values()) == {None} and "NaN" not in json.dumps(plain(metrics["modes"]))
     assert metrics["fp32"]["throttle_vs_recorded_pct"] is None and len(metrics["warnings"]) == 1
     assert [w.action for w in report.worst("static")] == ["steering"]
     rows = {r["gate"]: r["passed"] for r in compare.gates(metrics, LIMITS)}
@@ -194,6 +202,7 @@ IN_PCT = "error, % of the recorded range"
 def test_gates(changed, failing):
     rows = compare.gates(metrics_of(**changed), LIMITS)
     assert {r["gate"] for r in rows if r["passed"] is False} == failing
+    assert compare.gates(metrics_of(size_mb=102.0), LIMITS, "dynamic")[-1]["passed"]  # each mode has its own size
     assert [compare.hits_needed(LIMITS, trials) for trials in (None, 40, 20)] == [36, 36, 18]
 
 
@@ -206,10 +215,3 @@ def test_worlds_decide_where_they_show_something():
     found["modes"]["static"] |= pairs_of(1, 0, 200)  # does not show it
     rows = {r["gate"]: r["passed"] for r in compare.gates(found, LIMITS)}
     assert rows["static worlds lost at most, %"] is None and rows[f"static {IN_PCT}"] is False
-
-
-def test_each_mode_has_a_limit_of_size():
-    """At the real car's size dynamic has 102 MB, and no limit but static's was there."""
-    for mode, passed in (("static", False), ("dynamic", True)):
-        rows = {r["gate"]: r["passed"] for r in compare.gates(metrics_of(size_mb=102.0), LIMITS, mode)}
-        assert rows[f"{mode} size_mb"] is passed

@@ -53,6 +53,8 @@ def test_the_demo_deploys_static(demo):
     assert "drawn balloons" in "".join(judged["cautions"])
     assert commands(judged) == ["rover view runs/mine/policy_static.pt", "rover record --max-seconds 30 episodes"]
     assert v.verdict(demo, PARAMS, Names("runs/demo", "", ""))["next"][0]["command"] == "make watch"
+    broken = v.verdict(demo, PARAMS, Names("runs/x\nrm -r y  # z", "", ""))["next"]
+    assert [step["command"].split()[0] for step in broken] == ["rover", "rover"]
     least = [{"episode": "drive 7", "frame": "5.jpg", "strange": 1.0}]
     rate = {"drives": 39, "stopped_low_pct": 0.065, "stopped_high_pct": 9.03}
     demo["quantize"]["modes"]["static"]["familiar"] = rate | {"least": least}
