@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from policies import MemorySample, memory_samples
-from rover_lib.workshop.int8.graph import with_embedding
 
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.manifest import Artifact
@@ -16,7 +15,7 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.int8.export import Exporter, TorchScript
 from rover_lib.workshop.int8.familiar import Drives, fit
-from rover_lib.workshop.int8.quantize import quantize
+from rover_lib.workshop.int8.quantize import quantize, with_embedding
 from rover_lib.workshop.int8.scheme import Scheme
 
 NOISE = np.random.default_rng(5).integers(0, 256, (72, 128, 3), np.uint8)
