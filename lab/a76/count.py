@@ -95,6 +95,7 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
         "first_g": inferences_g[0],
         "second_g": inferences_g[1],
         "tenth_g": inferences_g[9] if counted >= COUNTED else None,
+        "familiar_g": done.total(counted + 1) / 1e9 if "familiar" in manifest else None,
         "load_instructions_g": done.total(0) / 1e9,
         "gmac": manifest["gmac"],
         "image_height": manifest["cameras"][0]["height"],

@@ -94,15 +94,11 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
         "good_hits": outcomes.count("hit"),
         "moved_limit": MOVED,
     }
-    if recordings:
-        stuck_s = params()["drive"]["stuck_s"]
-        for episode in load_recordings(recordings).episodes:
-            metrics[episode.path.name] = watch_recording(episode.samples, stuck_s)
-    return metrics
+    episodes, stuck_s = load_recordings(recordings).episodes if recordings else (), params()["drive"]["stuck_s"]
+    return metrics | {episode.path.name: watch_recording(episode.samples, stuck_s) for episode in episodes}
 
 
 if __name__ == "__main__":
     output, run_dir, *more = map(Path, sys.argv[1:])
     found = study(run_dir / "policy_static.pt", more[0] if more else None)
     write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=found)
-    print(found)

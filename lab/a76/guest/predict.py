@@ -3,7 +3,7 @@
     predict.py ARTIFACT OBSERVATIONS FOLDER COUNTED
 
 Loading is section 0 of the plugin's counts; the first COUNTED inferences, with the preparation of a frame, are sections
-1, 2, ... Each line on stdout says what begins.
+1, 2, ... and what tells the unfamiliar is the one after them. Each line on stdout says what begins.
 
 OBSERVATIONS: an npz of `state` (n, S) float32 and `frame_0000`... (h, w, 3) uint8 BGR. FOLDER gets `chunks.npy`
 (n, chunk, A) float32, `maps` (which files are loaded where) and `versions.json`.
@@ -49,6 +49,10 @@ def predict_all(policy: Policy, observations: str, counted: int) -> np.ndarray:
             chunks.append(policy.predict_chunk(frame, state))
             if i < counted:
                 mark(False, i + 1)
+    if policy.familiar:  # what telling the unfamiliar costs of each inference; its arrays are in the caches by now
+        mark(True, counted + 1)
+        policy.familiar.strange(policy.familiar.mean[None])
+        mark(False, counted + 1)
     return np.stack(chunks[: len(states)])
 
 

@@ -50,7 +50,7 @@ class Policy:
     """A loaded artifact, as `load_policy` returns it. car: the car for which it plans.
 
     strange: how unfamiliar the newest prediction's picture is, as a share of the artifact's threshold, NaN if that
-    cannot be told; None for an artifact without one.
+    cannot be told; None for an artifact without one. familiar: what tells it.
     """
 
     def __init__(self, path: Path, engine: Engine, manifest: dict[str, Any], familiar: Familiar | None = None):
@@ -62,7 +62,7 @@ class Policy:
         self.chunk: int = manifest["chunk"]
         self.rate_hz = float(manifest["rate_hz"])
         self.image_size: tuple[int, int] = (manifest["cameras"][0]["height"], manifest["cameras"][0]["width"])
-        self._engine, self._familiar = engine, familiar
+        self._engine, self.familiar = engine, familiar
         self.strange: float | None = None
         self.car = car_of(manifest)
         self._low, self._high = action_limits(self.action_names, self.car)
@@ -103,10 +103,10 @@ class Policy:
             what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
             raise PolicyError(what, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
         shapes = [embedding.shape for embedding in embeddings]
-        if shapes != ([(1, *self._familiar.mean.shape)] if self._familiar else []):
+        if shapes != ([(1, *self.familiar.mean.shape)] if self.familiar else []):
             raise PolicyError(f"{self.path}: gives another embedding than its manifest says", found=shapes)
-        if self._familiar:
-            self.strange = float(self._familiar.strange(embeddings[0])[0])
+        if self.familiar:
+            self.strange = float(self.familiar.strange(embeddings[0])[0])
         return y[0].copy()
 
     @property
@@ -141,12 +141,9 @@ def load_policy(source: Path | str | Artifact, *, threads: int | None = None) ->
     source.prove()
     engine = import_engine(source).load(source, threads)
     path, vectors = source.path, source.parity
-    familiar = Familiar.of(vectors)
-    policy = Policy(path, engine, source.manifest, familiar)
+    policy = Policy(path, engine, source.manifest, Familiar.of(vectors))
     chunks, strange = _predict(policy, vectors)
-    _check_differences(policy, chunks, vectors)
-    if familiar:
-        _check_strange(policy, familiar.strange(vectors["embedding"]), strange)
+    _check(policy, chunks, strange, vectors)
     if engine.give_back() and not np.array_equal(_predict(policy, vectors)[0], chunks):
         raise ArtifactError(f"{path}: predicts differently without its original weights", remedy="do not drive")
     give_back_freed()
@@ -176,19 +173,15 @@ def _predict(policy: Policy, vectors: Mapping[str, np.ndarray]) -> tuple[np.ndar
         raise refused(policy.path, f"its parity vectors do not run ({why})") from None
 
 
-def _check_differences(policy: Policy, chunks: np.ndarray, vectors: Mapping[str, np.ndarray]) -> None:
-    """Raise ArtifactError if the answers, (n, chunk, A), differ more from the vectors' than the manifest tolerates."""
-    difference = np.abs(chunks - vectors["chunk"]).max((0, 1))
-    tolerance = policy.manifest["parity"]["tolerance"]
-    for name, d in zip(policy.action_names, difference.tolist(), strict=True):
+def _check(policy: Policy, chunks: np.ndarray, strange: list[float | None], vectors: Mapping[str, np.ndarray]) -> None:
+    """Raise ArtifactError if the answers, those of _predict, differ more from the vectors' than is tolerated."""
+    differences = dict(zip(policy.action_names, np.abs(chunks - vectors["chunk"]).max((0, 1)).tolist(), strict=True))
+    tolerance = dict(policy.manifest["parity"]["tolerance"])
+    if policy.familiar:
+        told, wanted = "how unfamiliar a picture is, of the threshold,", policy.familiar.strange(vectors["embedding"])
+        differences[told] = np.abs(wanted - np.array(strange)).max()
+        tolerance[told] = TOLERANCE[policy.manifest["mode"] != "fp32"]
+    for name, d in differences.items():
         if not d <= tolerance[name]:  # so that NaN fails too
             what = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
             raise ArtifactError(what, remedy="do not drive with it")
-
-
-def _check_strange(policy: Policy, wanted: np.ndarray, strange: list[float | None]) -> None:
-    """Raise ArtifactError if the parity vectors' pictures are more or less familiar here than where it was made."""
-    difference = np.abs(wanted - np.array(strange)).max()
-    if not difference <= TOLERANCE[policy.manifest["mode"] != "fp32"]:  # so that NaN fails too
-        what = f"{policy.path}: how unfamiliar a picture is differs here by {difference:.3g} of the threshold"
-        raise ArtifactError(what, remedy="do not drive with it")
