@@ -120,14 +120,6 @@ def test_the_process_computes_what_the_policy_does(process, artifacts):
     assert (process.rate_hz, process.chunk, process.manifest["mode"]) == (policy.rate_hz, policy.chunk, "static")
 
 
-def test_every_thread_of_the_process_is_confined(process):
-    assert process.unconfined == ""
-    for thread in Path(f"/proc/{process._process.pid}/task").iterdir():
-        status = (thread / "status").read_text()
-        assert "\nNoNewPrivs:\t1\n" in status and "\nSeccomp:\t2\n" in status
-    assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
-
-
 def test_an_answer_of_another_size_is_no_plan(process, monkeypatch):
     monkeypatch.setattr(process, "_answer", lambda timeout_s: bytes(8 * 33))
     with pytest.raises(PolicyError, match="size of a plan"):
