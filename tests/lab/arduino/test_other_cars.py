@@ -46,8 +46,7 @@ def crawler():
     told(board, CRAWLER)
     sticks_rest(board, CRAWLER)
     arm(board)
-    yield board
-    board.close()
+    return board
 
 
 def test_the_pins_are_car_ymls_over_the_whole_range(crawler):
@@ -94,7 +93,6 @@ def test_told_of_another_car_no_pulse_is_cut():
         assert abs(after[-1].pulse_us - car.numbers[6]) <= STEP_US
         assert all(us > 1400 for us in widths(board.events[start:], "steering"))
         assert board.now_us / 1000 - 35 <= board.status.uptime_ms <= board.now_us / 1000  # the clock's timer changed
-    board.close()
 
 
 # ---- the car that it keeps
@@ -116,7 +114,6 @@ def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car):
     on_pins(events, car.numbers[2], car.numbers[6], within_us=HALF_STEP_US)
     has_periods(events, car)
     assert any(line.endswith(f" p {car.id}") for line in board.lines)
-    board.close()
 
 
 def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
@@ -129,7 +126,6 @@ def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
         board.transmitter(1700, 500)
         assert not [e for e in board.run_ms(90) if e.channel >= 0], eeprom.hex()
         assert (board.status.missing, board.status.steering_us, board.status.throttle_us) == ("s", 0, 0)
-        board.close()
 
 
 def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
@@ -145,7 +141,6 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
         assert board.now_us < 250_000
     board.run_ms(100)
     assert board.eeprom == images[-1]  # and no more
-    board.close()
     between = {
         before[:at] + bytes([byte]) + before[at + 1 :]
         for before, after in pairwise(images)
@@ -159,5 +154,4 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
         found = int(board.lines[0].split()[-1])
         car = next((car for car in (INVERTED, CRAWLER) if car.id == found), None)
         assert pins == ({(0, car.numbers[2]), (1, car.numbers[6])} if car else set()), eeprom.hex()
-        board.close()
     assert len(images) > 12
