@@ -72,15 +72,3 @@ def test_what_a_page_asks_for(simulation):
     assert ("ended", "stopped here; nobody drives", "INT8") in said and said[-1][2] == "FP32"
     assert [results[1] for results in simulation._results.values()] == [0, 1]  # what was stopped counts for nobody
     assert simulation._seed == 10_002
-
-
-@pytest.mark.slow
-def test_whoever_watches_pushes_the_car(simulation):
-    """A drive that somebody pushed counts for its pushes, and for no policy."""
-    alone = drive(simulation)[-1]["world"]
-    simulation._seed -= 1
-    asked = iter(["push left", "push right", "push left", "push up"])
-    seen = drive(simulation, 1, lambda head: head["phase"] == "driving" and simulation.ask(next(asked, "")))
-    pushed = seen[-1]["world"]
-    assert pushed["path"] != alone["path"] and pushed["results"] == alone["results"]
-    assert pushed["pushed"][1] == 3 and pushed["pushed"][0] in (0, 3)
