@@ -115,14 +115,10 @@ class Uno:
         self.send(text)
         return text
 
-    def transmitter(
-        self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float
-    ) -> None:
-        """Move the human's sticks, from their next pulse on. 0 means no signal, None leaves a channel as it is."""
+    def transmitter(self, steering_us: float, throttle_us: float, periods_us: tuple[float, float] = (0, 0)) -> None:
+        """Move the human's sticks, from their next pulse on. 0 means no signal, and the nominal period."""
         for channel, pulse_us in enumerate((steering_us, throttle_us)):
-            if pulse_us is not None:
-                period = period_us.get(f"{'throttle' if channel else 'steering'}_period_us", 0)
-                self._c.uno_transmitter(self._uno, channel, pulse_us, period)
+            self._c.uno_transmitter(self._uno, channel, pulse_us, periods_us[channel])
 
     def wiggle(self) -> None:
         """Let the human move the steering stick to both sides and let go of it, and run until that has counted."""

@@ -28,8 +28,8 @@ def told(board, car):
 
 def sticks_rest(board, car):
     """Near neutral; receiver and Arduino have each a clock of their own."""
-    periods = {"steering_period_us": car.numbers[0] + 30, "throttle_period_us": car.numbers[4] + 30 * car.reverses}
-    board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, **periods)
+    periods_us = car.numbers[0] + 30, car.numbers[4] + 30 * car.reverses
+    board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, periods_us)
     board.run_ms(300)
 
 
