@@ -34,11 +34,6 @@ def armed(request):
     return armed_board(request.param)
 
 
-def neutral_of(board):
-    pulses = board.car.pwm.neutral()
-    return pulses.steering_us, pulses.throttle_us
-
-
 # ---- being told
 
 
@@ -63,11 +58,11 @@ def test_the_car_is_kept_only_while_it_rests(armed):
 
 
 def test_no_other_car_while_armed(armed):
-    before = neutral_of(armed)
+    neutral = armed.car.pwm.neutral()
     assert armed.command("C", *Car().numbers) == "i"
     assert armed.status.state is State.AUTONOMOUS and armed.hello.car == armed.car.id
     armed.command("N")
-    assert armed.run(1) == [before]
+    assert armed.run(1) == [(neutral.steering_us, neutral.throttle_us)]
     assert armed.command("C", *Car().numbers) == "k"
     assert armed.run(1) == [(1456, 120)]
 

@@ -26,13 +26,6 @@ def told(board, car):
     assert board.status.result == "k", board.lines[-3:]
 
 
-def sticks_rest(board, car):
-    """Near neutral; receiver and Arduino have each a clock of their own."""
-    periods_us = car.numbers[0] + 30, car.numbers[4] + 30 * car.reverses
-    board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, periods_us)
-    board.run_ms(300)
-
-
 def has_periods(events, car):
     for pin, period_us in (("steering", car.numbers[0]), ("throttle", car.numbers[4])):
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
@@ -44,7 +37,9 @@ def crawler():
     board = Uno()
     board.run_ms(60)
     told(board, CRAWLER)
-    sticks_rest(board, CRAWLER)
+    # Near neutral; receiver and Arduino have each a clock of their own.
+    board.transmitter(1504, 1504, (CRAWLER.numbers[0] + 30, CRAWLER.numbers[4] + 30))
+    board.run_ms(300)
     arm(board)
     return board
 
