@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_playbooks import programs
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import Releases
@@ -20,7 +21,7 @@ from rover_lib.onboard.stage import sha256_of
 ROOT = Path(__file__).parents[2]
 NAMES = ("canary", "second", "third")
 BINARY = Path(sys.executable).parent
-SYSTEMCTL = """#!/bin/sh
+SYSTEMCTL = """
 echo "$*" >> {folder}/asked
 case $1 in
   show) cat {folder}/state ;;
@@ -39,15 +40,9 @@ class Fleet:
         self.folder, rover = folder, folder / "home" / "venv" / "bin" / "rover"
         rover.parent.mkdir(parents=True)
         rover.symlink_to(BINARY / "rover")
-        self.write(folder / "bin" / "systemctl", SYSTEMCTL.format(folder=folder))
-        self.write(folder / "bin" / "journalctl", "#!/bin/sh\necho rover: no\n")
+        programs(folder, {"bin/systemctl": SYSTEMCTL.format(folder=folder), "bin/journalctl": "echo rover: no"})
         self.service("inactive")
         self.lines = {name: f"{name} rover_models={folder}/{name}/models" for name in NAMES}
-
-    def write(self, program: Path, text: str) -> None:
-        program.parent.mkdir(exist_ok=True)
-        program.write_text(text)
-        program.chmod(0o755)
 
     def service(self, active: str, text: str = "") -> None:
         (self.folder / "state").write_text(f"LoadState=loaded\nActiveState={active}\nStatusText={text}\n")

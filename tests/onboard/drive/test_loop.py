@@ -9,6 +9,7 @@ import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -133,10 +134,7 @@ def test_whatever_ends_it_neutral_is_the_first_that_follows(link, clock, what, r
 
 
 def test_what_ended_it_is_told_although_neutral_fails_too(link, clock, monkeypatch):
-    def interrupted():
-        raise ZeroDivisionError("another bug")
-
-    monkeypatch.setattr(link, "neutral", interrupted)
+    monkeypatch.setattr(link, "neutral", Mock(side_effect=ZeroDivisionError("another bug")))
     log, report = Log(), Report()
     with pytest.raises(DriveFault, match="unplugged"):
         go(Always({2: CameraError("unplugged")}), link, clock, log, report=report)
