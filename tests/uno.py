@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import tempfile
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,27 +41,12 @@ class _Event(ctypes.Structure):
 @functools.cache
 def _library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(compiled("libarduino.so", "-shared", "-fPIC", *arduino.WITH_SIMAVR)))
-    library.uno_new.restype = ctypes.c_void_p
-    library.uno_now_us.restype = library.uno_longest_us.restype = ctypes.c_double
     pointer, real = ctypes.c_void_p, ctypes.c_double
-    for name, arguments in {
-        "uno_new": [ctypes.c_char_p],
-        "uno_free": [pointer],
-        "uno_now_us": [pointer],
-        "uno_send": [pointer, ctypes.POINTER(ctypes.c_uint16), ctypes.c_int],
-        "uno_transmitter": [pointer, ctypes.c_int, real, real],
-        "uno_wiggle": [pointer],
-        "uno_reset": [pointer],
-        "uno_power": [pointer],
-        "uno_eeprom": [pointer, ctypes.c_char_p, ctypes.c_uint32, ctypes.c_bool],
-        "uno_hang": [pointer, ctypes.c_uint32],
-        "uno_watch": [pointer, ctypes.c_uint32, ctypes.c_uint32],
-        "uno_longest_us": [pointer],
-        "uno_run_us": [pointer, real],
-        "uno_read": [pointer, ctypes.c_char_p, ctypes.c_int],
-        "uno_events": [pointer, ctypes.POINTER(_Event), ctypes.c_int],
-    }.items():
-        getattr(library, name).argtypes = arguments
+    library.uno_new.restype = pointer
+    library.uno_now_us.restype = library.uno_longest_us.restype = real
+    # Of the others, ctypes knows each argument's type by itself.
+    library.uno_transmitter.argtypes = [pointer, ctypes.c_int, real, real]
+    library.uno_run_us.argtypes = [pointer, real]
     return library
 
 
@@ -75,8 +61,9 @@ class Uno:
         """eeprom: its first bytes; None: of a board that has kept the default car. human: as the firmware is built."""
         self._c = _library()
         firmware = arduino.build(human).firmware
-        self._uno = self._c.uno_new(str(firmware).encode())
+        self._uno = ctypes.c_void_p(self._c.uno_new(str(firmware).encode()))
         assert self._uno, f"simavr cannot load {firmware}"
+        weakref.finalize(self, self._c.uno_free, self._uno)
         kept = arduino.eeprom_of(car.Car()) if eeprom is None else eeprom
         self._c.uno_eeprom(self._uno, ctypes.create_string_buffer(kept, len(kept) or 1), len(kept), True)
         self.events: list[SimpleNamespace] = []
@@ -85,11 +72,6 @@ class Uno:
         self.sequence = 0
         self.boot = None
         self.car_id = car.this_car().id  # the car that the host names when it arms
-
-    def close(self) -> None:
-        if self._uno:
-            self._c.uno_free(self._uno)
-            self._uno = None
 
     @property
     def now_us(self) -> float:
@@ -133,14 +115,10 @@ class Uno:
         self.send(text)
         return text
 
-    def transmitter(
-        self, steering_us: float | None = None, throttle_us: float | None = None, **period_us: float
-    ) -> None:
-        """Move the human's sticks, from their next pulse on. 0 means no signal, None leaves a channel as it is."""
+    def transmitter(self, steering_us: float, throttle_us: float, periods_us: tuple[float, float] = (0, 0)) -> None:
+        """Move the human's sticks, from their next pulse on. 0 means no signal, and the nominal period."""
         for channel, pulse_us in enumerate((steering_us, throttle_us)):
-            if pulse_us is not None:
-                period = period_us.get(f"{'throttle' if channel else 'steering'}_period_us", 0)
-                self._c.uno_transmitter(self._uno, channel, pulse_us, period)
+            self._c.uno_transmitter(self._uno, channel, pulse_us, periods_us[channel])
 
     def wiggle(self) -> None:
         """Let the human move the steering stick to both sides and let go of it, and run until that has counted."""

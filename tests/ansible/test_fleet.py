@@ -1,7 +1,7 @@
 """deploy.yml, rollback.yml and status.yml on three rovers that are folders of this machine, and one that is not there.
 
 What systemd and the service would say comes from a script in their place; models, files and commands are real.
-`make test` runs one of the deployments, and `make check-release` the others.
+`make test` runs one of the deployments, and `make check-release` the others. `python -m lab pi` arms one car.
 """
 
 import json
@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_playbooks import programs
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import Releases
@@ -20,17 +21,11 @@ from rover_lib.onboard.stage import sha256_of
 ROOT = Path(__file__).parents[2]
 NAMES = ("canary", "second", "third")
 BINARY = Path(sys.executable).parent
-SYSTEMCTL = """#!/bin/sh
+SYSTEMCTL = """
 echo "$*" >> {folder}/asked
 case $1 in
   show) cat {folder}/state ;;
   start) [ ! -e {folder}/parity-fails ] ;;
-esac
-"""
-DRIVING = """#!/bin/sh
-echo "$*" >> {folder}/rover
-case $* in
-  *--heartbeat) [ $(grep -c heartbeat$ {folder}/rover) -gt 1 ] && echo "disarmed: 600 s" || echo "driving: armed" ;;
 esac
 """
 
@@ -42,19 +37,12 @@ pytestmark = [
 
 class Fleet:
     def __init__(self, folder: Path):
-        self.folder, self.rover = folder, folder / "home" / "venv" / "bin" / "rover"
-        self.rover.parent.mkdir(parents=True)
-        self.rover.symlink_to(BINARY / "rover")
-        self.write(folder / "bin" / "systemctl", SYSTEMCTL.format(folder=folder))
-        self.write(folder / "bin" / "journalctl", "#!/bin/sh\necho rover: no\n")
+        self.folder, rover = folder, folder / "home" / "venv" / "bin" / "rover"
+        rover.parent.mkdir(parents=True)
+        rover.symlink_to(BINARY / "rover")
+        programs(folder, {"bin/systemctl": SYSTEMCTL.format(folder=folder), "bin/journalctl": "echo rover: no"})
         self.service("inactive")
         self.lines = {name: f"{name} rover_models={folder}/{name}/models" for name in NAMES}
-
-    def write(self, program: Path, text: str) -> None:
-        program.parent.mkdir(exist_ok=True)
-        program.unlink(missing_ok=True)
-        program.write_text(text)
-        program.chmod(0o755)
 
     def service(self, active: str, text: str = "") -> None:
         (self.folder / "state").write_text(f"LoadState=loaded\nActiveState={active}\nStatusText={text}\n")
@@ -134,21 +122,3 @@ def test_the_model_before_stays_when_the_canary_fails_drives_or_does_not_get_rea
         fleet.service(*service)
         assert fleet.deploy(artifacts["mixed"]).returncode != 0
         assert {fleet.releases(n).current for n in NAMES} == old, service
-
-
-@pytest.mark.release
-def test_the_model_that_was_checked_is_armed_and_the_laptop_is_heard(fleet, artifacts):
-    fleet.give(artifacts["static"], "canary")
-    fleet.service("active", "disarmed: waiting for a human to arm it")
-    refused = fleet.play("drive", rover_arm=True)
-    assert refused.returncode != 0 and "choose one with --limit" in refused.stdout
-    assert not (fleet.folder / "asked").exists()  # before anything was asked of systemd
-    fleet.write(fleet.rover, DRIVING.format(folder=fleet.folder))
-    done = fleet.play("drive", "--limit", "canary", rover_arm=True, rover_fetched=str(fleet.folder))
-    assert done.returncode == 0, done.stdout
-    verified, doctor, *asked = (fleet.folder / "rover").read_text().splitlines()
-    model = content_hash(artifacts["static"])
-    assert verified.startswith("release ") and doctor.startswith("doctor ")
-    armed = f"arm-car --yes --model={model} --max-seconds=600 --heartbeat-s=10"
-    assert asked == [armed, "arm-car --heartbeat", "arm-car --heartbeat"]
-    assert "stop" in (fleet.folder / "asked").read_text().splitlines()[-1]

@@ -109,6 +109,7 @@ def test_wrong_arguments_and_machines_are_refused_before_anything_is_done(tmp_pa
         ("system", {"rover_usb_ids": ['2341:0043", RUN+="/bin/true']}),
     ]
     cases += [(file, given, "nowhere.pt" if file == "artifact" else next(iter(given))) for file, given in values]
+    cases.append(("drive", {"rover_arm": True}, "choose one with --limit"))  # each of these is one of many hosts
     play_each(tmp_path, cases, "--check")  # so that this machine stays as it is in any case
 
 
@@ -217,6 +218,9 @@ def test_no_unit_lets_root_load_an_artifact_and_no_playbook_runs_one_itself(unit
         assert "\nUser=rover" in text and "\nUnsetEnvironment=ROVER_AS_ROOT\n" in text and "ROVER_AS_ROOT=" not in text
     tasks = "".join(p.read_text() for p in (ROLE / "tasks").glob("*.yml"))
     assert "current/policy.pt" not in tasks and "--sandboxed, verify]" in tasks
+    drive = (ROLE / "tasks" / "drive.yml").read_text()  # armed is what was checked, and only while the laptop is heard
+    steps = "register: rover_meant", "verify]", "--model={{ rover_meant.stat", "--heartbeat-s={{ rover", "--heartbeat]"
+    assert (places := [drive.index(step) for step in steps]) == sorted(places)
 
 
 def test_the_units_say_what_the_command_line_takes(units):

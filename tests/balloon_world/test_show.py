@@ -1,4 +1,7 @@
-"""The balloon world in a view: a slow machine slows its time and changes nothing else; a page's requests."""
+"""The balloon world in a view: a slow machine slows its time and changes nothing else.
+
+What its page asks for, test_view_in_a_browser.py clicks.
+"""
 
 import time
 
@@ -6,7 +9,6 @@ import numpy as np
 import pytest
 
 from balloon_world import show
-from balloon_world.show import Simulation
 from rover_lib.onboard.car.car import this_car
 
 
@@ -15,72 +17,27 @@ class Straight:
 
     rate_hz, car = 30.0, this_car()
 
-    def __init__(self, path, seconds=0.0, threads=None):
-        self.seconds = seconds
+    def __init__(self, path, threads):
+        self.seconds = 0.0
 
     def predict_unclipped(self, frame_bgr, state):
         time.sleep(self.seconds)
         return np.tile(np.float32([0.0, 0.4]), (32, 1))
 
 
-@pytest.fixture
-def simulation(tmp_path, monkeypatch):
-    """Of a run with two modes. The clock's time passes as fast as a test wants it."""
-    for name in ("policy_static.pt", "policy_fp32.pt"):
-        (tmp_path / name).touch()
+@pytest.mark.slow
+def test_a_slow_machine_slows_time_and_changes_nothing_else(tmp_path, monkeypatch):
+    (artifact := tmp_path / "policy_static.pt").touch()
     monkeypatch.setattr(show, "load_policy", Straight)
     monkeypatch.setattr(show, "HOLD_S", 0.0)
     monkeypatch.setattr(show, "PICTURE_S", 0.0)
-    return Simulation(tmp_path / "policy_static.pt")
-
-
-def drive(simulation, worlds=1, each=lambda head: None):
-    seen = []
-
-    def post(head, picture):
-        seen.append(head)
-        assert picture.startswith(b"\xff\xd8")
-        each(head)
-
-    simulation.run(post, worlds)
-    return seen
-
-
-@pytest.mark.slow
-def test_a_slow_machine_slows_time_and_changes_nothing_else(simulation, monkeypatch):
-    fast = drive(simulation)
-    slow_one = Simulation(simulation._paths["INT8"])
-    slow_one._policies["INT8"].seconds = 0.15  # for a plan, which the simulation needs ten times a second
-    slow = drive(slow_one)
-    assert fast[-1]["world"]["path"] == slow[-1]["world"]["path"] and len(fast[-1]["world"]["path"]) > 10
-    assert simulation._results == slow_one._results and sum(r[1] for r in simulation._results.values()) == 1
-
-
-@pytest.mark.slow
-def test_what_a_page_asks_for(simulation):
-    asked = iter([("driving", "stop"), ("ended", "drive FP32"), ("driving", "rm -rf"), ("driving", "next")])
-    waiting = [next(asked)]
-    said = []
-
-    def each(head):
-        said.append((head["phase"], head["text"], head["world"]["drives"]))
-        if waiting and head["phase"] == waiting[0][0]:
-            simulation.ask(waiting.pop()[1])
-            waiting.extend([step] if (step := next(asked, None)) else [])
-
-    drive(simulation, 3, each)  # stopped; the same world by FP32, skipped; the next one
-    assert ("ended", "stopped here; nobody drives", "INT8") in said and said[-1][2] == "FP32"
-    assert [results[1] for results in simulation._results.values()] == [0, 1]  # what was stopped counts for nobody
-    assert simulation._seed == 10_002
-
-
-@pytest.mark.slow
-def test_whoever_watches_pushes_the_car(simulation):
-    """A drive that somebody pushed counts for its pushes, and for no policy."""
-    alone = drive(simulation)[-1]["world"]
-    simulation._seed -= 1
-    asked = iter(["push left", "push right", "push left", "push up"])
-    seen = drive(simulation, 1, lambda head: head["phase"] == "driving" and simulation.ask(next(asked, "")))
-    pushed = seen[-1]["world"]
-    assert pushed["path"] != alone["path"] and pushed["results"] == alone["results"]
-    assert pushed["pushed"][1] == 3 and pushed["pushed"][0] in (0, 3)
+    paths, results = [], []
+    for seconds in (0.0, 0.15):  # for a plan, which the simulation needs ten times a second
+        seen, simulation = [], show.Simulation(artifact)
+        simulation._policies["INT8"].seconds = seconds
+        simulation.run(lambda head, picture, seen=seen: seen.append((head, picture)), 1)
+        assert all(picture.startswith(b"\xff\xd8") for _, picture in seen)
+        paths.append(seen[-1][0]["world"]["path"])
+        results.append(simulation._results)
+    assert paths[0] == paths[1] and len(paths[0]) > 10
+    assert results[0] == results[1] and results[0]["INT8"][1] == 1

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import needs
 import numpy as np
@@ -82,34 +83,23 @@ def test_it_ends_with_its_parent():
 # ---- the worlds, without a process: what the pins ask for, and what is kept
 
 
-class Board:
-    """Pins that do what they are told."""
-
-    def __init__(self, *events):
-        self.events = list(events)
-
-    def pulses(self):
-        events, self.events = self.events, []
-        return events
-
-
 def pulses(steering_us, throttle_us):
     return [PinEvent(0, "pulse", "steering", steering_us, 0.0), PinEvent(0, "pulse", "throttle", throttle_us, 0.0)]
 
 
 def test_the_newest_pulses_drive_world_after_world_and_a_reset_ends_them():
-    board = Board()
-    car = _Car(board, 5)
+    events = []
+    car = _Car(SimpleNamespace(pulses=lambda: events), 5)
     car.tick()
     assert car.world.state.time_s == 0  # nobody asked for motion yet
-    board.events = [*pulses(1456, 120), *pulses(2012, 711)]
+    events[:] = [*pulses(1456, 120), *pulses(2012, 711)]
     car.tick()
     state = car.world.state
     assert (state.steering_command, state.throttle_command) == pytest.approx((1, 1), abs=0.002)
-    board.events = [PinEvent(3.0, "reset", "", 0, 0)]
+    events[:] = [PinEvent(3.0, "reset", "", 0, 0)]
     car.tick()
     assert (car.world.state.steering_command, car.world.state.throttle_command) == (0, 0)
-    board.events = pulses(2012, 711)
+    events[:] = pulses(2012, 711)
     while car.trials < 3:
         car.tick()
     assert car.world.seed == 8 and car.hits < 3

@@ -242,8 +242,10 @@ def test_one_pause_is_no_reason_to_stop(armed, phase_ms):
 # ---- near the wrap of the clock
 
 
-def test_nothing_happens_when_the_clock_wraps():
-    board = NativeArduino(now_ms=(1 << 32) - 1000)
+@pytest.mark.parametrize("before_ms", [1000, 2000])
+def test_nothing_happens_when_the_clock_wraps(before_ms):
+    """In the gesture, and while it drives."""
+    board = NativeArduino(now_ms=(1 << 32) - before_ms)
     board.run(120)
     board.wiggle()
     assert board.command("A") == "k"

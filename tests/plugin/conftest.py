@@ -42,14 +42,14 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path, noise):
-    """bench(board=None, **options of RoverConfig): a context with a Bench, each time with everything of its own."""
+    """bench(**options of RoverConfig): a context with a Bench, each time with everything of its own."""
     from lerobot_robot_rover import Rover, RoverConfig
 
     @contextlib.contextmanager
-    def make(board=None, **options):
+    def make(**options):
         folder = Path(tempfile.mkdtemp(dir=tmp_path))
         with CameraFeed(folder / "camera", *noise) as feed, contextlib.ExitStack() as stack:
-            board = board or stack.enter_context(StandIn())
+            board = stack.enter_context(StandIn())
             given = {"width": 96, "height": 48, "log": folder / "flight.log", "port": board.port}
             given |= {"camera": str(folder / "camera"), "calibration_dir": folder} | options
             robot = Rover(RoverConfig(**given))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from unittest.mock import Mock
 from weakref import WeakValueDictionary
 
 import pytest
@@ -18,26 +19,6 @@ CALIBRATION = PwmCalibration()
 DRIVEN = CALIBRATION.pulses(0.5, 0.1)
 
 
-class Link:
-    """A link whose newest status is set by the test. opened: how many there are."""
-
-    opened = 0
-    status: Telemetry | None = None
-    calibration, remedy = CALIBRATION, MISSING.get
-
-    def __init__(self, port):
-        assert port == PORT
-
-    def open(self):
-        Link.opened += 1
-
-    def close(self):
-        Link.opened -= 1
-
-    def latest(self):
-        return Link.status
-
-
 def status(steering_us, throttle_us, at_s=1.0, pins=None):
     """A human drives, and the pins do what he does."""
     pins = pins or (steering_us or 1456, throttle_us or 120)
@@ -47,12 +28,14 @@ def status(steering_us, throttle_us, at_s=1.0, pins=None):
 
 
 @pytest.fixture(autouse=True)
-def _links(monkeypatch):
-    monkeypatch.setattr(line, "ServoLink", Link)
+def link(monkeypatch):
+    """A link whose newest status is set by the test."""
+    link = Mock(calibration=CALIBRATION, remedy=MISSING.get)
+    link.latest.return_value = status(DRIVEN.steering_us, DRIVEN.throttle_us)
+    monkeypatch.setattr(line, "ServoLink", {PORT: link}.__getitem__)
     monkeypatch.setattr(line, "_lines", WeakValueDictionary())
-    Link.opened, Link.status = 0, status(DRIVEN.steering_us, DRIVEN.throttle_us)
-    yield
-    assert Link.opened == 0
+    yield link
+    assert link.open.call_count == link.close.call_count
 
 
 @pytest.fixture
@@ -63,7 +46,7 @@ def transmitter(tmp_path):
         teleop.disconnect()
 
 
-def test_the_sticks_by_car_yml(transmitter):
+def test_the_sticks_by_car_yml(transmitter, link):
     assert transmitter.is_calibrated and transmitter.action_features == FEATURES
     for ask in (transmitter.get_action, transmitter.disconnect):
         with pytest.raises(DeviceNotConnectedError):
@@ -73,24 +56,25 @@ def test_the_sticks_by_car_yml(transmitter):
         transmitter.connect()
     action = transmitter.get_action()
     assert action == pytest.approx(named(0.5, 0.1), abs=2e-3) and CALIBRATION.pulses(**unnamed(action)) == DRIVEN
-    Link.status = status(2190, 118)  # beyond the ends
+    link.latest.return_value = status(2190, 118)  # beyond the ends
     assert transmitter.get_action() == named(1.0, 0.0)
 
 
-def test_a_lost_pulse_is_refused(transmitter):
+def test_a_lost_pulse_is_refused(transmitter, link):
     transmitter.connect()
     stretched = replace(status(1456, 120), receiver_steering_period_us=2 * 21316)
-    for Link.status in (status(None, 120), status(1456, None), None, stretched):
+    for link.latest.return_value in (status(None, 120), status(1456, None), None, stretched):
         with pytest.raises(LinkError):
             transmitter.get_action()
 
 
-def test_a_withheld_throttle_is_refused(transmitter):
+def test_a_withheld_throttle_is_refused(transmitter, link):
     transmitter.connect()
     withheld = partial(status, 1456, 170, pins=(1456, 120))
-    for Link.status in (withheld(1.0), withheld(1.4), status(1456, 170, 1.45), withheld(1.6), withheld(2.0)):
-        transmitter.get_action()  # not for long, each time
-    Link.status = withheld(2.2)
+    never_for_long = withheld(1.0), withheld(1.4), status(1456, 170, 1.45), withheld(1.6), withheld(2.0)
+    for link.latest.return_value in never_for_long:
+        transmitter.get_action()
+    link.latest.return_value = withheld(2.2)
     with pytest.raises(LinkError):
         transmitter.get_action()
 

@@ -21,9 +21,7 @@ RUBBISH = b"<>ADNQ 0123456789*ABCDEF\n\xff"
 
 @pytest.fixture
 def board():
-    board = Uno()
-    yield board
-    board.close()
+    return Uno()
 
 
 @pytest.fixture
@@ -110,4 +108,3 @@ def test_a_held_throttle_of_a_gamepad_stops():
     board.run_ms(400)
     last_us = max(e.at_us + e.pulse_us for e in pulses(board.events, "throttle") if e.pulse_us > 124)
     assert last_us - at_us <= 155_000  # after the last line began
-    board.close()

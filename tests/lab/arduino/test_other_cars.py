@@ -26,13 +26,6 @@ def told(board, car):
     assert board.status.result == "k", board.lines[-3:]
 
 
-def sticks_rest(board, car):
-    """Near neutral; receiver and Arduino have each a clock of their own."""
-    periods = {"steering_period_us": car.numbers[0] + 30, "throttle_period_us": car.numbers[4] + 30 * car.reverses}
-    board.transmitter(car.numbers[2] + 4, car.numbers[6] + 4, **periods)
-    board.run_ms(300)
-
-
 def has_periods(events, car):
     for pin, period_us in (("steering", car.numbers[0]), ("throttle", car.numbers[4])):
         assert all(abs(e.period_us - period_us) <= EDGE_US for e in pulses(events, pin)[1:])
@@ -44,10 +37,11 @@ def crawler():
     board = Uno()
     board.run_ms(60)
     told(board, CRAWLER)
-    sticks_rest(board, CRAWLER)
+    # Near neutral; receiver and Arduino have each a clock of their own.
+    board.transmitter(1504, 1504, (CRAWLER.numbers[0] + 30, CRAWLER.numbers[4] + 30))
+    board.run_ms(300)
     arm(board)
-    yield board
-    board.close()
+    return board
 
 
 def test_the_pins_are_car_ymls_over_the_whole_range(crawler):
@@ -94,7 +88,6 @@ def test_told_of_another_car_no_pulse_is_cut():
         assert abs(after[-1].pulse_us - car.numbers[6]) <= STEP_US
         assert all(us > 1400 for us in widths(board.events[start:], "steering"))
         assert board.now_us / 1000 - 35 <= board.status.uptime_ms <= board.now_us / 1000  # the clock's timer changed
-    board.close()
 
 
 # ---- the car that it keeps
@@ -116,7 +109,6 @@ def test_from_power_on_the_pins_have_the_neutral_of_the_car_that_was_told(car):
     on_pins(events, car.numbers[2], car.numbers[6], within_us=HALF_STEP_US)
     has_periods(events, car)
     assert any(line.endswith(f" p {car.id}") for line in board.lines)
-    board.close()
 
 
 def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
@@ -129,7 +121,6 @@ def test_a_board_that_keeps_no_car_sends_nothing_until_it_is_told():
         board.transmitter(1700, 500)
         assert not [e for e in board.run_ms(90) if e.channel >= 0], eeprom.hex()
         assert (board.status.missing, board.status.steering_us, board.status.throttle_us) == ("s", 0, 0)
-        board.close()
 
 
 def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
@@ -145,7 +136,6 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
         assert board.now_us < 250_000
     board.run_ms(100)
     assert board.eeprom == images[-1]  # and no more
-    board.close()
     between = {
         before[:at] + bytes([byte]) + before[at + 1 :]
         for before, after in pairwise(images)
@@ -159,5 +149,4 @@ def test_a_power_cut_while_it_writes_leaves_the_old_car_or_none():
         found = int(board.lines[0].split()[-1])
         car = next((car for car in (INVERTED, CRAWLER) if car.id == found), None)
         assert pins == ({(0, car.numbers[2]), (1, car.numbers[6])} if car else set()), eeprom.hex()
-        board.close()
     assert len(images) > 12

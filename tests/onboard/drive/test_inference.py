@@ -71,13 +71,9 @@ def test_plans_follow_the_frames():
     assert [0.25, 0.5] in states
 
 
-def raising(frame, state):
-    raise ZeroDivisionError("by zero")
-
-
 def test_what_must_not_drive_is_raised():
     wild = lambda *_: np.full((8, 2), 3.0, np.float32)  # noqa: E731
-    for predict, match in ((wild, "outside the range"), (raising, "ZeroDivisionError: by zero")):
+    for predict, match in ((wild, "outside the range"), (lambda *_: 1 / 0, "ZeroDivisionError")):
         with Planner(Frames(), policy_of(predict), Commanded()) as planner:
             until_raises(planner, PolicyError, match)
     with Planner(Frames(fails_after=3), policy_of(lambda frame, state: CHUNK), Commanded()) as planner:
@@ -118,14 +114,6 @@ def test_the_process_computes_what_the_policy_does(process, artifacts):
     state = np.array([0.1, 0.02], np.float32)
     assert process.predict(FRAME, state).tolist() == policy.predict_unclipped(FRAME, state).tolist()
     assert (process.rate_hz, process.chunk, process.manifest["mode"]) == (policy.rate_hz, policy.chunk, "static")
-
-
-def test_every_thread_of_the_process_is_confined(process):
-    assert process.unconfined == ""
-    for thread in Path(f"/proc/{process._process.pid}/task").iterdir():
-        status = (thread / "status").read_text()
-        assert "\nNoNewPrivs:\t1\n" in status and "\nSeccomp:\t2\n" in status
-    assert process.predict(FRAME, np.zeros(2)).shape == (process.chunk, 2)
 
 
 def test_an_answer_of_another_size_is_no_plan(process, monkeypatch):

@@ -8,6 +8,7 @@ import resource
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -85,12 +86,8 @@ def test_a_recording_that_was_cut_off_is_not_lost(tmp_path, caplog):
 
 def test_a_full_disk_at_the_end_costs_nothing(tmp_path, monkeypatch):
     """It removed all 8,460 rows of a drive."""
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
     with monkeypatch.context() as patch:
-        patch.setattr(csv.DictWriter, "writerows", full)
+        patch.setattr(csv.DictWriter, "writerows", Mock(side_effect=OSError(28, "No space left on device")))
         with pytest.raises(EpisodeError, match=r"No space left.*make room; `rover record .* --finish` keeps"):
             write(tmp_path / NAME, controls=5, frames=3)
         assert finish(tmp_path).exit_code == 1 and names_in(tmp_path) == [f".{NAME}.part"]
@@ -203,12 +200,9 @@ def test_a_row_or_a_picture_that_a_full_disk_took_half_of_is_taken_back(tmp_path
 
 
 def test_a_disk_that_cannot_sync_ends_the_recording(tmp_path, monkeypatch):
-    def broken(*_):
-        raise OSError(5, "Input/output error")
-
     writer = EpisodeWriter(tmp_path / NAME, About(), resolution=None)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "sync_disk", broken)
+        patch.setattr(module, "sync_disk", Mock(side_effect=OSError(5, "Input/output error")))
         patch.setattr(module, "SYNC_S", 0.5)
         writer.open()
         fill(writer)

@@ -212,15 +212,8 @@ def test_a_disk_that_hangs_holds_up_nothing(tmp_path, virtual, monkeypatch):
 # ---- a human drives
 
 
-def status_of(n, host_s=0.0):
-    """Every fourth throttle pulse is lost."""
-    throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
-    receiver = 1456 + n % 50 * 4, 21316, *throttle
-    return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", "-", 1456, 120, 238, *receiver, 0, 0, 0, 0)
-
-
 class FakeLink:
-    """An Arduino with a status every 20 ms of the clock."""
+    """An Arduino with a status every 20 ms of the clock, of which every fourth lacks the throttle's pulse."""
 
     port, car = "fake port", Car()
 
@@ -233,7 +226,10 @@ class FakeLink:
         if now > self.dies_s:
             raise LinkError("fake port: reading failed; is it still plugged in?")
         n = int(min(now, self.silent_s) / 0.02)
-        return status_of(n, self.start + 0.02 * n)
+        throttle = (None, None) if n % 4 == 3 else (120 + n % 5 * 4, 1016)
+        receiver = 1456 + n % 50 * 4, 21316, *throttle
+        host_s = self.start + 0.02 * n
+        return Telemetry(host_s, 7, 20 * n, 0, "-", State.MANUAL, "r", "-", 1456, 120, 238, *receiver, 0, 0, 0, 0)
 
 
 def record_a_human(folder, virtual, monkeypatch, **link):
