@@ -8,14 +8,12 @@ once. Nobody edits them by hand. A field without its JSON is empty, and a row wi
 
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import nbformat
 
 from balloon_world.learn import HOW
-from lab.a76.pi5 import DRIVING
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import parameters_in
@@ -50,20 +48,6 @@ def changed_pages(root: Path = ROOT) -> dict[Path, str]:
 
     new = {path: PLACE.sub(place, text) for path, text in texts.items()}
     return {path: text for path, text in new.items() if text != texts[path]}
-
-
-def _clock(root: Path) -> dict[tuple, str]:
-    """What each shape of a policy takes on the cores that drive, computed, as "low to high" with two digits each."""
-    times = {}
-    for row in _metrics(root / "results" / "clock", "clock")["policies"]:
-        if row["threads"] == DRIVING:
-            low, high = (float(f"{row[f'predicted_{end}_ms']:.2g}") for end in ("low", "high"))
-            times[_shape_of(row)] = f"{low:g} to {high:g}"
-    return times
-
-
-def _shape_of(row: Mapping[str, Any]) -> tuple:
-    return tuple(row.get(key) for key in ("width", "height", "decoder_layers", "feedforward", "backbone_channels"))
 
 
 def _line(fields: Row) -> str:
@@ -123,30 +107,6 @@ def _drives(root: Path) -> list[Row]:
     ]
 
 
-def _students(run: str, root: Path) -> list[Row]:
-    """The policy of that run, and what was distilled from it."""
-    rows = _metrics(root / "results" / run, "students")["students"]
-    actions = [key.removeprefix("recorded_").removesuffix("_pct") for key in rows[0] if key.startswith("recorded_")]
-    times = _clock(root)
-
-    def row(student: Mapping[str, Any]) -> Row:
-        shape = f"{student['width']}x{student['height']}, {student['decoder_layers']} x {student['feedforward']}"
-        if share := student.get("backbone_channels"):
-            shape += f", {share:.0%} of channels"
-        return (
-            f"{student['name']}: {shape}",
-            format(student["size_mb"], ".1f"),
-            f"{student['instructions_g']:.3g}",
-            times.get(_shape_of(student), ""),
-            str(student["hits"]),
-            f"{student['pushed_hits']} at {student['pushed_latency_ms']:.2g} ms",
-            " / ".join(f"{student[f'recorded_{action}_pct']:.2f}" for action in actions),
-        )
-
-    hits = (f"hit of {rows[0]['trials']}", f"pushed, hit of {rows[0]['pushed_trials']}")
-    return [("", "MB", "10^9 instructions", "ms", *hits, "error, %"), *map(row, rows)]
-
-
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
@@ -184,9 +144,6 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
     "drives": _drives,
-    "students": partial(_students, "full"),
-    "channels": partial(_students, "channels"),
-    "faster": partial(_students, "faster"),
     "learning": _learning,
     "judging": _judging,
     "parameters": _parameters,
