@@ -20,7 +20,10 @@ LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times", "reverse_on_a_car_without")
+REPAIRED = (
+    *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
+    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
+)
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -65,6 +68,7 @@ class Layout:
     state_order: tuple[int, ...] = (0, 1)
     action_order: tuple[int, ...] = (0, 1)
     image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
+    has_state: bool = True  # else no state is recorded, and it is the last action
 
     def words(self) -> str:
         """Describe the layout in one line, in which users should recognise their own car."""
@@ -75,6 +79,8 @@ class Layout:
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
         state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
+        if not self.has_state:
+            state = f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
 
@@ -237,7 +243,7 @@ class Recordings:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
-        drivers = _counted(s.driver for s in self.samples)
+        drivers = Counter(s.driver for s in self.samples)
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -246,16 +252,12 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
-            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
+            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
             "faults": [vars(f) for f in self.faults],
         }
-
-
-def _counted(words: Iterable[str]) -> dict[str, int]:
-    return dict(sorted(Counter(words).items()))
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:
