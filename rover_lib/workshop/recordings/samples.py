@@ -32,25 +32,28 @@ class Source:
     """Where recordings are, and what the user adds if the dataset itself does not say it.
 
     action_names: the names of its actions, in the order of its columns, and of its states too if those are unnamed.
-    cameras: the cameras that the policy looks through, in the policy's order.
+    cameras: the cameras that the policy looks through, in the policy's order. facts: what a policy's files do not say,
+    as checkpoint.facts reads it.
     """
 
     path: Path
     action_names: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
+    facts: str = ""
 
     @classmethod
-    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
+    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "", facts: str = "") -> "Source":
         """Make a source from a path and a command line's comma-separated names; a Source is returned unchanged."""
         if isinstance(path, Source):
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
-        return cls(Path(path), names, cameras)
+        return cls(Path(path), names, cameras, facts)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
         """The recordings that a run loaded, by load.json's params, or those `elsewhere`, with the same names."""
-        return cls.of(elsewhere or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
+        said = (given.get(name, "") for name in ("action_names", "camera", "facts"))
+        return cls.of(elsewhere or given["episodes"], *said)
 
 
 @dataclass(frozen=True)

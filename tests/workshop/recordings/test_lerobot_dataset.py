@@ -428,6 +428,10 @@ def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, da
     assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
     sample = right.recordings.samples[0]
     assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
+    # of a smaller copy: nothing but a trial tells, and no plan of random weights is the better one
+    edit(smaller / "config.json", lambda c: c["input_features"][seen].update(shape=[3, 36, 64]))
+    copy = load(smaller, datasets()).checkpoint
+    assert copy.config.image_sizes == ((36, 64),) and "tried on 8 frames" in copy.report["notes"][0]
     squeezed = replace(right.checkpoint.config, image_sizes=((36, 64),))
     write_lerobot(tmp_path / "ours", squeezed, right.checkpoint.weights, {})
     assert load(tmp_path / "ours", datasets()).checkpoint.config.image_sizes == ((36, 64),)  # squeezed on purpose
