@@ -104,7 +104,10 @@ class Checkpoint:
         if guessed and not given:  # our own recordings, which it was not trained on
             say = " ".join({"actions": "actions=steering,throttle", "rate": "rate=30"}[fact] for fact in guessed)
             what = f"{self.path}: nothing says its {' and '.join(guessed)}"
-            raise CheckpointError(what, remedy=f'{TRAINED_ON}, or say them as in {USER} "{say}"')
+            # Both orders: the user must not just copy one.
+            other = say.replace("steering,throttle", "throttle,steering")
+            options = " or ".join(f'{USER} "{each}"' for each in dict.fromkeys((say, other)))
+            raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say them in its numbers' order: {options}")
         if given and "rate" not in guessed and layout.rate_hz != c.rate_hz:
             found = f"recordings of {layout.rate_hz:g} frames a second"
             what = f"{self.path}: plans {c.rate_hz:g} steps a second"

@@ -71,7 +71,8 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
         for file in sorted(path.parent.iterdir()):
             if STATISTICS.fullmatch(file.name) and file.name not in facts.ignored:
                 raise facts.refusal(file.name, "beside it", "which may mean how its numbers are normalised")
-            if BESIDE.fullmatch(file.name) and isinstance(said := yaml.safe_load(read_plain(file, JSON_BYTES)), dict):
+            said = yaml.safe_load(read_plain(file, JSON_BYTES)) if BESIDE.fullmatch(file.name) else None
+            if isinstance(said, dict) and "input_features" not in said:  # that is LeRobot's, of another format
                 facts.read({k: v for k, v in said.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
     extra = {
         "epoch": plain(content.get("epoch")),
