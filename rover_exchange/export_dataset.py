@@ -100,11 +100,7 @@ def _parts(
         if sample.driver == NOBODY:
             left_out["nobody_drove"] += 1
             continue
-        try:
-            frame = sample.frame_bgr()
-        except EpisodeError:
-            left_out["pictures_not_whole"] += 1
-            continue
+        frame = sample.frame_bgr()
         if size is None and frame.shape != recorded:
             sizes = f"{frame.shape[1]}x{frame.shape[0]} among those of {recorded[1]}x{recorded[0]}"
             raise EpisodeError(f"{sample.frame_path}: a picture of {sizes}", remedy="export all at one --size")
@@ -132,7 +128,7 @@ def _write(
         robot_type="rover",
         use_videos=False,
     )
-    left_out: Counter[str] = Counter(pictures_not_whole=0, too_short=0, nobody_drove=0)
+    left_out: Counter[str] = Counter(too_short=0, nobody_drove=0)
     written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
     with warnings.catch_warnings():
         # numpy warns when LeRobot computes statistics of yes and no

@@ -9,6 +9,7 @@ begins, and at a hole in time; its first record gives the next one its state, bu
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, check_picture, nothing_usable
+from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, nothing_usable
+from rover_lib.workshop.recordings.pictures import Pictures
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
     Episode,
@@ -36,6 +38,8 @@ RATE_HZ = 20.0  # of records without a time: donkeycar's own
 MOST_BYTES = 10_000_000  # of a manifest or a catalog; JSON takes 25 times its size, and a thousand records 200 kB
 MOST_LINES, MOST_CATALOGS = 50_000, 10_000  # donkeycar's catalogs have a thousand lines
 MOST_INDEX, MOST_MS = 10**9, 10**14
+LEAST_STANDING = 5  # gaps; fewer may be a camera's
+WHOLE_PERIODS = 0.3  # a gap differs by less from whole periods
 OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
 
@@ -64,15 +68,17 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     records = _in_order(_read_records(tub, faults), throttle, tub, faults)
     steps_s = np.diff([r.time_s for r in records])
     usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
+    stands = _standing_parts(records, usual_s, tub, faults)
     runs: list[list[_Record]] = []
     for record in records:
-        if not runs or _ends(runs[-1][-1], record, min(HOLE_INTERVALS * usual_s, HOLE_S), tub, faults):
+        longest_s = HOLE_S if record.index in stands else min(HOLE_INTERVALS * usual_s, HOLE_S)
+        if not runs or _ends(runs[-1][-1], record, longest_s, tub, faults):
             runs.append([])
         runs[-1].append(record)
     episodes, sessions = [], set()
     for run in progress(runs, desc="reading the tub", total=len(runs)):
         first = run[0]
-        samples = _samples(run, tub, car, first.session not in sessions, faults)
+        samples = _samples(run, tub, car, first.session not in sessions, stands, faults)
         sessions.add(first.session)
         found_hz = frame_rate_hz(samples)
         if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
@@ -100,6 +106,25 @@ def _in_order(records: Iterable[_Record], throttle: str | None, tub: Path, fault
     return [replace(r, throttle=-r.throttle) for r in ordered] if throttle == "negated" else ordered
 
 
+def _standing_parts(records: list[_Record], usual_s: float, tub: Path, faults: Faults) -> set[int]:
+    """Return the records before which the car stood for some periods that were not recorded.
+
+    donkeycar by default records only while the throttle is on (AUTO_RECORD_ON_THROTTLE), and numbers on. So it was off
+    in the gaps of a tub without one record of throttle 0.
+    """
+    found = set()
+    for before, record in pairwise(records):
+        periods = (record.time_s - before.time_s) / usual_s
+        whole = periods > HOLE_INTERVALS and abs(periods - round(periods)) < WHOLE_PERIODS
+        if whole and record.index == before.index + 1 and record.session == before.session:
+            found.add(record.index)
+    if len(found) < LEAST_STANDING or not all(record.throttle for record in records):
+        return set()
+    note = "nothing was recorded while the throttle was off: AUTO_RECORD_ON_THROTTLE = False records whole drives"
+    faults.add(tub, "stood_unrecorded", note, len(found))
+    return found
+
+
 def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults: Faults) -> bool:
     """Whether an episode ends between two records."""
     if record.session != before.session:
@@ -114,9 +139,11 @@ def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults:
     return True
 
 
-def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faults) -> tuple[Sample, ...]:
-    """begins: whether the run begins its session, so that the car stood before it."""
-    images, home = tub / "images", tub.resolve()
+def _samples(
+    run: list[_Record], tub: Path, car: Car, begins: bool, stands: set[int], faults: Faults
+) -> tuple[Sample, ...]:
+    """begins: whether the run begins its session, so that the car stood before it. stands: see _standing_parts."""
+    images, home, pictures = tub / "images", tub.resolve(), Pictures(faults)
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
@@ -124,15 +151,18 @@ def _samples(run: list[_Record], tub: Path, car: Car, begins: bool, faults: Faul
     actions = np.stack([-car.left * np.array([r.angle for r in run]), throttle], 1).astype(np.float32)
     samples = []
     for k, record in enumerate(run):
-        if not check_picture(home, images / record.picture, record.picture, tub, faults) or (k == 0 and not begins):
+        if not pictures.size_of(home, images / record.picture, record.picture, tub) or (k == 0 and not begins):
             continue
         after = min(k + 1, len(run) - 1)
+        before = actions[k - 1] if k else np.asarray(NEUTRAL, np.float32)
+        if record.index in stands:
+            before = np.array([before[0], 0], np.float32)
         samples.append(
             Sample(
                 episode=f"{record.session} from {run[0].index}",
                 frame_path=images / record.picture,
                 time_s=record.time_s - run[0].time_s,
-                state=actions[k - 1] if k else np.asarray(NEUTRAL, np.float32),
+                state=before,
                 chunk=actions[[k, after]],
                 is_pad=np.array([False, after == k]),
                 row=k,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.cli.prepare import CHECKPOINT, EPISODES, size_option, with_source
+from rover_lib.cli.prepare import CHECKPOINT, EPISODES, FACTS, size_option, with_source
 from rover_lib.onboard.cli import FILE
 from rover_lib.onboard.kinds import Output
 from rover_lib.workshop.progress import terminal_bar
@@ -83,8 +83,9 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
 @click.command(short_help="Train a policy further, from takeovers.")
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
+@FACTS
 @of_a_recipe
-def finetune(checkpoint: Path, episodes: tuple[Path, ...], **options: Any) -> None:
+def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, **options: Any) -> None:
     """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
@@ -93,9 +94,10 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], **options: Any) -> No
     """
     from rover_learn.finetune import FinetuneRecipe, summary
     from rover_learn.finetune import finetune as learn_on
+    from rover_lib.workshop.recordings.samples import Source
 
-    recipe = FinetuneRecipe.of(**_recipes(options))
-    folder = learn_on(checkpoint, episodes, recipe=recipe, progress=terminal_bar(), **options)
+    recipe, sources = FinetuneRecipe.of(**_recipes(options)), [Source.of(each, facts=facts) for each in episodes]
+    folder = learn_on(checkpoint, sources, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
 
 

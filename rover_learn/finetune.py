@@ -133,14 +133,14 @@ def _open(
     checkpoint: Path | str, sources: Sequence[Source], progress: Progress
 ) -> tuple[Checkpoint, tuple[Recordings, ...]]:
     """Read the checkpoint and the recordings, and check that they belong together."""
-    parent = load_checkpoint(checkpoint)
+    parent = load_checkpoint(checkpoint, said=sources[0].facts)
     refuse_no_car(parent)
     places = [str(s.path.resolve()) if isinstance(s.path, Path) else str(s.path) for s in sources]
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     sync_s = params()["calibration"]["sync_s"]
     read = tuple(load_recordings(source, parent.config.chunk, sync_s, progress) for source in sources)
-    policies = [parent.recorded_as(recordings.layout) for recordings in read]
+    policies = [parent.recorded_as(recordings.layout, recordings.samples) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise TrainingError("the recordings name, order or time states and actions differently", found=places)
     refuse_no_car(policies[0])

@@ -30,6 +30,7 @@ Turned = tuple[tuple[str, str], ...]
 CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
 ACTION_NAMES = click.option("--action-names", default="", help="Of a LeRobotDataset's actions, if it has none.")
 CAMERA = click.option("--camera", default="", help="A LeRobotDataset's cameras that the policy uses, with commas.")
+FACTS = click.option("--facts", default="", help="Of a policy, if its files lack them: rate=20 actions=A,B size=WxH.")
 
 
 def with_source(command: Callable[..., None]) -> Callable[..., None]:
@@ -37,11 +38,12 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 
     @ACTION_NAMES
     @CAMERA
+    @FACTS
     @functools.wraps(command)
-    def called(*args: Any, episodes: Path, action_names: str, camera: str, **options: Any) -> None:
+    def called(*args: Any, episodes: Path, action_names: str, camera: str, facts: str, **options: Any) -> None:
         from rover_lib.workshop.recordings.samples import Source
 
-        return command(*args, episodes=Source.of(episodes, action_names, camera), **options)
+        return command(*args, episodes=Source.of(episodes, action_names, camera, facts), **options)
 
     return called
 
@@ -51,6 +53,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @click.argument("episodes", type=EPISODES, required=False)
 @ACTION_NAMES
 @CAMERA
+@FACTS
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")

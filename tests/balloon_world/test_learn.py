@@ -74,9 +74,9 @@ def test_who_drove_is_in_the_recording_and_what_they_did_in_the_world(tmp_path):
 
 
 def test_a_demonstration_is_a_whole_drive_or_cut(tmp_path):
-    assert demonstrate(tmp_path, 0, NotDrawn(CURVE), 1.0) == pytest.approx(1.0, abs=1 / 30)
-    whole_s = demonstrate(tmp_path, 1, NotDrawn(CURVE), 60.0)
-    cut, whole = load_recordings(tmp_path, 32).episodes
+    assert demonstrate(tmp_path / "cut", 0, NotDrawn(CURVE), 1.0) == pytest.approx(1.0, abs=1 / 30)
+    whole_s = demonstrate(tmp_path / "whole", 1, NotDrawn(CURVE), 60.0)
+    (cut,), (whole,) = (load_recordings(tmp_path / name, 32).episodes for name in ("cut", "whole"))
     assert len(cut.samples) == 30 and len(whole.samples) == pytest.approx(30 * whole_s, abs=1)
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from command import rover
+from test_episodes import kinds
 
 from rover_exchange.export_dataset import usual_rate_hz
 from rover_exchange.tub import read_tub
@@ -50,10 +51,6 @@ def tub(root, rows, deleted=(), per_catalog=30, lines=lambda rows: [json.dumps(r
     last = {"paths": paths, "current_index": len(rows), "max_len": per_catalog, "deleted_indexes": list(deleted)}
     (root / "manifest.json").write_text("\n".join(map(json.dumps, [[], [], {}, {"created_at": 1.0}, last])) + "\n")
     return root
-
-
-def kinds(recordings):
-    return {fault.kind: fault.count for fault in recordings.faults}
 
 
 @pytest.mark.parametrize(("car", "side"), [(Car(), 1), (LEFT, -1)])
@@ -111,6 +108,21 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     recordings = read_tub(tub(tmp_path / "tub", [*rows, *slower]), LEFT)
     assert kinds(recordings) == {"hole_in_time": 1, "another_rate": 20}
     assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
+
+
+@pytest.mark.parametrize(("off", "found"), [(0.0, {"hole_in_time"}), (0.3, {"stood_unrecorded"})])
+def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, off, found):
+    """donkeycar's default: indexes go on, and three real tubs fell into 305 to 1,300 pieces of three frames."""
+    rows, ms = records(80), 1_629_500_000_000
+    for i, row in enumerate(rows):
+        ms += 50 if i % 4 else 250
+        row.update({"_timestamp_ms": ms, "user/throttle": 0.3 if i else off})
+    recordings = read_tub(tub(tmp_path / "tub", rows), LEFT)
+    assert kinds(recordings).keys() == found
+    assert len(recordings.episodes) == (1 if off else 20)
+    if off:
+        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.3, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
+        assert "AUTO_RECORD_ON_THROTTLE" in recordings.faults[0].note
 
 
 def test_what_is_broken_is_counted(tmp_path):

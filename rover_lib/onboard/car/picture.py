@@ -25,6 +25,7 @@ MOST_PIXELS = 3840 * 2160  # 25 MB decoded
 MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a whole plain JPEG
 FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
 BASELINE, SCAN, RESTART_INTERVAL = 0xC0, 0xDA, 0xDD  # markers
+SMALL = {"min_height": 1, "min_width": 1, "min_factor": 8}  # all bytes are read, and few pixels computed
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 TABLES = (0xDB, 0xC4)  # markers of quantization and Huffman tables
 MOST_PIECES, MOST_TABLES = 10_000, 4000  # restart intervals, and bytes of tables: each interval is decoded with them
@@ -35,33 +36,51 @@ SQUEEZED = 0.05  # largest relative change of the aspect ratio; 432x240 instead 
 
 def decode_jpeg(data: bytes) -> np.ndarray:
     """Decode to (h, w, 3) uint8 BGR. Raises CameraError if it is not complete, or larger than any camera's."""
+    return _decode(data, "BGR")
+
+
+def check_jpeg(data: bytes) -> tuple[int, int]:
+    """Return a JPEG's (height, width). Raises CameraError for what decode_jpeg() refuses, in half of its time."""
+    _decode(data, "GRAY", **SMALL)
+    height, width = simplejpeg.decode_jpeg_header(data, strict=False)[:2]
+    return height, width
+
+
+def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
     if len(data) > MOST_BYTES:
         raise CameraError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
     try:
-        height, width = simplejpeg.decode_jpeg_header(data)[:2]
+        height, width = simplejpeg.decode_jpeg_header(data, strict=False)[:2]
         scans = data.count(b"\xff\xda")
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
             found = f"{width}x{height} pixels in {scans} scans"
             raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
         try:
-            return simplejpeg.decode_jpeg(data, "BGR")
+            return simplejpeg.decode_jpeg(data, colours, **scale)
         except ValueError as error:
-            _check_only_filler(data, error)
-            return simplejpeg.decode_jpeg(data, "BGR", strict=False)
-    except ValueError as error:
+            return simplejpeg.decode_jpeg(_check_only_filler(data, error), colours, strict=False, **scale)
+    except (ValueError, KeyError) as error:  # KeyError: a header without colours
         raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
 
 
-def _check_only_filler(data: bytes, warning: ValueError) -> None:
-    """Raise ValueError unless a JPEG is complete but for a few bytes of filler before markers.
+def _check_only_filler(data: bytes, warning: ValueError) -> bytes:
+    """Return a JPEG without filler in its header. Raises ValueError unless it is whole but for filler before markers.
 
     warning: the first one, and the only one that simplejpeg reports: what follows filler may be torn. So each restart
     interval is decoded as a picture of its own, where a warning about filler is the last one.
     """
     segments, scan_at = _segments(data)
+    header, scanned = b"\xff\xd8" + b"".join(segments), data[scan_at:]
+    data, filled = header + scanned, data[:scan_at]
+    if header != filled:
+        try:
+            simplejpeg.decode_jpeg(data, "GRAY", **SMALL)
+            return data
+        except ValueError as error:
+            warning = error
     named = {segment[1]: segment for segment in segments}
     if RESTART_INTERVAL not in named and _is_filler(warning) and "marker 0xd9" in str(warning):
-        return  # nothing follows it
+        return data  # nothing follows it
     if not ("extraneous bytes" in str(warning) and {RESTART_INTERVAL, BASELINE} <= named.keys()):
         raise warning
     interval, frame = int.from_bytes(named[RESTART_INTERVAL][4:6], "big"), named[BASELINE]
@@ -69,7 +88,7 @@ def _check_only_filler(data: bytes, warning: ValueError) -> None:
     sampling = frame[11::3] if parts > 1 else b"\x11"  # horizontal and vertical, four bits each
     block = 8 * max(s >> 4 for s in sampling), 8 * max(s & 15 for s in sampling)
     blocks = math.ceil(width / block[0]) * math.ceil(height / block[1])
-    scan, end, _ = data[scan_at:].partition(b"\xff\xd9")
+    scan, end, _ = scanned.partition(b"\xff\xd9")
     pieces = RESTART.split(scan)
     in_turn = all(marker[1] & 7 == i % 8 for i, marker in enumerate(RESTART.findall(scan)))
     tables = b"".join(segment for segment in segments if segment[1] in TABLES)
@@ -80,10 +99,11 @@ def _check_only_filler(data: bytes, warning: ValueError) -> None:
         row = [v.to_bytes(2, "big") for v in (block[1], block[0] * min(interval, blocks - i * interval))]
         picture = b"\xff\xd8", tables, frame[:5], *row, frame[9:], named[SCAN], piece, end
         try:
-            simplejpeg.decode_jpeg(b"".join(picture), "GRAY", min_height=1, min_width=1, min_factor=8)  # the fastest
+            simplejpeg.decode_jpeg(b"".join(picture), "GRAY", **SMALL)
         except ValueError as error:
             if not _is_filler(error):
                 raise
+    return data
 
 
 def _is_filler(warning: ValueError) -> bool:
@@ -92,9 +112,14 @@ def _is_filler(warning: ValueError) -> bool:
 
 
 def _segments(data: bytes) -> tuple[list[bytes], int]:
-    """Return a JPEG's segments up to the header of its first scan, and where the scan begins. Raises ValueError."""
+    """Return a JPEG's segments up to the header of its first scan, and where the scan begins. Raises ValueError.
+
+    Filler between them is left out.
+    """
     at, segments = 2, [b"  "]
     while segments[-1][1] != SCAN:
+        filled = data.find(b"\xff", at, at + FILLED_MOST + 1)
+        at = max(at, filled)
         while data[at : at + 2] == b"\xff\xff":
             at += 1
         segment = data[at : at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")]

@@ -2,26 +2,40 @@
 
 import hashlib
 import json
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import TWO_ACTIONS, Contents, check_limits, check_weights, tensor_bytes
-from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, read_lerobot
+from rover_lib.workshop.act import ACT, ActConfig, Affine, inputs_of, predictions
+from rover_lib.workshop.checkpoint.contents import (
+    TWO_ACTIONS,
+    Contents,
+    check_limits,
+    check_weights,
+    put_in_order,
+    tensor_bytes,
+)
+from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts, is_nothing
+from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer
-from rover_lib.workshop.recordings.samples import Layout
+from rover_lib.workshop.recordings.samples import Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
+FRAMES = 8  # on which two sizes of pictures are tried, in FP32
+BETTER = 0.5  # the share of the error that the less likely size must leave at most
+SAME, CLEARLY = 0.05, 1.0  # apart: statistics of the same actions; how much nearer those of another order are
+INFO, TRAINED_ON = "the recordings' meta/info.json", "give the dataset that it was trained on"
 
 
 @dataclass(frozen=True)
@@ -34,14 +48,17 @@ class Checkpoint:
     weights: dict[str, Tensor] = field(repr=False)
     sha256: str  # of the trainer's file, or of model.safetensors
     report: dict[str, Any] = field(repr=False)
+    facts: Facts = field(repr=False)
 
     @property
     def identity(self) -> str:
         """A hash, in hex digits, of everything that decides what the policy computes.
 
-        A trainer's file holds all of it. In LeRobot's folder the config and the statistics are beside the weights.
+        A trainer's file holds all of it, but what files beside it or the user say. In LeRobot's folder the config and
+        the statistics are beside the weights.
         """
-        if self.format == "trainer":
+        elsewhere = [by for _, by in self.facts.known.values() if by == USER or re.search(r"\.(json|ya?ml):", by)]
+        if self.format == "trainer" and not elsewhere:
             return self.sha256
         config = asdict(self.config)
         if config["sees_state"]:  # as nearly all do: their hashes are of before there were others
@@ -65,86 +82,139 @@ class Checkpoint:
             raise CheckpointError(what, found=trained, remedy=remedy)
         return replace(self, config=replace(self.config, image_sizes=((height, width),)))
 
-    def recorded_as(self, layout: Layout) -> "Checkpoint":
+    def recorded_as(self, layout: Layout, samples: Sequence[Sample] = ()) -> "Checkpoint":
         """Return the same policy with the recordings' names, order and rate of states and actions.
 
-        Only the dataset that LeRobot's checkpoints were trained on says what their numbers mean, in what order, and how
-        many steps of a plan make a second. The trainer's files and ours have [steering, throttle] and a known rate.
+        The trainer's files and ours say them. LeRobot's say nothing: then the dataset that they were trained on does,
+        if the statistics of the recorded samples do not deny it, or the user. samples: also to try sizes on.
 
-        Raises CheckpointError for another number of cameras, states or actions, and, for the trainer's files and ours,
-        for another rate or other names.
+        Raises CheckpointError for another number of cameras, states or actions, for another rate or names than the
+        policy's own, where nothing says the order or the rate, and for keys of LeRobot's config that may matter.
         """
-        c = self.config
+        c, facts, given = self.config, self.facts, layout.rate_hz is not None
         has = len(c.cameras), len(c.state_names) if c.sees_state else 0, len(c.action_names)
         recorded = len(layout.cameras), len(layout.state_names) if c.sees_state else 0, len(layout.action_names)
         if has != recorded:
             what = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
-            found = f"recordings of {', '.join(map(str, recorded))}"
-            raise CheckpointError(what, found=found, remedy="give the dataset that it was trained on")
-        if layout.rate_hz is None:  # our own recordings
-            return self
-        if self.format == "lerobot" and not self.report["written_here"]:
-            return self._reordered(layout, layout.rate_hz)
-        if layout.rate_hz != c.rate_hz:
+            raise CheckpointError(what, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
+        for key, value in facts.unknown.items():
+            if self.format == "lerobot" and not is_nothing(value):
+                raise facts.refusal(key, value, "and nobody here knows what that does")
+        guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
+        if guessed and not given:  # our own recordings, which it was not trained on
+            say = " ".join({"actions": "actions=steering,throttle", "rate": "rate=30"}[fact] for fact in guessed)
+            what = f"{self.path}: nothing says its {' and '.join(guessed)}"
+            # Both orders: the user must not just copy one.
+            other = say.replace("steering,throttle", "throttle,steering")
+            options = " or ".join(f'{USER} "{each}"' for each in dict.fromkeys((say, other)))
+            raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say them in its numbers' order: {options}")
+        if given and "rate" not in guessed and layout.rate_hz != c.rate_hz:
             found = f"recordings of {layout.rate_hz:g} frames a second"
             what = f"{self.path}: plans {c.rate_hz:g} steps a second"
             raise CheckpointError(what, found=found, remedy="give recordings of that rate")
         numbers = (("state", c.state_names, layout.state_names), ("action", c.action_names, layout.action_names))
-        for what, own, theirs in numbers[not c.sees_state :]:
-            if own == TWO_ACTIONS != theirs:
+        for what, own, theirs in () if "actions" in guessed else numbers[not c.sees_state :]:
+            if set(own) != set(theirs) and set(TWO_ACTIONS) in (set(own), set(theirs)):
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
-        return self
+        return self._reordered(layout, samples, guessed)._at_trained_size(layout, samples)
 
-    def _reordered(self, layout: Layout, rate_hz: float) -> "Checkpoint":
-        """Return LeRobot's policy with the order of numbers, the cameras and the rate of the dataset."""
+    def _reordered(self, layout: Layout, samples: Sequence[Sample], guessed: Sequence[str]) -> "Checkpoint":
+        """Return the policy with the order of numbers, and LeRobot's with the cameras and the rate of the dataset."""
+        c, notes = self.config, list[str]()
+        states, actions = layout.state_order, layout.action_order
+        if "actions" not in guessed:
+            if set(c.action_names) != set(layout.action_names):
+                return self
+            actions = tuple(c.action_names.index(name) for name in layout.action_names)
+            states = actions if len(c.state_names) == len(actions) else tuple(range(len(c.state_names)))
+        if not guessed and actions == tuple(range(len(actions))):
+            return self
+        config, weights = put_in_order(c, self.weights, states, actions)
+        # A state that is not looked at may as well be the car's.
+        state_names = TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
+        config = replace(config, state_names=state_names, action_names=layout.action_names)
+        known: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
+        if guessed:
+            same = self._varies_as(samples, actions, "actions" in guessed)
+            cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
+            if c.cameras != cameras:
+                notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
+            config = replace(
+                config, cameras=cameras, rate_hz=(layout.rate_hz if "rate" in guessed else None) or c.rate_hz
+            )
+            given: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}
+            known |= {fact: (given[fact], INFO if same else f"{GUESS}, {INFO}") for fact in guessed}
+        return replace(self._told(config, known, notes), weights=weights)
 
-        def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
-            return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
+    def _varies_as(self, samples: Sequence[Sample], order: tuple[int, ...], guessed: bool) -> bool:
+        """Whether its actions vary as the samples', whose places in the policy are `order`: then it learned from them.
 
-        c, notes = self.config, list(self.report["notes"])
-        cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
-        if c.cameras != cameras:
-            notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
-        # LeRobot never resizes, and a fine-tuned policy has its base's config.json. No weight depends on the size.
-        sizes = tuple(layout.image_sizes.get(name, size) for name, size in zip(cameras, c.image_sizes, strict=True))
-        for name, (h, w), (height, width) in zip(cameras, c.image_sizes, sizes, strict=True):
-            if (h, w) != (height, width):
-                note = f"config.json says {w}x{h} for {name}, and the recordings are {width}x{height}"
-                notes.append(f"{note}: LeRobot never resizes, so the policy sees {width}x{height}")
-        weights = dict(self.weights)
-        for name, order, axis in (
-            ("encoder_robot_state_input_proj.weight", layout.state_order, 1),
-            ("vae_encoder_robot_state_input_proj.weight", layout.state_order, 1),
-            ("vae_encoder_action_input_proj.weight", layout.action_order, 1),
-            ("action_head.weight", layout.action_order, 0),
-            ("action_head.bias", layout.action_order, 0),
-        ):
-            if name in weights:
-                weights[name] = weights[name].index_select(axis, torch.tensor(order))
-        config = replace(
-            c,
-            cameras=cameras,
-            image_sizes=sizes,
-            # A state that is not looked at may as well be the car's.
-            state_names=TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names,
-            action_names=layout.action_names,
-            rate_hz=rate_hz,
-            state_norm=reorder(c.state_norm, layout.state_order),
-            action_unnorm=reorder(c.action_unnorm, layout.action_order),
-        )
-        report = self.report | {"normalisation": normalisation(config), "notes": notes}
-        return replace(self, config=config, weights=weights, report=report)
+        Raises CheckpointError if that clearly denies the order of two actions that was guessed.
+        """
+        theirs = self.facts.value("action std")
+        if not samples or theirs is None:
+            return False
+        recorded = np.std([s.chunk[0].astype(np.float64) for s in samples], 0) + 1e-3
+        apart = np.abs(np.log((np.array(theirs)[list(order)] + 1e-3) / recorded))
+        turned = np.abs(np.log((np.array(theirs)[list(order[::-1])] + 1e-3) / recorded))
+        if guessed and len(order) == 2 and turned.sum() + CLEARLY < apart.sum():
+            other = ",".join(TWO_ACTIONS[i] for i in order[::-1])
+            what = f"{self.path}: the statistics of its actions deny the order in {INFO}"
+            raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say the policy's: {USER} actions={other}")
+        return bool(apart.max() < SAME)
+
+    def _at_trained_size(self, layout: Layout, samples: Sequence[Sample]) -> "Checkpoint":
+        """Return the policy at the size of pictures that it was trained at, where only config.json says one.
+
+        LeRobot never resizes, and a fine-tuned policy has its base's config.json, so the recordings' size may be right;
+        but one that was trained on a smaller copy needs that. No weight depends on it: both are tried on samples.
+        """
+        c, few = self.config, pick_evenly(samples, FRAMES)
+        recorded = dict(layout.image_sizes)
+        if few and not recorded and len(c.cameras) == 1:
+            recorded = {c.cameras[0]: few[0].frame_bgr().shape[:2]}
+        sizes = tuple(recorded.get(name, size) for name, size in zip(c.cameras, c.image_sizes, strict=True))
+        pairs = list(zip(c.image_sizes, sizes, strict=True))
+        squeezed = any(is_squeezed(there[::-1], own[::-1]) for own, there in pairs)
+        said = ", ".join(f"{w}x{h} for pictures of {width}x{height}" for (h, w), (height, width) in pairs)
+        if self.facts.source("size") != SIZE_OF_BASE or self.report["written_here"] or not layout.image_sizes:
+            note = f"{GUESS}, that pictures were squeezed in training too: {said}"
+            return self._told(c, {"size": (c.image_sizes[0], note)}, [note]) if squeezed else self
+        if sizes == c.image_sizes:
+            return self
+        config = replace(c, image_sizes=sizes)
+        own, other = (planned_error(replace(self, config=each), few) if few else 1.0 for each in (c, config))
+        # Nobody squeezes a copy, so then the recordings' size is likelier.
+        taken = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
+        note = f"{GUESS}: config.json says {said}; tried on {len(few)} frames, they are {own:.3g} and {other:.3g} off"
+        return self._told(taken, {"size": (taken.image_sizes[0], note)}, [note])
+
+    def _told(self, config: ActConfig, known: dict[str, tuple[Any, str]], notes: Sequence[str]) -> "Checkpoint":
+        """Return the same weights with another config, of which other facts are known."""
+        facts = copy(self.facts)
+        facts.known = facts.known | known
+        report = self.report | _words(config, facts) | {"notes": [*self.report["notes"], *notes]}
+        return replace(self, config=config, facts=facts, report=report)
 
 
-def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
+def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | None = None) -> float:
+    """The mean error of one action, or of all, against the recorded ones."""
+    plans = predictions(ACT(policy.config, policy.weights), [inputs_of(s, policy.config) for s in samples]).numpy()
+    known = ~np.stack([s.is_pad for s in samples])
+    errors = np.abs(plans - np.stack([s.chunk for s in samples]))[known]
+    return float((errors if action is None else errors[:, action]).mean())
+
+
+def load_checkpoint(path: Path | str, checked: str | None = None, said: str = "") -> Checkpoint:
     """Read and check a checkpoint.
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
     `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints.
 
     checked: the sha256 of weights that an earlier call has held against their config, for which LeRobot takes seconds.
+    said: what the user says of it by --facts.
 
     Raises CheckpointError, in one sentence, for a file that is missing or damaged, that would have to run code, or
     whose config and weights do not agree, and for a policy that this project cannot run.
@@ -152,11 +222,13 @@ def load_checkpoint(path: Path | str, checked: str | None = None) -> Checkpoint:
     path = Path(path)
     if path.is_dir():
         path = lerobot_folder(path)
-        return _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path))
+        facts = Facts(path, said)
+        return _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path, facts), facts)
     if not path.is_file():
         remedy = "give the trainer's .pth file, or LeRobot's pretrained_model folder"
         raise CheckpointError(f"{path}: not found, or neither a file nor a folder", remedy=remedy)
-    return _checkpoint(path, "trainer", path, checked, read_trainer(path))
+    facts = Facts(path, said)
+    return _checkpoint(path, "trainer", path, checked, read_trainer(path, facts), facts)
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -178,12 +250,21 @@ def normalisation(c: ActConfig) -> dict[str, str]:
     return words
 
 
-def _checkpoint(path: Path, kind: str, file: Path, checked: str | None, read: Contents) -> Checkpoint:
+def _words(c: ActConfig, facts: Facts) -> dict[str, Any]:
+    """What reports say of a policy beyond its weights, and who says it."""
+    known = {fact: f"{value} ({by})" for fact, (value, by) in facts.known.items()}
+    sizes = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(c.cameras, c.image_sizes, strict=True))
+    known |= {"size": f"{sizes} ({facts.source('size')})"}
+    guesses = [f"its {fact}: {by}" for fact, (_, by) in facts.known.items() if by.startswith(GUESS)]
+    return {"known": known, "guesses": guesses, "normalisation": normalisation(c)}
+
+
+def _checkpoint(path: Path, kind: str, file: Path, checked: str | None, read: Contents, facts: Facts) -> Checkpoint:
     """file: the weights'. Raises CheckpointError unless config and weights agree."""
     config, weights, extra = read
     check_limits(path, config)
     if (sha256 := sha256_of(file)) != checked:
-        check_weights(path, config, weights)
+        check_weights(path, config, weights, facts.unknown)
     acts = sum(weight.numel() for name, weight in weights.items() if not name.startswith("vae_"))
     report = {
         "format": kind,
@@ -192,7 +273,9 @@ def _checkpoint(path: Path, kind: str, file: Path, checked: str | None, read: Co
         "parameters": sum(weight.numel() for weight in weights.values()),
         "parameters_acting": acts,
         "int8_floor_mb": acts / 1e6,
-        "normalisation": normalisation(config),
+        **_words(config, facts),
         **extra,
     }
-    return Checkpoint(path, kind, config, weights, sha256, report)
+    if facts.unknown:
+        report["notes"].append(f"nobody here knows what these keys mean, not used: {quote_all(facts.unknown)}")
+    return Checkpoint(path, kind, config, weights, sha256, report, facts)

@@ -1,7 +1,8 @@
 """What both formats of a checkpoint hold: named weights, checked against what LeRobot builds of the config."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from rover_lib.onboard.artifact.manifest import RULES
 from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig
+from rover_lib.workshop.act import ACTIVATIONS, BACKBONES, ActConfig, Affine
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -22,8 +23,8 @@ TWO_ACTIONS = ("steering", "throttle")
 MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_limits` has seen them all
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
-MIGRATE = "convert one of before LeRobot 0.4 by its lerobot.processor.migrate_policy_normalization"
-IS_IT_WHOLE = f"is it an ACTPolicy of LeRobot, and whole? {MIGRATE}"
+IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
+RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 
 
 def name_weights(path: Path, state: dict[Any, Any]) -> dict[str, Tensor]:
@@ -44,6 +45,28 @@ def name_weights(path: Path, state: dict[Any, Any]) -> dict[str, Tensor]:
 def _is_weight(value: Any) -> bool:
     dense = isinstance(value, Tensor) and value.layout == torch.strided and value.device.type == "cpu"
     return dense and value.is_floating_point()  # a quantized tensor is not
+
+
+def put_in_order(
+    c: ActConfig, weights: dict[str, Tensor], states: tuple[int, ...], actions: tuple[int, ...]
+) -> tuple[ActConfig, dict[str, Tensor]]:
+    """Return the policy with its numbers in another order. states, actions: for each number, where it is now."""
+
+    def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+        return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
+
+    weights = dict(weights)
+    for name, order, axis in (
+        ("encoder_robot_state_input_proj.weight", states, 1),
+        ("vae_encoder_robot_state_input_proj.weight", states, 1),
+        ("vae_encoder_action_input_proj.weight", actions, 1),
+        ("action_head.weight", actions, 0),
+        ("action_head.bias", actions, 0),
+    ):
+        if name in weights:
+            weights[name] = weights[name].index_select(axis, torch.tensor(order))
+    c = replace(c, state_norm=reorder(c.state_norm, states), action_unnorm=reorder(c.action_unnorm, actions))
+    return c, weights
 
 
 def name_numbers(count: int, stem: str) -> tuple[str, ...]:
@@ -76,8 +99,10 @@ def check_limits(path: Path, c: ActConfig) -> None:
         raise CheckpointError(f"{path}: {name} must be {must}", found=found, remedy=CORRECT_IT)
 
 
-def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor]) -> None:
+def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown: Iterable[str] = ()) -> None:
     """Raise CheckpointError unless LeRobot's ACT of this config has exactly these weights, and all are finite.
+
+    unknown: keys that nobody here knows, and that may be why.
 
     What is checked first either cannot run here, or would let LeRobot build something without end.
     """
@@ -93,7 +118,9 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor]) -> None:
         what = f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)"
         found = f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}"
         raise CheckpointError(what, found=found, remedy=CORRECT_IT)
-    with as_checkpoint_error(path, CORRECT_IT):
+    keys = quote_all(unknown)
+    forked = f"; nobody here knows {keys}: train with LeRobot's own ACT if that asks for other weights" if keys else ""
+    with as_checkpoint_error(path, CORRECT_IT + forked):
         lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         what = f"{path}: NaN or Inf in {quote_all(bad)}"

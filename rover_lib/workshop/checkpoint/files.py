@@ -16,7 +16,8 @@ from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import atomic_path, sha256_of
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.act_config import imagenet, lerobot_act
-from rover_lib.workshop.checkpoint.lerobot import ORIGIN, RATE_HZ
+from rover_lib.workshop.checkpoint.contents import RATE_HZ
+from rover_lib.workshop.checkpoint.lerobot import ORIGIN
 
 Weights = dict[str, Tensor]
 DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too

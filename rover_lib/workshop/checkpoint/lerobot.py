@@ -4,6 +4,8 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
+import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,23 +19,28 @@ from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.checkpoint.contents import (
-    MIGRATE,
     MOST,
+    RATE_HZ,
     Contents,
     as_checkpoint_error,
     name_numbers,
     name_weights,
 )
+from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
 from rover_lib.workshop.recordings.samples import camera_names
 from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.processor.normalize_processor import NormalizerProcessorStep
 
-RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
-PRETRAINED = "pretrained_model"
+PRETRAINED, CONFIG = "pretrained_model", "config.json"
+WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
+SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
+IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
+Sizes = tuple[tuple[int, int], ...]
+SAME = {"chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
+NOT_OF_POLICY = {"policy", "optimizer", "scheduler", "eval", "wandb", "env"}  # sections of train_config.json
 ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
 # Each processor's file, and its step that normalises.
 INNER = "policy_preprocessor.json", "normalizer_processor"
@@ -55,20 +62,32 @@ def lerobot_folder(path: Path) -> Path:
     raise CheckpointError(what, found=quote_all(found) or "none", remedy=remedy)
 
 
-def read_lerobot(folder: Path) -> Contents:
-    """Raises CheckpointError for missing or damaged files, and for policies that this project cannot run."""
-    said, notes = _act_config(folder)
-    weights = name_weights(folder, _read_safetensors(folder / "model.safetensors"))
-    inner, outer = Normaliser(folder, *INNER, said), Normaliser(folder, *OUTER, said)
+def read_lerobot(folder: Path, facts: Facts) -> Contents:
+    """facts: what its files say is added. Raises CheckpointError for missing, damaged or other policies' files."""
+    raw = _of_today(folder, _read_json(folder / CONFIG))
+    said, notes = _act_config(folder, raw, facts)
+    tensors, inside = _read_safetensors(folder / WEIGHTS), dict[str, Tensor]()
+    # Statistics of before LeRobot had processors.
+    for key in () if (folder / OUTER[0]).exists() else (*said.input_features, *said.output_features):
+        for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
+            inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
+    weights = name_weights(folder, tensors)
+    inner, outer = Normaliser(folder, *INNER, said, inside), Normaliser(folder, *OUTER, said, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
     with as_checkpoint_error(folder):
+        sizes = _trained_sizes(folder, raw, tuple((f.shape[1], f.shape[2]) for f in images.values()), facts)
+        by = ORIGIN if origin else GUESS
+        if origin:
+            facts.say("rate", float(origin.get("rate_hz", RATE_HZ)), ORIGIN)
+        if (spread := outer.step.state_dict().get("action.std")) is not None:
+            facts.say("action std", spread.flatten().tolist(), OUTER[0])
         config = ActConfig(
             cameras=tuple(camera_names(images)),
-            image_sizes=tuple((f.shape[1], f.shape[2]) for f in images.values()),
+            image_sizes=sizes,
             state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
-            action_names=name_numbers(actions.shape[0], "action"),
-            chunk=said.chunk_size,
+            action_names=facts.default("actions", name_numbers(actions.shape[0], "action"), by),
+            chunk=facts.default("chunk", said.chunk_size, CONFIG),
             dim=said.dim_model,
             heads=said.n_heads,
             feedforward=said.dim_feedforward,
@@ -76,11 +95,11 @@ def read_lerobot(folder: Path) -> Contents:
             decoder_layers=said.n_decoder_layers,
             latent=said.latent_dim,
             vae_layers=said.n_vae_encoder_layers if said.use_vae else 0,
-            backbone=said.vision_backbone,
+            backbone=facts.default("backbone", said.vision_backbone, CONFIG),
             dilation=bool(said.replace_final_stride_with_dilation),
             pre_norm=said.pre_norm,
             activation=said.feedforward_activation,
-            rate_hz=float(origin.get("rate_hz", RATE_HZ)),
+            rate_hz=facts.default("rate", RATE_HZ, by),
             image_norm=tuple(
                 inner.affine(key, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for key in images
             ),
@@ -92,16 +111,61 @@ def read_lerobot(folder: Path) -> Contents:
     return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
 
 
-def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
+def _of_today(folder: Path, raw: dict[str, Any]) -> dict[str, Any]:
+    """Return a config.json of 2024, which had shapes and modes by feature and no type, as LeRobot writes it now."""
+    if "type" in raw or not {"input_shapes", "output_shapes"} <= raw.keys():
+        return raw
+    raw, mapping = raw | {"type": "act"}, dict[str, str]()
+    with as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
+        for part in ("input", "output"):
+            shapes, modes = raw.pop(f"{part}_shapes"), raw.pop(f"{part}_normalization_modes", {})
+            kinds = {k: "ACTION" if k == "action" else "VISUAL" if "image" in k else "STATE" for k in shapes}
+            raw[f"{part}_features"] = {k: {"type": kinds[k], "shape": shape} for k, shape in shapes.items()}
+            for key, kind in kinds.items():
+                mode = modes.get(key, "identity").upper()
+                if mapping.setdefault(kind, mode) != mode:
+                    raise ValueError(f"{mapping[kind]} and {mode} of {kind}")
+    return raw | {"normalization_mapping": mapping}
+
+
+def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Facts) -> Sizes:
+    """Return (height, width) of each camera's pictures in training: config.json's, or as train_config.json resizes.
+
+    Raises CheckpointError where the two deny each other, and for what was done to pictures and is not done here.
+    """
+    path = folder / TRAINED
+    said = _read_json(path) if path.exists() else {}
+    policy, dataset = said.get("policy") or {}, dict(said.get("dataset") or {})
+    for key in SAME & raw.keys() & policy.keys():
+        facts.say(key, raw[key], f"{CONFIG}:{key}")
+        facts.say(key, policy[key], f"{TRAINED}:policy.{key}")
+        facts.known.pop(key, None)
+    transforms = dataset.pop("image_transforms", None) or {}
+    rest = {k: v for k, v in said.items() if k not in NOT_OF_POLICY} | {"dataset": dataset}
+    facts.read(rest | {"policy": {k: v for k, v in policy.items() if k not in raw}}, f"{TRAINED}:", noted=False)
+    steps = [t for t in (transforms.get("tfs") or {}).values() if t.get("weight", 1) > 0]
+    for step in (t for t in steps if t["type"] not in WORDS["random"] and transforms.get("enable")):
+        to = step["kwargs"].get("size")
+        whole = all(is_whole(n, 1, MOST) for n in (to if isinstance(to, list) else [to]))
+        if step["type"] != "Resize" or not whole or len(steps) > transforms.get("max_num_transforms", 3):
+            what = f"{path}: some or all of its pictures were changed by {quote(step['type'])}"
+            raise CheckpointError(what, remedy=f"train without it, or if it is another training's, remove {TRAINED}")
+        from torchvision.transforms.v2 import Resize  # here, because it takes a second
+
+        sizes = tuple((h, w) for _, h, w in (Resize(to)(torch.empty(1, *size)).shape for size in sizes))
+        facts.known["size"] = sizes[0], f"{TRAINED}:dataset.image_transforms"
+    return (facts.value("size"),) if len(sizes) == 1 and facts.source("size") == USER else sizes
+
+
+def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> tuple["ACTConfig", list[str]]:
     """Return the config as LeRobot reads it, and notes on what it asks for beyond the network.
 
     Raises CheckpointError.
     """
-    path = folder / "config.json"
-    raw = _read_json(path)
+    path = folder / CONFIG
     if raw.get("type") != "act":
         what = f"{path}: policy type is {quote(raw.get('type'))}"
-        raise CheckpointError(what, remedy=f"only 'act' is known; {MIGRATE}")
+        raise CheckpointError(what, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
     with as_checkpoint_error(path):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
@@ -122,8 +186,9 @@ def _act_config(folder: Path) -> tuple["ACTConfig", list[str]]:
     if said.temporal_ensemble_coeff is not None:
         coefficient = f"temporal_ensemble_coeff is {said.temporal_ensemble_coeff}"
         notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
-    if unknown := sorted(set(raw) - known - {"type", "pretrained_revision"}):
-        notes.append(f"config.json has what no ACT of LeRobot 0.4 or 0.6 has, not used: {quote_all(unknown)}")
+    facts.default("size", cameras[0][1:], SIZE_OF_BASE)
+    with as_checkpoint_error(path):
+        facts.read({k: v for k, v in raw.items() if k not in {*known, "type", "pretrained_revision"}}, "")
     return said, notes
 
 
@@ -131,23 +196,20 @@ class Normaliser:
     """Says how LeRobot normalises each input, or each output, as an Affine.
 
     LeRobot silently leaves a feature without statistics as it is, and an output in standard deviations would become a
-    servo's pulse. file, step: INNER or OUTER. said: the policy's config, whose modes hold where there is no file.
+    servo's pulse. file, normalises: INNER or OUTER. said: the policy's config, whose modes hold where there is no file.
+    inside: statistics that lie among the weights, as LeRobot's step names them.
     """
 
-    def __init__(self, folder: Path, file: str, step: str, said: "ACTConfig"):
+    def __init__(self, folder: Path, file: str, normalises: str, said: "ACTConfig", inside: dict[str, Tensor]):
+        """Raises CheckpointError for a step that is unknown."""
         from lerobot.processor.normalize_processor import NormalizerProcessorStep
 
         self.where = folder / file
-        if self.where.exists():
-            self.step = self._read_step(folder, step)
-        else:
+        if not self.where.exists():
             features = {**said.input_features, **said.output_features}
             self.step = NormalizerProcessorStep(features, said.normalization_mapping)
-
-    def _read_step(self, folder: Path, normalises: str) -> "NormalizerProcessorStep":
-        """Return the step that normalises, as LeRobot reads it. Raises CheckpointError for a step that is unknown."""
-        from lerobot.processor.normalize_processor import NormalizerProcessorStep
-
+            self.step.load_state_dict(inside)
+            return
         content, read = _read_json(self.where), []
         with as_checkpoint_error(self.where):
             for step in content["steps"]:
@@ -162,7 +224,7 @@ class Normaliser:
         if len(read) != 1 or read[0].normalize_observation_keys is not None:
             what = f"{self.where}: normalises {len(read)} times, or some of the observations only"
             raise CheckpointError(what, remedy="copy the folder again, or train with LeRobot's own single step")
-        return read[0]
+        self.step = read[0]
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.

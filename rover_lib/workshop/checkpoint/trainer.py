@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.stage import plain
+from rover_lib.onboard.stage import plain, read_plain
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import imagenet
 from rover_lib.workshop.checkpoint.contents import (
@@ -22,19 +23,36 @@ from rover_lib.workshop.checkpoint.contents import (
     CORRECT_IT,
     IS_IT_WHOLE,
     MOST,
+    RATE_HZ,
     Contents,
     as_checkpoint_error,
     name_numbers,
     name_weights,
     tensor_bytes,
 )
+from rover_lib.workshop.checkpoint.facts import Facts
+from rover_lib.workshop.checkpoint.files import trainer_config
 from rover_lib.workshop.untrusted import quote, quote_all
 
-TRAINER_CAMERA = "cam_front"
+JSON_BYTES = 1_000_000  # a trainer's settings take some kB
+TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
+KNOWN = {"epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config"}
+KNOWN_CONFIG = {*trainer_config(ActConfig()), "learning_rate", "batch_size", "data_dir", "output_dir", "device", "seed"}
+KNOWN_CONFIG |= {"rate_hz", "use_vae", "origin"}
+OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
+# Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
+BESIDE = re.compile(r"(.*_)?(config|cfg|hparams|args)\.(json|ya?ml)")
+STATISTICS = re.compile(
+    r"(.*_)?(stats|norm|normali[sz]er|normali[sz]ation|scaler)\.(pth?|json|ya?ml|pkl|np[yz]|safetensors)"
+)
+SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 
 
-def read_trainer(path: Path) -> Contents:
-    """Raises CheckpointError for a file that is damaged, would run code, or lacks something."""
+def read_trainer(path: Path, facts: Facts) -> Contents:
+    """facts: what its keys and the files beside it say is added.
+
+    Raises CheckpointError for a file that is damaged, would run code, or lacks something.
+    """
     content = _read_pickle(path)
     for key in ("config", "model_state_dict"):
         if not isinstance(content, dict) or not isinstance(content.get(key), dict):
@@ -46,6 +64,16 @@ def read_trainer(path: Path) -> Contents:
     loss = content.get("best_val_loss")  # NaN if the training had diverged
     with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
+    facts.default("size", (raw.get("image_height"), raw.get("image_width")), "config.image_height")
+    with as_checkpoint_error(path):
+        facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
+        facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
+        for file in sorted(path.parent.iterdir()):
+            if STATISTICS.fullmatch(file.name) and file.name not in facts.ignored:
+                raise facts.refusal(file.name, "beside it", "which may mean how its numbers are normalised")
+            said = yaml.safe_load(read_plain(file, JSON_BYTES)) if BESIDE.fullmatch(file.name) else None
+            if isinstance(said, dict) and "input_features" not in said:  # that is LeRobot's, of another format
+                facts.read({k: v for k, v in said.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
     extra = {
         "epoch": plain(content.get("epoch")),
         "best_val_loss": loss,
@@ -53,11 +81,11 @@ def read_trainer(path: Path) -> Contents:
         "trainer_config": plain(raw),
         "notes": [],
     }
-    return _config(path, raw, weights), weights, extra
+    return _config(path, raw, weights, facts), weights, extra
 
 
-def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor]) -> ActConfig:
-    """Make the config from what the trainer's says, and from what only the shapes of the weights say."""
+def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor], facts: Facts) -> ActConfig:
+    """Make the config from the trainer's, from what only the shapes of the weights say, and from the facts."""
 
     def whole(key: str, default: int | None = None) -> int:
         if not is_whole(value := raw.get(key, default), 1, 1_000_000):
@@ -74,17 +102,19 @@ def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor]) -> ActC
     if raw.get("n_obs_steps", 1) != 1:
         what = f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}"
         raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
+    size = whole("image_height"), whole("image_width")
+    whole("rate_hz", default=30)
     return ActConfig(
         cameras=(TRAINER_CAMERA,),
-        image_sizes=((whole("image_height"), whole("image_width")),),
-        backbone=raw.get("vision_encoder", ""),
-        rate_hz=float(whole("rate_hz", default=30)),
+        image_sizes=(facts.default("size", size, "config.image_height"),),
+        backbone=facts.default("backbone", raw.get("vision_encoder", ""), "config.vision_encoder"),
+        rate_hz=facts.default("rate", RATE_HZ, OF_TRAINER),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
         state_names=name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
-        action_names=name_numbers(last("action_head.bias"), "action"),
+        action_names=facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER),
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
-        chunk=whole("chunk_size"),
+        chunk=facts.default("chunk", whole("chunk_size"), "config.chunk_size"),
         dim=whole("hidden_size"),
         heads=whole("n_heads"),
         feedforward=whole("feedforward_dim"),
@@ -121,4 +151,5 @@ def _read_pickle(path: Path) -> Any:
         # torch puts advice before it, to read it unsafely
         reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
         what = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
-        raise CheckpointError(what, remedy=COPY_AGAIN) from None
+        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if isinstance(e, zipfile.BadZipFile) else ""
+        raise CheckpointError(what, remedy=COPY_AGAIN + older) from None

@@ -13,8 +13,6 @@ sample, because its state would be invented.
 
 import csv
 import math
-import os
-import stat
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import simplejpeg
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
@@ -44,7 +41,10 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
+from rover_lib.workshop.recordings.copies import leave_out_copies
+from rover_lib.workshop.recordings.pictures import Pictures
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
+from rover_lib.workshop.recordings.strangers import name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What DATA has under these names, and where it is again with which columns.
@@ -52,8 +52,6 @@ TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_sample
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
-JPEG_HEAD = 1024  # in which most cameras say how large the picture is
-JPEG_TAIL = 64  # some recorders pad the end marker with zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +87,8 @@ def load_recordings(
     """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset.
 
     chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
-    what they affect is repaired or skipped. Here only the two ends of each picture are checked; `Sample.frame_bgr`
-    decodes it. Raises EpisodeError if nothing usable is left, with the most frequent reasons.
+    what they affect is repaired or skipped. Raises EpisodeError if nothing usable is left, with the most frequent
+    reasons.
     """
     source = Source.of(root)
     root = source.path
@@ -109,27 +107,30 @@ def load_recordings(
         if any((root / name).exists() for name in EPISODE_FILES):
             root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
         else:
-            folders = sorted(p for p in root.iterdir() if not p.name.startswith(".") and p.is_dir())
+            folders = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
     except OSError as e:
         remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
         raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
+    if not killed and (stranger := name_stranger(root)):
+        raise EpisodeError(f"{root}: {stranger[0]}, not our recordings", remedy=stranger[1])
     if not folders:
         remedy = finish if killed else "give the folder that holds episode_*"
         many = f"{len(killed)} killed ones" if killed else None
         raise EpisodeError(f"{root}: no episode folders in it", found=many, remedy=remedy)
     faults = Faults(root)
+    pictures = Pictures(faults)
     for part in killed:
         faults.add(part, "killed_recording", finish)
     listed = progress(folders, desc="reading episodes", total=len(folders))
-    episodes = tuple(episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults)))
+    loaded = [_load_episode(folder, chunk, sync_s, faults, pictures) for folder in listed]
+    episodes = tuple(episode for episode in loaded if episode)
+    pictures.keep()
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
-        if any(map(lerobot_dataset.is_dataset, folders)):
-            remedy = "give one LeRobotDataset of those in it"
         raise nothing_usable(f"{root}: no usable sample in {len(folders)} folder(s)", faults.listed(), remedy)
-    return Recordings(root, episodes, faults.listed(), source)
+    return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
 
 
 def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeError:
@@ -146,7 +147,7 @@ def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeEr
     return EpisodeError(f"{what} ({worst or 'empty'})", found=found or None, remedy="" if "; " in found else remedy)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults, pictures: Pictures) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         with limited_memory():
@@ -167,15 +168,14 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
     except EpisodeError as e:
         faults.add(folder, "no_formula", str(e))
         return None
-    frames = _read_frames(folder, frames_source, frame_rows, faults)
+    frames = _read_frames(folder, frames_source, frame_rows, faults, pictures)
     samples: tuple[Sample, ...] = ()
     if controls and frames:
         controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        faults.add(
-            folder, "nothing_usable", f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
-        )
+        note = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        faults.add(folder, "nothing_usable", note)
         return None
     return Episode(
         id=folder.name,
@@ -219,7 +219,7 @@ def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
     return list(table)
 
 
-def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
+def _read_frames(folder: Path, path: Path, rows: list, faults: Faults, pictures: Pictures) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
     frames: list[_Frame] = []
     numbers: set[float] = set()
@@ -239,11 +239,11 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             continue
         numbers.add(number)
         picture = folder / name.replace("\\", "/")
-        frames.append(_Frame(int(number), time_s, picture, check_picture(home, picture, name, path, faults)))
-    sizes = Counter(f.size for f in frames if f.size and any(f.size))
+        frames.append(_Frame(int(number), time_s, picture, pictures.size_of(home, picture, name, path)))
+    sizes = Counter(f.size for f in frames if f.size)
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
     for i, frame in enumerate(frames):
-        if frame.size and frame.size not in (usual, (0, 0)):
+        if frame.size and frame.size != usual:
             note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*frame.size, *usual)
             faults.add(frame.path, "another_size", note)
             frames[i] = replace(frame, size=None)
@@ -256,34 +256,6 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
     return kept
-
-
-def check_picture(home: Path, picture: Path, name: str, path: Path, faults: Faults) -> tuple[int, int] | None:
-    """Return a listed picture's (height, width), (0, 0) where it says them late; None unless it is there and whole.
-
-    home: the episode's folder, resolved. Only the picture's two ends are read.
-    """
-    try:
-        if Path(name).is_absolute() or not picture.resolve().is_relative_to(home):
-            faults.add(path, "path_leaves_folder", f"{quote(name)} is outside of the episode")
-            return None
-        if not stat.S_ISREG(picture.stat().st_mode):  # opening a pipe would wait for ever
-            raise ValueError
-        with picture.open("rb") as f:
-            head = f.read(JPEG_HEAD)
-            f.seek(max(f.seek(0, os.SEEK_END) - JPEG_TAIL, 0))
-            tail = f.read()
-    except (OSError, ValueError, RuntimeError):  # not there, unreadable, a name too long, a zero byte, a loop of links
-        faults.add(path, "frame_missing", f"{quote(name)} is listed but cannot be read")
-        return None
-    # cv2 would only warn of a file that was cut short, and return a picture.
-    if not head.startswith(b"\xff\xd8") or not tail.rstrip(b"\0").endswith(b"\xff\xd9"):
-        faults.add(picture, "broken_jpeg", f"not a whole JPEG: begins with {quote(head[:12])}, ends {quote(tail[-4:])}")
-        return None
-    try:
-        return simplejpeg.decode_jpeg_header(head)[:2]
-    except ValueError:
-        return 0, 0
 
 
 def _actions_of(

@@ -20,7 +20,10 @@ LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = ("serial_burst", "unsorted_control_times", "unsorted_frame_times", "reverse_on_a_car_without")
+REPAIRED = (
+    *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
+    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
+)
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -29,25 +32,28 @@ class Source:
     """Where recordings are, and what the user adds if the dataset itself does not say it.
 
     action_names: the names of its actions, in the order of its columns, and of its states too if those are unnamed.
-    cameras: the cameras that the policy looks through, in the policy's order.
+    cameras: the cameras that the policy looks through, in the policy's order. facts: what a policy's files do not say,
+    as checkpoint.facts reads it.
     """
 
     path: Path
     action_names: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
+    facts: str = ""
 
     @classmethod
-    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "") -> "Source":
+    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "", facts: str = "") -> "Source":
         """Make a source from a path and a command line's comma-separated names; a Source is returned unchanged."""
         if isinstance(path, Source):
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
-        return cls(Path(path), names, cameras)
+        return cls(Path(path), names, cameras, facts)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
         """The recordings that a run loaded, by load.json's params, or those `elsewhere`, with the same names."""
-        return cls.of(elsewhere or given["episodes"], given.get("action_names", ""), given.get("camera", ""))
+        said = (given.get(name, "") for name in ("action_names", "camera", "facts"))
+        return cls.of(elsewhere or given["episodes"], *said)
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,7 @@ class Layout:
     state_order: tuple[int, ...] = (0, 1)
     action_order: tuple[int, ...] = (0, 1)
     image_sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
+    has_state: bool = True  # else no state is recorded, and it is the last action
 
     def words(self) -> str:
         """Describe the layout in one line, in which users should recognise their own car."""
@@ -75,6 +82,8 @@ class Layout:
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
         state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
+        if not self.has_state:
+            state = f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
 
@@ -237,7 +246,7 @@ class Recordings:
 
     def summary(self) -> dict[str, Any]:
         """Return counts, ranges and faults in plain JSON types, for load.json."""
-        drivers = _counted(s.driver for s in self.samples)
+        drivers = Counter(s.driver for s in self.samples)
         return {
             "episodes": len(self.episodes),
             "frames": sum(e.frames for e in self.episodes),
@@ -246,16 +255,12 @@ class Recordings:
             "duration_s": sum(e.duration_s for e in self.episodes),
             "layout": self.layout.words(),
             "labels": sorted({e.label for e in self.episodes}),
-            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in drivers.items()},
+            "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
             "faults_by_kind": self.faults_by_kind(),
             "faults": [vars(f) for f in self.faults],
         }
-
-
-def _counted(words: Iterable[str]) -> dict[str, int]:
-    return dict(sorted(Counter(words).items()))
 
 
 def camera_names(keys: Iterable[str]) -> dict[str, str]:

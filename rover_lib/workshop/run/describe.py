@@ -50,7 +50,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
-    checkpoint = load_checkpoint(path)
+    checkpoint = load_checkpoint(path, said=source.facts)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}
 
 

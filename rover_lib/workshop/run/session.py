@@ -41,14 +41,15 @@ def load(
     of `load_checkpoint`. Raises CheckpointError and EpisodeError.
     """
     p = params()["calibration"]
-    policy = load_checkpoint(checkpoint, checked)
     source = Source.of(episodes)
+    policy = load_checkpoint(checkpoint, checked, source.facts)
     theirs = policy.config.cameras
     if policy.format == "lerobot" and source.cameras in ((), theirs):  # a trainer's file does not name its camera
         source = replace(source, cameras=theirs if is_dataset(source.path) else ())
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
-    recorded = in_todays_units(policy.recorded_as(recordings.layout), recordings, parts.calibration)
+    recorded = policy.recorded_as(recordings.layout, recordings.samples)
+    recorded = in_todays_units(recorded, recordings, parts.calibration)
     check_limits(policy.path, recorded.config)  # again, because its rate and names are the recordings'
     return Opened(recorded, recordings, parts)
 

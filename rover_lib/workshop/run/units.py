@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
-from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation
+from rover_lib.workshop.act import Affine
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation, planned_error
 from rover_lib.workshop.recordings.controls import OLD, Formula
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
@@ -30,14 +30,15 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
         return policy
     car = car_of(recordings.samples)
     recorded = {n: OLD[n] for e in recordings.episodes for n in e.formulas}
+    # Throttle tells the two readings apart: standing still is 0 in one of them only.
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
         tried.append(OLD)
     few = pick_evenly(samples, FRAMES)
-    best, least = policy, BETTER * _error(policy, few) if tried else 0.0
+    best, least = policy, BETTER * planned_error(policy, few, 1) if tried else 0.0
     for formulas in tried:
         converted = _in_units_of(policy, car, formulas)
-        if (error := _error(converted, few)) <= least:
+        if (error := planned_error(converted, few, 1)) <= least:
             best, least = converted, error
     return best
 
@@ -65,10 +66,3 @@ def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) 
 
 def _affine(scale: np.ndarray, shift: np.ndarray) -> Affine:
     return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
-
-
-def _error(policy: Checkpoint, samples: Sequence[Sample]) -> float:
-    """The mean error of throttle, which tells the two readings apart: standing still is 0 in one of them only."""
-    plans = predictions(ACT(policy.config, policy.weights), [inputs_of(s, policy.config) for s in samples]).numpy()
-    known = ~np.stack([s.is_pad for s in samples])
-    return float(np.abs(plans - np.stack([s.chunk for s in samples]))[known][:, 1].mean())

@@ -15,7 +15,7 @@ from hostile import HOSTILE, WHOLE, jpeg, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rover_lib.onboard.car.picture import block_sums, brightness, decode_jpeg, read_jpeg
+from rover_lib.onboard.car.picture import block_sums, brightness, check_jpeg, decode_jpeg, read_jpeg
 from rover_lib.onboard.errors import CameraError
 
 MOST_MB, MOST_S = 300, 5
@@ -60,7 +60,9 @@ FILLED = re.compile(rb"(?=\xff[\xd0-\xd7])").sub(b"UU", hostile.RESTARTS, 3)  # 
 
 def test_filler_before_markers_is_no_damage():
     assert FILLED != hostile.RESTARTS
-    for filled in (FILLED, hostile.RESTARTS[:-2] + b"UUUU\xff\xd9", WHOLE[:-2] + b"UU\xff\xd9"):
+    in_header = WHOLE.replace(b"\xff\xc0", b"UU\xff\xc0", 1)
+    assert not is_taken(hostile.cut(in_header)) and not is_taken(in_header[:12000] + bytes(4000) + in_header[16000:])
+    for filled in (FILLED, hostile.RESTARTS[:-2] + b"UUUU\xff\xd9", WHOLE[:-2] + b"UU\xff\xd9", in_header):
         assert (decode_jpeg(filled) == decode_jpeg(hostile.RESTARTS if filled.count(b"\xff\xd0") else WHOLE)).all()
 
 
@@ -76,7 +78,9 @@ def test_what_is_torn_after_filler_is_torn(from_end, missing):
 
 def is_taken(data):
     with suppress(CameraError):
-        return decode_jpeg(data) is not None
+        return decode_jpeg(data).shape[:2] == check_jpeg(data)
+    with pytest.raises(CameraError):
+        check_jpeg(data)
 
 
 def test_a_file_that_is_none(tmp_path):

@@ -202,7 +202,7 @@ def in_step(change):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda c: c.pop("type"), "migrate_policy_normalization"),
+        (lambda c: c.pop("type"), 'write "type": "act" into it'),
         (lambda c: c.update(feedforward_activation="glu"), "'glu'"),
         (lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
         (lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
@@ -315,11 +315,11 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
     assert load_checkpoint(copied).config.state_norm is None
 
 
-def test_statistics_in_the_weights_are_refused_with_lerobots_conversion(copied):
+def test_statistics_in_the_weights_beside_processors_are_refused(copied):
     """As LeRobot wrote them before it had processors."""
     weights = load_file(copied / "model.safetensors")
     save_file(weights | {"unnormalize_outputs.buffer_action.std": torch.ones(2)}, copied / "model.safetensors")
-    assert "migrate_policy_normalization" in refused(copied)
+    assert "remove policy_p*processor.json" in refused(copied)
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,12 @@
 import functools
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import hostile
 import numpy as np
 import pyarrow
 import pytest
@@ -13,6 +16,7 @@ import torch
 from click.testing import CliRunner
 from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
 from pyarrow import parquet
+from recorded import edit_json as edit
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -74,9 +78,10 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (info(codebase_version="v2.1"), "LeRobot's own convert_dataset_v21_to_v30"),
-        (info(codebase_version="v4.0"), "only v3"),
+        (info(codebase_version="v1.6"), "only v2 and v3"),
+        (info(codebase_version="v4.0"), "only v2 and v3"),
         (info(fps=0), "frames per second"),
+        (info(codebase_version="v2.1", features={}), "no features, and meta/episodes_stats.jsonl is missing"),
         ("[" * 100_000, "JSON"),
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (features(front=None), "has no camera"),
@@ -84,9 +89,9 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
         (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
-        (features(action=TWO | {"names": {"steering": 1, "throttle": 0}}), "'action' does not name its 2 numbers"),
+        (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
-        (features(), "has no meta/tasks.parquet"),
+        (features(), "has no meta/episodes"),
         (features(**{"observation.images.x/../../../outside": info()["features"]["action"]}), "plain features"),
         (features(**{f"f{i}": TWO for i in range(40_000)}), "plain features"),
         (info(data_path="../elsewhere/{chunk_index}"), "plain features"),
@@ -94,11 +99,6 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 )
 def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
     assert says in refused(written(tmp_path, content))
-
-
-def test_a_folder_of_datasets_is_recognised(tmp_path):
-    written(tmp_path / "a", info())
-    assert "give one LeRobotDataset" in refused(tmp_path)
 
 
 def test_a_camera_that_is_not_there_is_refused(tmp_path):
@@ -116,25 +116,22 @@ def test_our_own_recordings_say_their_names_themselves(tmp_path):
 # ---- what LeRobot's writer made ------------------------------------------------------------------------------------
 
 
-def make(root, kind="image", actions=CAR, states=CAR, fps=FPS, value=None):
-    """EPISODES of FRAMES by LeRobot's writer. actions, states: the features' names. value: of every action."""
+def make(root, kind):
+    """EPISODES of FRAMES by LeRobot's writer."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    row = {"dtype": "float32", "shape": (2,)}
-    features = {
-        CAM: {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]},
-        "observation.state": row | {"names": list(states)},
-        "action": row | {"names": list(actions)},
-    }
+    row = {"dtype": "float32", "shape": (2,), "names": list(CAR)}
+    picture = {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]}
+    features = {CAM: picture, "observation.state": row, "action": row}
     video = {"use_videos": kind == "video", "video_backend": "pyav"}
-    made = LeRobotDataset.create("local/made", fps, features, root=root, **video)
+    made = LeRobotDataset.create("local/made", FPS, features, root=root, **video)
     rng = np.random.default_rng(0)
     for episode in range(EPISODES):
         for _ in range(FRAMES + episode):
             row = {
                 CAM: smooth_frame(rng, *SIZE),
                 "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
-                "action": rng.uniform(0, 0.5, 2).astype(np.float32) if value is None else np.float32(value),
+                "action": rng.uniform(0, 0.5, 2).astype(np.float32),
                 "task": f"hit the {episode}. balloon",
             }
             made.add_frame(row)
@@ -150,9 +147,7 @@ def datasets(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(huggingface.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
-        yield functools.cache(
-            lambda kind="image", **options: make(tmp_path_factory.mktemp("made") / kind, kind, **options)
-        )
+        yield functools.cache(lambda kind="image": make(tmp_path_factory.mktemp("made") / kind, kind))
 
 
 @pytest.fixture
@@ -191,30 +186,6 @@ def test_the_names_of_a_dataset_decide_which_column_is_throttle(tmp_path):
     assert (found.action_names, found.action_order, found.state_order) == (CAR, (1, 0), (0, 1))
 
 
-@pytest.mark.slow
-def test_names_decide_the_order_or_the_user_does(datasets, tmp_path):
-    straight = load_recordings(datasets(), CHUNK).samples[5]
-    swapped = straight.chunk[:, ::-1]
-    other = shutil.copytree(datasets(), tmp_path / "other")
-    content = json.loads((other / "meta/info.json").read_text())
-    for names in ({"motors": SWAPPED}, None):
-        for key in ("action", "observation.state"):
-            content["features"][key]["names"] = names
-        content["features"][CAM]["shape"] = [3, *SIZE]  # colours first
-        written(other, content)
-        if names:
-            recordings = load_recordings(other, CHUNK)
-            assert "action: steering (column 1), throttle (column 0)" in recordings.layout.words()
-            assert np.array_equal(recordings.samples[5].state, straight.state[::-1])
-            assert np.array_equal(recordings.samples[5].chunk, swapped)
-            assert np.array_equal(recordings.samples[5].frame_bgr(), straight.frame_bgr())
-    assert "--action-names steering,throttle" in refused(other)
-    for said, chunk in (("throttle, steering", swapped), ("steering,throttle", straight.chunk)):
-        assert np.array_equal(load_recordings(Source.of(other, said), CHUNK).samples[5].chunk, chunk)
-    result = CliRunner().invoke(main, ["inspect", str(other), "--action-names", "throttle,steering"])
-    assert result.exit_code == 0 and "steering (column 1)" in result.output
-
-
 DATA, EPISODES_AT = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 VIDEO_AT = f"videos/{CAM}/chunk-000/file-000.mp4"
 
@@ -241,11 +212,11 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
 @pytest.mark.parametrize(
     ("kind", "file", "damage", "says"),
     [
-        ("image", DATA, lambda p: p.unlink(), "has no data/*/*.parquet"),
-        ("image", EPISODES_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "LeRobot cannot read it"),
+        ("image", DATA, lambda p: p.unlink(), "has no data/chunk-000/file-000.parquet"),
+        ("image", EPISODES_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be read"),
         ("video", VIDEO_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be decoded"),
         # what LeRobot accepts without a word
-        ("image", EPISODES_AT, column("dataset_to_index", 33), "belong together"),
+        ("image", EPISODES_AT, column("length", 33), "belong together"),
         ("image", DATA, column("frame_index", 1), "belong together"),
         ("image", DATA, column("timestamp", 2.0), "frames come at another rate"),
         ("image", DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "neither PNG nor JPEG"),
@@ -262,29 +233,207 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
     assert says in refused(root)
 
 
-def edit(path, change):
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+# ---- what others write in another way ------------------------------------------------------------------------------
+
+
+def table(path, change):
+    parquet.write_table(change(parquet.read_table(path)), path)
+
+
+def language(root):
+    """A column of LeRobot 0.6, whose type 0.4 does not know."""
+    said = [[{"role": "assistant", "content": "drive"}]] * 33
+    table(root / DATA, lambda t: t.append_column("language_persistent", pyarrow.array(said)))
+    more = {"language_persistent": {"dtype": "language", "shape": [1], "names": None}}
+    edit(root / "meta/info.json", lambda c: c["features"].update(more))
+
+
+def openpi(root):
+    words = {"action": "actions", "observation.state": "state", CAM: "image"}
+    table(root / DATA, lambda t: t.rename_columns([words.get(c, c) for c in t.column_names]))
+    edit(root / "meta/info.json", lambda c: c.update(features={words.get(k, k): v for k, v in c["features"].items()}))
+
+
+def leftovers(root):
+    """A Mac's, Windows', notebooks', and a copy beside the file."""
+    for name in ("._file-000.parquet", ".DS_Store", "Thumbs.db", "desktop.ini", "file-000 (1).parquet"):
+        for folder in ("data/chunk-000", "meta/episodes/chunk-000", "data/.ipynb_checkpoints", "meta"):
+            (root / folder).mkdir(exist_ok=True)
+            (root / folder / name).write_bytes(b"\0\5\26\7" + bytes(60))
+
+
+def version_2(root):
+    """As LeRobot of early 2025 wrote it, and without the statistics that its converter needs."""
+    rows, episodes = parquet.read_table(root / DATA), parquet.read_table(root / EPISODES_AT).to_pylist()
+    for i, episode in enumerate(episodes):
+        part = rows.slice(episode["dataset_from_index"], episode["length"])
+        parquet.write_table(part, root / f"data/chunk-000/episode_{i:06d}.parquet")
+    for name, keys in (("episodes", ("episode_index", "length")), ("tasks", ("task_index", "task"))):
+        told = episodes
+        if name == "tasks":
+            told = [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
+        lines = [json.dumps({key: row[key] for key in keys}) for row in told]
+        (root / f"meta/{name}.jsonl").write_text("\n".join(lines) + "\n")
+    path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    edit(root / "meta/info.json", lambda c: c.update(codebase_version="v2.1", data_path=path))
+
+
+def tasks_in_a_column(root):
+    words = [f"hit the {i}. balloon" for i in range(EPISODES)]
+    parquet.write_table(pyarrow.table({"task_index": range(EPISODES), "task": words}), root / "meta/tasks.parquet")
+
+
+OTHERS_WAYS = [
+    (language, set()),
+    (lambda root: table(root / DATA, lambda t: t.append_column("__index_level_0__", pyarrow.array(range(33)))), set()),
+    (tasks_in_a_column, set()),
+    (leftovers, set()),
+    (openpi, set()),
+    (lambda root: column("dataset_to_index", 10, 2)(root / EPISODES_AT), {"scrambled_index"}),
+    (version_2, {"no_statistics"}),
+    (lambda root: edit(root / "meta/info.json", lambda c: c["features"]["action"].update(names=[[*CAR]])), set()),
+    (lambda root: edit(root / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])), set()),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("change", "faults"), OTHERS_WAYS)
+def test_what_others_write_in_another_way_is_read_the_same(datasets, copied, change, faults):
+    root, right = copied(), load_recordings(datasets(), CHUNK)
+    change(root)
+    found = load_recordings(root, CHUNK)
+    assert {fault.kind for fault in found.faults} == faults
+    assert [e.label for e in found.episodes] == [e.label for e in right.episodes]
+    for ours, theirs in zip(found.samples, right.samples, strict=True):
+        assert np.array_equal(ours.state, theirs.state) and np.array_equal(ours.chunk, theirs.chunk)
+        assert np.array_equal(ours.frame_bgr(), theirs.frame_bgr())
+
+
+def named(**names):
+    def change(root):
+        said = {"action": names["action"], "observation.state": names["state"]}
+        edit(root / "meta/info.json", lambda c: [c["features"][key].update(names=said[key]) for key in said])
+
+    return change
+
+
+def second_camera(root):
+    table(root / DATA, lambda t: t.append_column("observation.images.left", t.column(CAM)))
+    edit(root / "meta/info.json", lambda c: c["features"].update({"observation.images.left": c["features"][CAM]}))
+
+
+def other_key(root):
+    edit(root / "meta/info.json", lambda c: c["features"].update(act=c["features"].pop("action")))
+
+
+def as_printed(message, root, whole):
+    """Do what a refusal's remedy says, and return what is to be read then."""
+    if given := re.search(r"--action-names ([a-z_0-9]+,[a-z_0-9]+)", message.partition(";")[2]):
+        return Source.of(root, given[1])
+    if "--camera NAME" in message:
+        return Source.of(root, camera=re.search(r"found (\w+),", message)[1])
+    if found := re.search(r"such as (.+)$", message):
+        return Path(found[1])
+    if "name its column 'action'" in message:
+        edit(root / "meta/info.json", lambda c: c["features"].update(action=c["features"].pop("act")))
+    elif "correct the rate" in message:
+        edit(root / "meta/info.json", lambda c: c.update(fps=FPS))
+    else:
+        assert message.endswith("copy the whole dataset again")
+        shutil.rmtree(root)
+        shutil.copytree(whole, root)
+    return root
+
+
+TRIGGERS = [
+    (named(action=None, state=None), (0, 1)),
+    (named(action={"motors": [*SWAPPED]}, state=None), (1, 0)),
+    (named(action=None, state=[[*SWAPPED]]), (1, 0)),
+    (named(action=["Throttle", "Steering"], state=["Throttle", "Steering"]), (1, 0)),
+    (named(action=["linear.vel", "angular.vel"], state=["linear.vel", "angular.vel"]), (1, 0)),
+    (second_camera, (0, 1)),
+    (other_key, (0, 1)),
+    (lambda root: edit(root / "meta/info.json", lambda c: c.update(fps=30)), (0, 1)),
+    (lambda root: (root / DATA).unlink(), (0, 1)),
+    (lambda root: (root / EPISODES_AT).write_bytes(b"PAR1"), (0, 1)),
+    (column("length", 33), (0, 1)),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("trigger", "order"), TRIGGERS)
+def test_the_printed_remedy_works_on_what_it_is_printed_for(datasets, copied, trigger, order):
+    root = copied()
+    trigger(root / EPISODES_AT if trigger is TRIGGERS[-1][0] else root)
+    source, straight = as_printed(refused(root), root, datasets()), load_recordings(datasets(), CHUNK).samples[5]
+    recordings = load_recordings(source, CHUNK)
+    assert recordings.layout.action_order == order and len(recordings.samples) == 33
+    assert np.array_equal(recordings.samples[5].chunk, straight.chunk[:, order])
+    assert np.array_equal(recordings.samples[5].state, straight.state[list(recordings.layout.state_order)])
+    if isinstance(source, Source) and source.action_names:
+        result = CliRunner().invoke(main, ["inspect", str(root), "--action-names", ",".join(source.action_names)])
+        assert result.exit_code == 0, result.output
+
+
+@pytest.mark.slow
+def test_one_of_a_folder_of_datasets_can_be_given_as_printed(copied, tmp_path):
+    copied()
+    assert len(load_recordings(as_printed(refused(tmp_path), tmp_path, None), CHUNK).samples) == 33
+
+
+@pytest.mark.slow
+def test_without_a_state_it_is_the_last_action(copied):
+    root = copied()
+    column("observation.state")(root / DATA)
+    edit(root / "meta/info.json", lambda c: c["features"].pop("observation.state"))
+    recordings = load_recordings(root, CHUNK)
+    assert "state: none recorded, taken as the last action" in recordings.layout.words()
+    for episode in recordings.episodes:
+        states = [s.state.tolist() for s in episode.samples]
+        assert states == [[0, 0], *(s.chunk[0].tolist() for s in episode.samples[:-1])]
+
+
+@pytest.mark.slow
+def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
+    """PIL and OpenCV make a picture of a torn one; a dataset merged with itself judges what it has calibrated."""
+    root = copied()
+    whole = hostile.jpeg(hostile.scene(size=SIZE[::-1]))
+    pictures = [hostile.jpeg(hostile.scene(seed, SIZE[::-1])) for seed in range(32)] + [hostile.cut(whole)]
+
+    def change(t):
+        at = t.column_names.index(CAM)
+        column = pyarrow.array([{"bytes": data, "path": None} for data in pictures], t.schema.field(CAM).type)
+        actions = t.column("action").to_pylist()
+        actions[10:20] = actions[:10]
+        acted = pyarrow.array(actions, t.schema.field("action").type)
+        t = t.set_column(t.column_names.index("action"), "action", acted)
+        return t.set_column(at, CAM, column)
+
+    pictures[10:20] = pictures[:10]
+    table(root / DATA, change)
+    recordings = load_recordings(root, CHUNK)
+    assert {fault.kind: fault.count for fault in recordings.faults} == {"broken_jpeg": 1, "copy": 1}
+    assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
 
 
 @pytest.mark.slow
 def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, datasets, tmp_path):
     """A fine-tuned policy has its base's input_features, and LeRobot never resizes."""
     smaller = shutil.copytree(trained, tmp_path / "smaller")
-    edit(
-        smaller / "config.json",
-        lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, 36, 128]),
-    )
+    seen = "observation.images.cam_front"
+    edit(smaller / "config.json", lambda c: c["input_features"][seen].update(shape=[3, 36, 128]))
     loaded, right = load(smaller, datasets()), load(trained, datasets())
     (note,) = loaded.checkpoint.report["notes"]
     assert "128x36" in note and "128x72" in note
     assert loaded.checkpoint.config == right.checkpoint.config and not right.checkpoint.report["notes"]
     sample = right.recordings.samples[0]
     assert np.array_equal(planned(loaded.checkpoint, sample), planned(right.checkpoint, sample))
-    write_lerobot(
-        tmp_path / "ours", replace(right.checkpoint.config, image_sizes=((36, 64),)), right.checkpoint.weights, {}
-    )
+    # of a smaller copy: nothing but a trial tells, and no plan of random weights is the better one
+    edit(smaller / "config.json", lambda c: c["input_features"][seen].update(shape=[3, 36, 64]))
+    copy = load(smaller, datasets()).checkpoint
+    assert copy.config.image_sizes == ((36, 64),) and "tried on 8 frames" in copy.report["notes"][0]
+    squeezed = replace(right.checkpoint.config, image_sizes=((36, 64),))
+    write_lerobot(tmp_path / "ours", squeezed, right.checkpoint.weights, {})
     assert load(tmp_path / "ours", datasets()).checkpoint.config.image_sizes == ((36, 64),)  # squeezed on purpose
 
 

@@ -1,0 +1,157 @@
+"""What is known of a policy, and by whom: each fact once, with its source, from all files that are there.
+
+facts = Facts(path, said)              # what the user says by --facts
+facts.say("rate", 15.0, "config.fps")  # CheckpointError, if another source denies it
+facts.read(content, "config.")         # keys that nobody here knows, by the words of their names in keys.yml
+"""
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from torch import Tensor
+
+from rover_lib.onboard.checked import is_number
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
+from rover_lib.workshop.recordings.names import flat_names, read_as_car
+from rover_lib.workshop.untrusted import quote, quote_all
+
+USER, GUESS = "--facts", "a guess"
+WORDS = yaml.safe_load(Path(__file__).with_name("keys.yml").read_text())
+SMALL = 64  # numbers or keys; more are weights
+NOTHING: tuple[Any, ...] = (
+    None,
+    False,
+    0,
+    1,
+    "",
+    "none",
+    "identity",
+    "rgb",
+    [],
+    (),
+    {},
+)  # values that change nothing, unlike True
+
+
+class Facts:
+    """The facts of the policy at `path`: {fact: (value, who says it)}, and the keys whose meaning is unknown."""
+
+    def __init__(self, path: Path, said: str = ""):
+        """said: what the user says, such as "rate=20 actions=throttle,steering size=64x48 ignore=KEY,KEY"."""
+        self.path, self.said = path, said
+        self.known, self.unknown = dict[str, tuple[Any, str]](), dict[str, Any]()
+        try:
+            given = dict(part.split("=", 1) for part in said.split())
+            self.ignored = {*given.pop("ignore", "").split(",")}
+            for fact, text in given.items():
+                parts = re.split("[x,]", text)
+                value: Any = tuple(parts) if fact == "actions" else float(parts[0])
+                self.say(fact, (int(parts[1]), int(parts[0])) if fact == "size" else value, USER)
+            if given.keys() - {"rate", "actions", "size"}:
+                raise ValueError
+        except (ValueError, IndexError):
+            remedy = f'as in {USER} "rate=20 actions=throttle,steering size=64x48 ignore=KEY"'
+            raise CheckpointError(f"{USER} {quote(said)} is not understood", remedy=remedy) from None
+
+    def value(self, fact: str) -> Any:
+        return self.known.get(fact, (None, ""))[0]
+
+    def source(self, fact: str) -> str:
+        return self.known.get(fact, (None, GUESS))[1]
+
+    def default(self, fact: str, value: Any, source: str) -> Any:
+        """Return what is known of a fact, or `value`, which is then known by `source`."""
+        return self.known.setdefault(fact, (value, source))[0]
+
+    def say(self, fact: str, value: Any, source: str) -> None:
+        """Add a fact. Raises CheckpointError if another source denies it, and the user ignores neither."""
+        before, by = (value, source) if source in self.ignored else self.known.setdefault(fact, (value, source))
+        if not _same(before, value):
+            which = " or ".join(f"{USER} {shlex.quote(f'ignore={each}')}" for each in (source, by) if each != USER)
+            what = f"{self.path}: {by} and {source} deny each other on its {fact}"
+            raise CheckpointError(what, found=f"{quote(str(before))} and {quote(str(value))}", remedy=f"say {which}")
+
+    def read(self, content: Mapping[str, Any], where: str, noted: bool = True) -> None:
+        """Read keys that nobody here knows. where: what stands before their names. noted: whether to name the rest.
+
+        Raises CheckpointError for a key that may change the actions, where it is not plain how.
+        """
+        refused = dict[str, tuple[Any, str]]()
+        for key, value in _flatten(content, where):
+            words, last = words_of(key), words_of(re.split("[.:]", key)[-1])
+            words |= {value.lower()} if isinstance(value, str) else set()  # action_type: delta
+            harmless = is_nothing(value) or bool(last & {*WORDS["training"]} or words & {*WORDS["augments"]})
+            # Pictures are normalised, by ImageNet's statistics.
+            harmless |= value is True and bool(words & {*WORDS["image"]}) and "normali" in key
+            harmless |= any(_same(value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
+            if key in self.ignored or (not harmless and self._read_key(key, value, words, last)):
+                continue
+            meaning = next((meaning for meaning, these in WORDS["changes"].items() if words & {*these}), "")
+            of_numbers = value is True or words & {*WORDS["numbers"]} or not {"units", "actions"} & words_of(meaning)
+            if meaning and not harmless and of_numbers:
+                refused[key] = value, f"which may mean {meaning}"
+            elif noted:
+                self.unknown[key] = value
+        for key, (value, why) in refused.items():
+            raise self.refusal(key, value, why, ",".join(refused))
+
+    def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:
+        """Return the error of a key that cannot be used, for the caller to raise. ignored: all such keys."""
+        option = shlex.quote(f"ignore={ignored or key}")
+        remedy = f"save the policy without it, or if it changes no action, say {USER} {option}"
+        return CheckpointError(f"{self.path}: '{key}' is {quote(str(value))}, {why}", remedy=remedy)
+
+    def _read_key(self, key: str, value: Any, words: set[str], last: set[str]) -> bool:
+        """Read a key whose name and value plainly say a fact; False for others."""
+        names, meant = flat_names(value), read_as_car(flat_names(value))
+        if len(names) > 1 and (meant or words & {"action", "actions"}):
+            if meant and meant != names and self.value("actions") is None:
+                what = f"{self.path}: '{key}' is {quote_all(names)}: are they steering and throttle?"
+                raise CheckpointError(what, remedy=f"if they are, say {USER} actions={','.join(meant)}")
+            self.say("actions", meant or names, key)
+        elif (last & {*WORDS["rate"]} or "rate" in last <= {*WORDS["of_rate"]}) and is_number(value, 1, 1000):
+            self.say("rate", float(value), key)
+        elif "timestamps" in words and len(value) > 1:
+            self.say("rate", round(float(1 / np.diff(value).mean()), 3), key)
+        elif self.value("size") and words & {*WORDS["image"]} and last & {*WORDS["size"]}:
+            height, width = self.value("size")
+            if not {*np.ravel(value).tolist()} <= {1, 3, height, width}:
+                raise self.refusal(key, value, f"and its pictures are {width}x{height}: say {USER} size=WxH")
+        else:
+            return False
+        return True
+
+
+def is_nothing(value: Any) -> bool:
+    """Whether a key's value is one that changes nothing, such as a scale of 1."""
+    return value is not True and value in NOTHING
+
+
+def words_of(key: str) -> set[str]:
+    """Return the words of a key's name: those of `actionMean` are action and mean."""
+    return set(re.findall("[a-z]+[0-9]*", re.sub("([a-z])([A-Z])", r"\1_\2", key).lower()))
+
+
+def _same(a: Any, b: Any) -> bool:
+    try:
+        return bool(np.allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-4, atol=1e-6, equal_nan=True))
+    except (TypeError, ValueError):  # words, or another number of numbers
+        return bool(a == b)
+
+
+def _flatten(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """Yield ("action_stats.mean", [0.0, 0.4]): dicts opened unless they name numbers, small tensors as lists."""
+    if isinstance(value, (Tensor, np.ndarray, np.generic)):
+        count = value.numel() if isinstance(value, Tensor) else value.size
+        value = value.tolist() if count <= SMALL else f"{count} numbers"
+    if not isinstance(value, Mapping) or len(value) > SMALL or read_as_car(flat_names(value)):
+        yield key, value
+        return
+    for name, inner in value.items():
+        yield from _flatten(inner, f"{key}{name}" if not key or key[-1] in ".:" else f"{key}.{name}")

@@ -1,0 +1,82 @@
+"""Find recordings that are the same drive, whatever they are called: a copy in both parts of a split judges nothing.
+
+Their actions say which two may be the same, and some of their pictures whether they are. So a copy is found that was
+encoded anew, renamed, cut or lacks some rows; and drives of a keyboard, whose actions repeat, are told apart.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.samples import Episode, pick_evenly
+
+RUN = 4  # consecutive actions that are compared at once
+STEPS = (1, 2, 3)  # a copy may have only every third row
+DIGITS = 2  # of an action; somebody may have rounded them
+SHARED = 0.3  # the share of an episode's runs that makes it a suspect, and of its compared pictures that differ
+COMPARED, SEEN = 8, (16, 9)  # pictures of a suspect, and the size to which they are scaled down
+ALIKE = 4.0  # grey levels, on average over a picture; encoding anew changes less, and a car that moves more
+MOST_ALIKE = 50  # episodes with the same run; it then tells nothing
+
+
+def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
+    """Return the episodes without those that are the same drive as another, of which the longest is kept."""
+    having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
+    kept = set()
+    for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
+        runs = _runs(episodes[i])
+        shared: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        for run, k in runs.items():
+            for other, there in having[run]:
+                shared[other].append((k, there))
+        suspects = [other for other, pairs in shared.items() if len(pairs) >= SHARED * len(runs)]
+        same = next((other for other in suspects if _look_alike(episodes[i], episodes[other], shared[other])), None)
+        if same is not None:
+            note = f"the same drive as {episodes[same].id}, as its actions and pictures show"
+            faults.add(episodes[i].path / episodes[i].id, "copy", note)
+            continue
+        kept.add(i)
+        for run, k in (item for step in STEPS for item in _runs(episodes[i], step).items()):
+            if len(having[run]) < MOST_ALIKE:
+                having[run].append((i, k))
+    return tuple(episode for i, episode in enumerate(episodes) if i in kept)
+
+
+def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
+    """Each run of actions, `step` samples apart, that are not all the same, and the sample where it first begins.
+
+    Without such runs, all single ones: then also their place must be the same.
+    """
+    rounded = np.array([sample.chunk[0] for sample in episode.samples]).round(DIGITS) + 0.0  # -0 is 0
+    actions = [action.tobytes() for action in rounded]
+    runs: dict[bytes, int] = {}
+    for k in range(len(actions) - (RUN - 1) * step):
+        run = actions[k : k + RUN * step : step]
+        if run != run[:1] * RUN:
+            runs.setdefault(b"".join(run), k)
+    return runs or {action + str(k).encode(): k for k, action in enumerate(actions)}
+
+
+def _look_alike(episode: Episode, other: Episode, pairs: list[tuple[int, int]]) -> bool:
+    """Whether most pictures at the same actions are the same. pairs: a sample of each."""
+    found: Counter[bool] = Counter()
+    chosen = pick_evenly(sorted(pairs), COMPARED)
+    for k, there in chosen:
+        if found[False] > SHARED * len(chosen):
+            return False
+        try:
+            seen = [_scaled(e.samples[i].frame_bgr()) for e, i in ((episode, k), (other, there))]
+        except EpisodeError:
+            continue  # a picture that is torn says nothing
+        found[bool(np.abs(seen[0] - seen[1]).mean() <= ALIKE)] += 1
+    return found[True] > 0 and found[False] <= SHARED * found.total()
+
+
+def _scaled(frame: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
+    """The picture in few pixels; of several cameras, one beside the other."""
+    frames = frame.values() if isinstance(frame, dict) else (frame,)
+    return np.stack([cv2.resize(f, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32) for f in frames])

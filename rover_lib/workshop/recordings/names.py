@@ -1,0 +1,96 @@
+"""What the names of actions mean: the car's own names, other people's words for the same, or another robot's."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.recording.episode import CHANNELS
+from rover_lib.workshop.untrusted import quote, quote_all
+
+STATE, ACTION = "observation.state", "action"
+Named = tuple[tuple[str, ...], tuple[int, ...]]  # names and their columns: a car's [steering, throttle], or as they lie
+OTHER_WORDS = {
+    "steering": {"steering", "steer", "angle", "angular", "turn", "yaw", "rudder"},
+    "throttle": {"throttle", "gas", "speed", "linear", "accelerator", "acceleration", "forward"},
+}
+
+
+def flat_names(names: Any, depth: int = 4) -> tuple[str, ...]:
+    """Return the names in a list, in lists of lists, under words, or with each one's number; () if there are none."""
+    if isinstance(names, Mapping) and sorted(map(repr, names.values())) == sorted(map(repr, range(len(names)))):
+        return tuple(sorted(names, key=names.__getitem__))  # {"throttle": 0, "steering": 1}
+    parts = list(names.values()) if isinstance(names, Mapping) else names
+    if not isinstance(parts, (list, tuple)) or not depth:
+        return ()
+    if all(isinstance(part, str) for part in parts):
+        return () if isinstance(names, Mapping) else tuple(parts)
+    flat = [flat_names(part, depth - 1) for part in parts]  # {"motors": [...]}, [["throttle", "steering"]]
+    return tuple(name for part in flat for name in part) if all(flat) else ()
+
+
+def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
+    """Return a car's names in the order of `names`, if their words mean steering and throttle, once each; else None."""
+    read = []
+    for name in names:
+        words = set(re.findall("[a-z]+", name.lower()))
+        read += [channel for channel, known in OTHER_WORDS.items() if words & known]
+    return tuple(read) if sorted(read) == sorted(CHANNELS) and len(names) == len(read) else None
+
+
+def settle_names(
+    where: str, own: tuple[str, ...], said: tuple[str, ...], option: str, error: type[RoverError]
+) -> tuple[str, ...]:
+    """Return the names of some numbers, in their order: the file's `own`, or those `said` by the user's `option`.
+
+    Raises `error` if the two deny each other, and asks by it whether other words mean steering and throttle.
+    """
+    meant = read_as_car(own)
+    say = f"{option} {','.join(meant or own)}"
+    if said and meant and meant != said:
+        what = f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}"
+        raise error(what, remedy=f"say {say}, or nothing")
+    if meant and meant != own and not said:
+        raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=f"if they are, say {say}")
+    return said or own
+
+
+def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
+    """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
+    own = _names(features[STATE])
+    (size,) = features[STATE]["shape"]
+    if own and not (said and own == _names(features[ACTION])):
+        said = (read_as_car(own) or own) if said else own
+    elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
+        said = tuple(f"state_{i}" for i in range(size))
+    return name_numbers(root, features, STATE, said)
+
+
+def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
+    """Return a dataset's names of its states or actions, or those `said` by the user, as `Named` has them."""
+    (size,) = features[key]["shape"]
+    own = _names(features[key])
+    names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
+    if not names:
+        # The other numbers' order, if they have one.
+        examples: list[Sequence[str]] = [_names(features.get(ACTION if key == STATE else STATE, {}))]
+        if len(examples[0]) != size:
+            # Of a car both orders: the user must not just copy one.
+            examples = [CHANNELS, CHANNELS[::-1]] if size == 2 else [[f"joint_{i}" for i in range(1, size + 1)]]
+        remedy = f"name them in the order of the numbers: --action-names {', or '.join(map(','.join, examples))}"
+        found = quote(features[key].get("names"))
+        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
+    if len(names) != size or len(set(names)) != size:
+        what = f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}"
+        raise EpisodeError(what, remedy="name each once: --action-names with commas between")
+    if set(names) == set(CHANNELS):
+        return CHANNELS, tuple(names.index(name) for name in CHANNELS)
+    return names, tuple(range(size))
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of a feature's numbers; () if there are none."""
+    names = flat_names(feature.get("names"))
+    bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
+    return bare if set(bare) == set(CHANNELS) else names

@@ -1,0 +1,185 @@
+"""What files say of a policy is used, asked about or refused, and each remedy works on the file that it is for."""
+
+import json
+import re
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from policies import TINY, lerobot_policy, normalised, trainer_content
+from recorded import edit_json as edit
+from recorded import record_drives
+from safetensors.torch import load_file, save_file
+
+from rover_lib.onboard.errors import CheckpointError
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.recordings.samples import Layout, Source
+from rover_lib.workshop.run.session import load
+
+ORDER = {"action_names": ["throttle", "steering"]}
+TURNED = {"mean": torch.tensor([0.25, 0.3]), "std": torch.tensor([0.05, 0.4])}
+
+
+def remedied(path, said="", act=load_checkpoint):
+    """What is refused of a policy; it is taken if the option is given that the refusal ends with."""
+    with pytest.raises(CheckpointError) as e:
+        act(path, said=said)
+    option = shlex.split(re.findall(r"--facts (\"[^\"]+\"|\S+)", str(e.value))[-1])[0]
+    act(path, said=f"{said} {option}")
+    return str(e.value)
+
+
+def says_more(policy, path, config=(), **more):
+    """A trainer's file with more keys than the known ones."""
+    content = trainer_content(policy)
+    torch.save(content | {"config": content["config"] | dict(config)} | more, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ({"action_stats": {"mean": torch.zeros(2), "std": torch.ones(2)}}, "'action_stats.mean'"),
+        ({"hparams": {"std": [0.2, 0.1]}}, "how its numbers are normalised"),
+        ({"config": {"normalize_actions": True}}, "normalised"),
+        ({"config": {"crop_top": 100}}, "which part of its pictures"),
+        ({"args": {"cropShape": [60, 100]}}, "which part of its pictures"),
+        ({"config": {"color_order": "bgr"}}, "the colours"),
+        ({"config": {"action_type": "delta"}}, "actions are changes"),
+        ({"config": {"throttle_scale": 0.5}}, "units"),
+        ({"config": {"frame_skip": 2}}, "its rate"),
+        ({"config": {"input_size": 224}}, "its pictures are 128x72"),
+        ({"config": {"fps": 15, "control_hz": 20}}, "deny each other on its rate"),
+        ({"config": {"rate_hz": 20, "fps": 30}}, "deny each other on its rate, found '20.0' and '30.0'"),
+        ({"config": {"label_names": ["gas", "steer"]}}, "are they steering and throttle?"),
+    ],
+)
+def test_what_may_change_actions_is_refused_and_the_option_decides(tiny_policy, tmp_path, more, says):
+    assert says in remedied(says_more(tiny_policy, tmp_path / "m.pth", **more))
+
+
+def test_files_beside_a_checkpoint_are_asked_about_or_read(tiny_policy, tmp_path):
+    path, stats = says_more(tiny_policy, tmp_path / "m.pth"), tmp_path / "dataset_stats.pt"
+    stats.touch()
+    assert "normalised" in remedied(path)
+    stats.unlink()
+    (tmp_path / "config.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
+    found = load_checkpoint(path)
+    assert found.report["known"]["rate"] == "15.0 (config.yaml:fps)" and found.identity != found.sha256
+
+
+def test_a_rate_and_an_order_are_used_and_other_keys_are_named(tiny, tiny_policy, tmp_path):
+    said = {"fps": 15, "input_size": [3, 72, 128], "crop_top": 0, "random_flip_prob": 0.5, "image_channels": 3}
+    more = {"normalize_images": True, "image_mean": [0.485, 0.456, 0.406], "history": {"throttle_max": [1]}}
+    found = load_checkpoint(says_more(tiny_policy, tmp_path / "m.pth", config=said | ORDER, **more))
+    (note,) = found.report["notes"]
+    assert found.config.rate_hz == 15 and "config.image_channels" in note and found.identity == found.sha256
+    turned = found.recorded_as(Layout())
+    assert turned.config.action_names == ("steering", "throttle") and turned.report["guesses"] == []
+    for name, axis in (("action_head.bias", 0), ("encoder_robot_state_input_proj.weight", 1)):
+        assert torch.equal(turned.weights[name], tiny.weights[name].flip(axis))
+
+
+@pytest.fixture
+def lerobots(tmp_path):
+    """A policy whose second number swings from -0.3 to 0.9: LeRobot's files do not say that it is steering."""
+    policy = lerobot_policy(**TINY)
+    inner, outer, _ = normalised(policy, "MEAN_STD")
+    for part in (policy, inner, outer):
+        part.save_pretrained(tmp_path / "lerobot")
+    for file in (tmp_path / "lerobot").glob("policy_*.safetensors"):
+        flat = {f"{key}.{name}": v for key in ("action", "observation.state") for name, v in TURNED.items()}
+        save_file(load_file(file) | {k: v.clone() for k, v in flat.items()}, file)
+    return tmp_path / "lerobot"
+
+
+def test_order_and_rate_are_asked_and_never_assumed(lerobots, tmp_path):
+    """With the rover's own recordings, which are not the dataset that it was trained on."""
+    own = record_drives(tmp_path / "episodes", frames=40)
+    say = remedied(lerobots, act=lambda path, said: load(path, Source.of(own, facts=said)))
+    assert "nothing says its actions and rate" in say
+    loaded = load(lerobots, Source.of(own, facts="rate=20 actions=throttle,steering"))
+    found = load_checkpoint(lerobots, said="rate=20 actions=throttle,steering").recorded_as(Layout())
+    assert loaded.checkpoint.config.rate_hz == 20
+    assert found.config.rate_hz == 20 and found.config.action_unnorm.scale == pytest.approx((0.4, 0.05))
+    # of a dataset whose actions vary as the policy's in the other order
+    rng, straight = np.random.default_rng(0), Layout(("cam_front",), rate_hz=20.0)
+    samples = [replace(s, chunk=rng.normal(size=(1, 2)) * (0.4, 0.05)) for s in loaded.recordings.samples]
+    with pytest.raises(CheckpointError, match=r"deny the order .* --facts actions=throttle,steering"):
+        load_checkpoint(lerobots).recorded_as(straight, samples)
+    right = load_checkpoint(lerobots).recorded_as(replace(straight, action_order=(1, 0)), samples)
+    assert right.config.action_unnorm == found.config.action_unnorm
+
+
+@pytest.mark.parametrize(
+    ("said", "size", "refused"),
+    [
+        ({"tfs": {"it": {"type": "Resize", "kwargs": {"size": [36, 64]}}}}, (36, 64), ""),
+        ({"tfs": {"it": {"type": "Resize", "kwargs": {"size": 36}}}}, (36, 64), ""),
+        ({"tfs": {"it": {"type": "ColorJitter"}}}, (72, 128), ""),
+        ({"tfs": {"it": {"type": "CenterCrop", "kwargs": {"size": 8}}}}, (72, 128), "'CenterCrop'"),
+        ({"chunk_size": 100}, (72, 128), "on its chunk_size"),
+        ({"fps": 15, "rename_map": {"a": "b"}}, (72, 128), "which camera is which"),
+    ],
+)
+def test_what_train_config_says(lerobots, said, size, refused):
+    path, transforms = lerobots / "train_config.json", {"enable": True, **said} if "tfs" in said else {}
+    rest = {} if transforms else {k: v for k, v in said.items() if k != "chunk_size"}
+    path.write_text(
+        json.dumps({"dataset": {"image_transforms": transforms, **rest}, "policy": {} if transforms else said})
+    )
+    if refused:
+        with pytest.raises(CheckpointError, match=refused) as e:
+            load_checkpoint(lerobots)
+        assert "train_config.json" in str(e.value)
+        path.unlink()  # as the sentence says
+    assert load_checkpoint(lerobots).config.image_sizes == (size,)
+
+
+def test_a_forks_keys_are_asked_about(lerobots):
+    edit(lerobots / "config.json", lambda c: c.update(use_coord_conv=True, resize_imgs=None))
+    assert "use_coord_conv" in load_checkpoint(lerobots).report["notes"][0]
+    say = remedied(lerobots, act=lambda path, said: load_checkpoint(path, said=said).recorded_as(Layout(rate_hz=20.0)))
+    assert "nobody here knows" in say
+    edit(lerobots / "config.json", lambda c: c.update(resize_imgs=[48, 64]))
+    assert "its pictures are 128x72" in remedied(lerobots)
+    edit(lerobots / "config.json", lambda c: c.update(resize_imgs=None))
+    weights, key = load_file(lerobots / "model.safetensors"), "model.backbone.conv1.weight"
+    weights[key] = torch.cat([weights[key], weights[key][:, :2]], 1)
+    save_file(weights, lerobots / "model.safetensors")
+    with pytest.raises(CheckpointError, match="nobody here knows use_coord_conv"):
+        load_checkpoint(lerobots)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_config_of_2024_is_read(lerobots, inside):
+    """With its statistics among the weights, or in LeRobot's processors."""
+    expected = load_checkpoint(lerobots).config
+
+    def in_2024(c):
+        del c["type"], c["normalization_mapping"]
+        for part in ("input", "output"):
+            shapes = {key: feature["shape"] for key, feature in c.pop(f"{part}_features").items()}
+            c |= {f"{part}_shapes": shapes, f"{part}_normalization_modes": dict.fromkeys(shapes, "mean_std")}
+
+    edit(lerobots / "config.json", in_2024)
+    if inside:
+        weights = load_file(lerobots / "model.safetensors")
+        for name, value in load_file(next(lerobots.glob("policy_pre*.safetensors"))).items():
+            key, _, stat = name.rpartition(".")
+            part = "unnormalize_outputs" if key == "action" else "normalize_inputs"
+            weights[f"{part}.buffer_{key.replace('.', '_')}.{stat}"] = value.clone()
+        save_file(weights, lerobots / "model.safetensors")
+        for file in lerobots.glob("policy_p*"):
+            file.unlink()
+    assert load_checkpoint(lerobots).config == expected
+
+
+def test_an_older_torchs_file_is_refused_and_saved_again_it_is_read(tiny, tiny_policy, tmp_path):
+    torch.save(trainer_content(tiny_policy), tmp_path / "m.pth", _use_new_zipfile_serialization=False)
+    with pytest.raises(CheckpointError, match=r"python -c") as e:
+        load_checkpoint(tmp_path / "m.pth")
+    exec(shlex.split(str(e.value).partition("python ")[2])[1], {})
+    assert load_checkpoint(tmp_path / "m.pth").config == tiny.config
