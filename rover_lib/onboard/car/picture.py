@@ -26,6 +26,7 @@ MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a
 FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
 BASELINE, SCAN, RESTART_INTERVAL = 0xC0, 0xDA, 0xDD  # markers
 SMALL = {"min_height": 1, "min_width": 1, "min_factor": 8}  # all bytes are read, and few pixels computed
+EXIF = b"Exif\0\0"
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 TABLES = (0xDB, 0xC4)  # markers of quantization and Huffman tables
 MOST_PIECES, MOST_TABLES = 10_000, 4000  # restart intervals, and bytes of tables: each interval is decoded with them
@@ -55,12 +56,21 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
             found = f"{width}x{height} pixels in {scans} scans"
             raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
+        if EXIF in data and _is_turned(data):
+            remedy = "turn its pixels, as mogrify -auto-orient does"
+            raise CameraError("a JPEG that its EXIF data turn over", remedy=remedy)
         try:
             return simplejpeg.decode_jpeg(data, colours, **scale)
         except ValueError as error:
             return simplejpeg.decode_jpeg(_check_only_filler(data, error), colours, strict=False, **scale)
     except (ValueError, KeyError) as error:  # KeyError: a header without colours
         raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
+
+
+def _is_turned(data: bytes) -> bool:
+    """Whether most programs show a picture turned, while decoders do not turn it."""
+    encoded, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8
+    return not np.array_equal(*(cv2.imdecode(encoded, flags | more) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION)))
 
 
 def _check_only_filler(data: bytes, warning: ValueError) -> bytes:

@@ -5,6 +5,8 @@ older one. The duty is the pulse's share of its period.
 """
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,13 +25,15 @@ from rover_lib.onboard.recording.episode import (
     no_pulse,
     number_of,
 )
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Fault, relative
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, relative
 from rover_lib.workshop.untrusted import quote
 
 EXACT = 1e-3  # an action agrees with a formula within this; recorded actions have 4 decimals
 FOLLOWS = 0.9  # the share of readings that must agree
 LEAST_READINGS = 8  # fewer do not show a formula, and are taken as recorded
+HALF = 0.4, 0.6  # where the middle of steering is straight ahead if it lies from 0 to 1
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
+DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 Item = TypeVar("Item")
 
 
@@ -77,6 +81,29 @@ class Faults:
 
     def listed(self) -> tuple[Fault, ...]:
         return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
+
+    def nothing_usable(self, what: str, remedy: str) -> EpisodeError:
+        """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
+        kinds: Counter[str] = Counter()
+        first: dict[str, str] = {}
+        for fault in self.listed():
+            if fault.handled == "left out":
+                kinds[fault.kind] += fault.count
+                first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
+        most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
+        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
+        found = first[most[0]] if most else ""
+        what = f"{self.root}: {what} ({worst or 'empty'})"
+        return EpisodeError(what, found=found or None, remedy="" if "; " in found else remedy)
+
+
+def note_one_sided(episodes: Sequence[Episode], faults: Faults) -> None:
+    """Add a fault if steering looks as if it were 0.5 straight ahead, as from 0 to 1 in some cars' files."""
+    steering = np.array([sample.chunk[0, 0] for episode in episodes for sample in episode.samples])
+    low, middle, high = np.quantile(steering, (0, 0.5, 1))
+    if 0 <= low < HALF[0] <= middle <= HALF[1] < high:
+        note = f"from {low:.2f} to {high:.2f}, half of it below {middle:.2f}: 0 must be straight ahead, is 0.5 here?"
+        faults.add(faults.root, "one_sided_steering", note)
 
 
 @dataclass(frozen=True)
