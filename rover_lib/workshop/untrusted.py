@@ -56,8 +56,6 @@ def check_encoded(data: bytes, size: tuple[int, int]) -> str:
     """Return what is wrong with a table's picture that must be a whole PNG or JPEG in colours, of (height, width)."""
     from PIL import Image
 
-    if not data:
-        return "missing"
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
             found, mode = (picture.height, picture.width), picture.mode
@@ -68,7 +66,7 @@ def check_encoded(data: bytes, size: tuple[int, int]) -> str:
     except CameraError as e:
         return str(e)
     except (OSError, TypeError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return "cannot be decoded: neither PNG nor JPEG, or damaged"
+        return "missing or damaged, or neither PNG nor JPEG"
     if found != size:
         return f"of another shape than {size} in meta/info.json, found {found}"
     return "" if mode == "RGB" else f"not in colours (RGB), found {quote(mode)}"

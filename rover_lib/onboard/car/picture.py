@@ -26,7 +26,6 @@ MOST_SCANS = 32  # a progressive JPEG has about ten, and each costs as much as a
 FILLED_MOST = 4  # bytes that some webcams put before a marker; many more mean that a piece is missing
 BASELINE, SCAN, RESTART_INTERVAL = 0xC0, 0xDA, 0xDD  # markers
 SMALL = {"min_height": 1, "min_width": 1, "min_factor": 8}  # all bytes are read, and few pixels computed
-EXIF = b"Exif\0\0"
 RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 TABLES = (0xDB, 0xC4)  # markers of quantization and Huffman tables
 MOST_PIECES, MOST_TABLES = 10_000, 4000  # restart intervals, and bytes of tables: each interval is decoded with them
@@ -56,7 +55,7 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
             found = f"{width}x{height} pixels in {scans} scans"
             raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
-        if EXIF in data and _is_turned(data):
+        if b"Exif\0\0" in data and _is_turned(data):
             remedy = "turn its pixels, as mogrify -auto-orient does"
             raise CameraError("a JPEG that its EXIF data turn over", remedy=remedy)
         try:

@@ -121,9 +121,8 @@ def load_recordings(
     faults = Faults(root)
     for part in killed:
         faults.add(part, "killed_recording", finish)
-    for folder in others:
-        if folder not in folders:
-            faults.add(folder, "no_episode", f"neither {DATA} nor CSV files; drives in folders of it are not read")
+    for folder in sorted({*others} - {*folders}):
+        faults.add(folder, "no_episode", f"neither {DATA} nor CSV files; drives in folders of it are not read")
     listed = progress(folders, desc="reading episodes", total=len(folders))
     loaded = [_load_episode(folder, chunk, sync_s, faults) for folder in listed]
     episodes = tuple(episode for episode in loaded if episode)

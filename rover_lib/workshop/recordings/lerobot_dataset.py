@@ -22,33 +22,15 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import HUMAN, POLICY
+from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
+from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.names import ACTION, STATE, name_numbers, name_states
-from rover_lib.workshop.recordings.samples import (
-    ACTION_NAMES,
-    Episode,
-    Layout,
-    Recordings,
-    Sample,
-    Source,
-    camera_names,
-)
-from rover_lib.workshop.untrusted import (
-    FORMATS,
-    JSON_BYTES,
-    check_encoded,
-    check_inside,
-    check_table,
-    check_video,
-    limited_memory,
-    quote,
-    quote_all,
-    read_json,
-)
+from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, camera_names
+from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
@@ -104,7 +86,8 @@ class _Camera:
         """
         found: list[str] = []
         for batch in self.rows.iter(BATCH) if self.rows else ():
-            found += [check_encoded((picture or {}).get("bytes") or b"", self.size) for picture in batch[self.key]]
+            encoded = [(picture or {}).get("bytes") or b"" for picture in batch[self.key]]
+            found += [untrusted.check_encoded(data, self.size) for data in encoded]
         unusable = [row for row, why in enumerate(found) if why]
         for path, row in () if self.rows else {path: row for row, path in enumerate(self.paths)}.items():
             with _as_episode_error(f"{path}: cannot be decoded"):
@@ -128,7 +111,7 @@ class _Camera:
         else:
             from PIL import Image, ImageOps
 
-            encoded = Image.open(io.BytesIO(self.rows[row][self.key]["bytes"]), formats=FORMATS)
+            encoded = Image.open(io.BytesIO(self.rows[row][self.key]["bytes"]), formats=untrusted.FORMATS)
             rgb = np.asarray(ImageOps.exif_transpose(encoded))  # as LeRobot turns it
         if rgb.shape != (*self.size, 3):
             raise _broken(f"{self.paths[row]}: its frame {row} has another shape than {self.size} in {INFO}", rgb.shape)
@@ -186,13 +169,13 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     with _as_episode_error(f"{dataset.root}: cannot be read"):
         with limited_memory():
             files = dataset.read_meta()
-        with limited_memory(3 * sum(path.stat().st_size for path in files)):
+        with limited_memory(3 * sum(path.stat().st_size for path in files if path.is_file())):
             dataset.read_frames(files)
     listed = progress(dataset.entries, desc="reading episodes", total=len(dataset.entries))
     episodes = [episode for entry in listed if (episode := dataset.episode(entry, chunk)).samples]
     if not episodes:
         raise faults.nothing_usable("no usable sample", "copy the whole dataset again")
-    if layout.action_names == ACTION_NAMES:
+    if layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     return Recordings(dataset.root, leave_out_copies(episodes, faults), faults.listed(), source, layout)
 
@@ -204,34 +187,25 @@ class _Dataset:
     layout's names, others (n,). unusable: rows without a whole picture.
     """
 
-    entries: Sequence[_Entry] = ()
-
     def __init__(self, source: Source):
         self.root, self.faults = source.path, Faults(source.path)
         self.info = _read_info(self.root)
         self.features, self.fps = self.info["features"], float(self.info["fps"])
         self.layout, self.keys = _layout(self.root, self.info, source)
         self.columns: dict[str, np.ndarray] = {}
-        self.cameras: dict[str, _Camera] = {}
 
     def read_meta(self) -> list[Path]:
         """Read what meta/ says of the episodes, and return the tables of frames, in the order of their rows."""
         if self.info["codebase_version"].startswith("v2"):
             _check_file(self.root, lines := self.root / "meta/episodes.jsonl")
-            rows = [json.loads(line) for line in read_plain(lines, JSON_BYTES).splitlines() if line.strip()]
-            if self.info["codebase_version"] != "v2.0" and not (self.root / STATS).exists():
-                note = f"{STATS} is missing: LeRobot's converter to version 3 would fail"
-                self.faults.add(self.root / STATS, "no_statistics", note)
+            rows = [json.loads(line) for line in read_plain(lines, untrusted.JSON_BYTES).splitlines() if line.strip()]
         else:
             tables = sorted(path for path in self.root.glob("meta/episodes/[!.]*/*") if OURS.fullmatch(path.name))
             if not tables:
                 raise _broken(f"{self.root}: has no meta/episodes/*/*.parquet")
             rows = [row for path in tables for row in _read_table(self.root, path, "(?!stats/).*").to_pylist()]
         self.entries = sorted(map(self._entry, rows), key=lambda entry: entry.number)
-        files = list(dict.fromkeys(entry.data for entry in self.entries))
-        for path in files:
-            _check_file(self.root, path)
-        return files
+        return list(dict.fromkeys(entry.data for entry in self.entries))
 
     def _entry(self, row: Mapping[str, Any]) -> _Entry:
         """Version 2 has files of each episode, and version 3 files that its tables name."""
@@ -296,11 +270,10 @@ class _Dataset:
         self.faults.add(self.root / "meta/episodes", "scrambled_index", note, scrambled)
 
     def _check_times(self) -> None:
-        """Raise EpisodeError for frames that do not come `fps` times a second from 0 s on."""
+        """Let episodes begin with 0 s. Raises EpisodeError for frames that do not come `fps` times a second."""
         times_s, first = self.columns["timestamp"].astype(np.float64), self.columns["frame_index"] == 0
-        if len(late := times_s[first & ~(np.abs(times_s) * self.fps <= 1)]):
-            what = f"{self.root}: the timestamps of {len(late)} episodes do not begin with 0"
-            raise EpisodeError(what, found=f"{late[0]:g} s", remedy="take each episode's first from all of its own")
+        begin_s = times_s[np.flatnonzero(first)[np.cumsum(first) - 1]]
+        times_s = self.columns["timestamp"] = np.where(np.abs(begin_s) * self.fps > 1, times_s - begin_s, times_s)
         steps = np.diff(times_s, prepend=0)[~first] * self.fps
         if len(odd := steps[~(np.abs(steps - 1) <= UNEVEN)]):  # so that NaN counts as odd
             what = f"{self.root}: {INFO} says {self.fps:g} frames a second, but {len(odd)} frames come at another rate"
@@ -310,7 +283,7 @@ class _Dataset:
     def _check_numbers(self) -> None:
         """Raise EpisodeError for states and actions beyond what the car can do."""
         for key, labels in ((STATE, self.layout.state_names), (ACTION, self.layout.action_names)):
-            if key == STATE and labels != ACTION_NAMES:
+            if key == STATE and labels != CHANNELS:
                 continue  # a state of these names is what the car is told when it drives: its last action
             limits = action_limits(labels, self.car)
             for name, values, low, high in zip(labels, self.columns[key].T, *limits, strict=True):
@@ -344,7 +317,7 @@ class _Dataset:
         for file in dict.fromkeys(path for path, *_ in shown):
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
-                check_video(file, size)
+                untrusted.check_video(file, size)
         wrong = {e.number for _, first_s, last_s, e in shown if abs((last_s - first_s) * self.fps - e.length) >= 1}
         for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
@@ -405,7 +378,7 @@ def _read_export(root: Path, episodes: int, marked: bool, faults: Faults) -> tup
     if not (root / REPORT).is_file():
         return drivers, car
     try:
-        report = read_json(root / REPORT, INFO_BYTES)
+        report = untrusted.read_json(root / REPORT, INFO_BYTES)
         car = Car.of(report[CAR], "the exported car")  # right also if somebody has removed episodes since
         said = report[DRIVEN_BY]
         if len(said) != episodes or not set(said) <= {POLICY, HUMAN}:
@@ -421,7 +394,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     path = root / INFO
     refuse_pointer(path, EpisodeError)
     try:
-        info = read_json(path, INFO_BYTES)
+        info = untrusted.read_json(path, INFO_BYTES)
     except (OSError, ValueError) as e:
         raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "without a version"
@@ -470,9 +443,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
     actions, action_order = name_numbers(root, features, ACTION, source.action_names)
-    states, state_order, has_state = actions, action_order, STATE in features
-    if has_state:
-        states, state_order = name_states(root, features, source.action_names)
+    has_state, given = STATE in features, source.action_names
+    states, state_order = name_states(root, features, given) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)
     return layout, {name: keys[name] for name in names}
 
@@ -492,7 +464,7 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
 
 def _check_file(root: Path, path: Path) -> None:
     """Raise EpisodeError for a file that leads elsewhere, is not there or is Git LFS's."""
-    check_inside(root, path)
+    untrusted.check_inside(root, path)
     if not path.is_file():
         raise _broken(f"{root}: has no {path.relative_to(root)}")
     refuse_pointer(path, EpisodeError)
@@ -504,7 +476,7 @@ def _read_table(root: Path, path: Path, columns: str, needed: Iterable[str] = ()
 
     _check_file(root, path)
     with _as_episode_error(f"{path}: cannot be read"):
-        names = check_table(path)
+        names = untrusted.check_table(path)
         if missing := {*needed} - {*names}:
             raise _broken(f"{path}: its columns are not those of {INFO}", quote_all(sorted(missing)))
         return parquet.ParquetFile(path).read(columns=[name for name in names if re.fullmatch(columns, name)])

@@ -59,9 +59,8 @@ def settle_names(
 
 def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
     """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
-    own = _names(features[STATE])
-    (size,) = features[STATE]["shape"]
-    if own and not (said and own == _names(features[ACTION])):
+    own, size = _names(features[STATE]), features[STATE]["shape"][0]
+    if own and own != _names(features[ACTION]):
         said = (read_as_car(own) or own) if said else own
     elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
         said = tuple(f"state_{i}" for i in range(size))

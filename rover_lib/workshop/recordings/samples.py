@@ -24,7 +24,7 @@ REPAIRED = (
     *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
     *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
 )
-TAKEN = ("another_export", "another_total", "no_statistics", "one_sided_steering")
+TAKEN = ("another_export", "another_total", "one_sided_steering")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 

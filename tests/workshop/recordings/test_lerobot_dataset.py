@@ -306,8 +306,9 @@ OTHERS_WAYS = [
     (leftovers, set()),
     (openpi, set()),
     (lambda root: column("dataset_to_index", 10, 2)(root / EPISODES_AT), {"scrambled_index"}),
-    (version_2, {"no_statistics"}),
+    (version_2, set()),
     (lambda root: table(root / DATA, lambda t: moved(t, "index", 100)), set()),
+    (lambda root: table(root / DATA, lambda t: moved(t, "timestamp", 1e6)), set()),
     (lambda root: edit(root / "meta/info.json", lambda c: c["features"]["action"].update(names=[[*CAR]])), set()),
     (lambda root: edit(root / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])), set()),
 ]
@@ -369,8 +370,6 @@ def as_printed(message, root, whole):
         shaped("observation.state", [2])(root)
     elif "correct meta/info.json" in message:
         shaped(CAM, [*SIZE, 3])(root)
-    elif "take each episode's first from all" in message:
-        table(root / DATA, lambda t: moved(t, "timestamp", -1e6))
     else:
         assert message.endswith("copy the whole dataset again")
         shutil.rmtree(root)
@@ -389,7 +388,6 @@ TRIGGERS = [
     (renamed("observation.state", "observation.joints"), (0, 1)),
     (shaped("observation.state", [3]), (0, 1)),
     (shaped(CAM, [144, 128, 3]), (0, 1)),
-    (lambda root: table(root / DATA, lambda t: moved(t, "timestamp", 1e6)), (0, 1)),
     (lambda root: edit(root / "meta/info.json", lambda c: c.update(fps=30)), (0, 1)),
     (lambda root: (root / DATA).unlink(), (0, 1)),
     (lambda root: (root / EPISODES_AT).write_bytes(b"PAR1"), (0, 1)),
