@@ -69,7 +69,8 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
 def _is_turned(data: bytes) -> bool:
     """Whether most programs show a picture turned, while decoders do not turn it."""
     encoded, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8
-    return not np.array_equal(*(cv2.imdecode(encoded, flags | more) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION)))
+    shown, plain = (np.asarray(cv2.imdecode(encoded, flags | more)) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION))
+    return not np.array_equal(shown, plain)
 
 
 def _check_only_filler(data: bytes, warning: ValueError) -> bytes:

@@ -23,7 +23,7 @@ def name_stranger(root: Path) -> tuple[str, str] | None:
             return f"a folder of {len(found)} {words}", remedy.format(found[0])
     paths = [f"/{path.relative_to(root).as_posix()}" for path in islice(root.rglob("*"), MOST_FILES)]
     for line in TABLE.read_text().splitlines():
-        pattern, words, *remedy = line.split("\t")
+        pattern, words, *own = line.split("\t")
         if any(re.search(pattern, path) for path in paths):
-            return words, remedy[0] if remedy else READ
+            return words, own[0] if own else READ
     return None
