@@ -186,3 +186,11 @@ def _row(episode: Episode, sample: Sample, frame: np.ndarray) -> dict[str, Any]:
         INTERVENTION: np.array([sample.driver == HUMAN and episode.by_policy]),
         "task": episode.label or "drive",
     }
+
+
+def lerobot_train(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
+    return (
+        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
+        "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
+    )

@@ -21,8 +21,9 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, Faults, nothing_usable
-from rover_lib.workshop.recordings.pictures import Pictures
+from rover_lib.workshop.recordings.controls import Faults, note_one_sided
+from rover_lib.workshop.recordings.copies import leave_out_copies
+from rover_lib.workshop.recordings.episodes import HOLE_INTERVALS, HOLE_S, check_pictures
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
     Episode,
@@ -39,7 +40,7 @@ MOST_BYTES = 10_000_000  # of a manifest or a catalog; JSON takes 25 times its s
 MOST_LINES, MOST_CATALOGS = 50_000, 10_000  # donkeycar's catalogs have a thousand lines
 MOST_INDEX, MOST_MS = 10**9, 10**14
 LEAST_STANDING = 5  # gaps; fewer may be a camera's
-WHOLE_PERIODS = 0.3  # a gap differs by less from whole periods
+WHOLE_PERIODS, MOST_WHOLE = 0.3, 0.8  # a gap differs by less from whole periods; the share of such gaps
 OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
 PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
 
@@ -88,8 +89,9 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
             name = f"{first.session or 'session'} from {first.index}"
             episodes.append(Episode(name, tub, "drive", length_s, len(run), len(run), samples, ()))
     if not episodes:
-        raise nothing_usable(f"{tub}: no usable record in it", faults.listed(), "copy the whole tub, images included")
-    return Recordings(tub, tuple(episodes), faults.listed(), Source(tub))
+        raise faults.nothing_usable("no usable record in it", "copy the whole tub, images included")
+    note_one_sided(episodes, faults)
+    return Recordings(tub, leave_out_copies(episodes, faults), faults.listed(), Source(tub))
 
 
 def _in_order(records: Iterable[_Record], throttle: str | None, tub: Path, faults: Faults) -> list[_Record]:
@@ -112,17 +114,17 @@ def _standing_parts(records: list[_Record], usual_s: float, tub: Path, faults: F
     donkeycar by default records only while the throttle is on (AUTO_RECORD_ON_THROTTLE), and numbers on. So it was off
     in the gaps of a tub without one record of throttle 0.
     """
-    found = set()
+    found = {}
     for before, record in pairwise(records):
         periods = (record.time_s - before.time_s) / usual_s
-        whole = periods > HOLE_INTERVALS and abs(periods - round(periods)) < WHOLE_PERIODS
-        if whole and record.index == before.index + 1 and record.session == before.session:
-            found.add(record.index)
-    if len(found) < LEAST_STANDING or not all(record.throttle for record in records):
+        if periods > HOLE_INTERVALS and record.index == before.index + 1 and record.session == before.session:
+            found[record.index] = abs(periods - round(periods)) < WHOLE_PERIODS
+    whole = sum(found.values()) >= MOST_WHOLE * len(found) and all(record.throttle for record in records)
+    if len(found) < LEAST_STANDING:
         return set()
-    note = "nothing was recorded while the throttle was off: AUTO_RECORD_ON_THROTTLE = False records whole drives"
-    faults.add(tub, "stood_unrecorded", note, len(found))
-    return found
+    kind, note = "stood_unrecorded" if whole else "gaps_unrecorded", "nothing was recorded in gaps of the drive"
+    faults.add(tub, kind, f"{note}: AUTO_RECORD_ON_THROTTLE = False records while the throttle is off too", len(found))
+    return {*found} if whole else set()
 
 
 def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults: Faults) -> bool:
@@ -143,15 +145,15 @@ def _samples(
     run: list[_Record], tub: Path, car: Car, begins: bool, stands: set[int], faults: Faults
 ) -> tuple[Sample, ...]:
     """begins: whether the run begins its session, so that the car stood before it. stands: see _standing_parts."""
-    images, home, pictures = tub / "images", tub.resolve(), Pictures(faults)
+    pictures = check_pictures(tub, [record.picture for record in run], tub, faults, "images")
     (_, low), (_, high) = car.limits.tolist()
     backwards = sum(r.throttle < low for r in run)
     faults.add(tub, "reverse_on_a_car_without", "negative throttle is read as stopped; see car.yml", backwards)
     throttle = np.clip([r.throttle for r in run], low, high)
     actions = np.stack([-car.left * np.array([r.angle for r in run]), throttle], 1).astype(np.float32)
     samples = []
-    for k, record in enumerate(run):
-        if not pictures.size_of(home, images / record.picture, record.picture, tub) or (k == 0 and not begins):
+    for k, (record, (path, size)) in enumerate(zip(run, pictures, strict=True)):
+        if not size or (k == 0 and not begins):
             continue
         after = min(k + 1, len(run) - 1)
         before = actions[k - 1] if k else np.asarray(NEUTRAL, np.float32)
@@ -160,7 +162,7 @@ def _samples(
         samples.append(
             Sample(
                 episode=f"{record.session} from {run[0].index}",
-                frame_path=images / record.picture,
+                frame_path=path,
                 time_s=record.time_s - run[0].time_s,
                 state=before,
                 chunk=actions[[k, after]],

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rover_exchange.export_dataset import lerobot_train
 from rover_learn import training as loop
 from rover_learn.curves import leave_curves
 from rover_learn.phases import VERSIONS, Recipe
@@ -44,7 +45,6 @@ from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.lerobot_dataset import lerobot_train
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source, pick_evenly
 from rover_lib.workshop.recordings.turning import measure_sides
 

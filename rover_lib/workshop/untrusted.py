@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.errors import EpisodeError
+from rover_lib.onboard.car.picture import check_jpeg
+from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.stage import read_plain
 
 JSON_BYTES = 60_000_000  # an hour and a half of driving
@@ -51,18 +52,24 @@ def check_inside(root: Path, path: Path) -> None:
         raise EpisodeError(f"{path}: leads out of the dataset", found=quote(str(real)), remedy="copy the files into it")
 
 
-def check_encoded(where: str, encoded: Any, size: tuple[int, int]) -> None:
-    """Raise EpisodeError unless a table's picture is a PNG or JPEG of (height, width); nothing is decoded."""
+def check_encoded(data: bytes, size: tuple[int, int]) -> str:
+    """Return what is wrong with a table's picture that must be a whole PNG or JPEG in colours, of (height, width)."""
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(encoded["bytes"]), formats=FORMATS) as picture:
-            found = picture.height, picture.width
-    except (OSError, TypeError, ValueError, Image.DecompressionBombError):
-        raise EpisodeError(f"{where} cannot be decoded: neither PNG nor JPEG", remedy="record it again") from None
+        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            found, mode = (picture.height, picture.width), picture.mode
+            if picture.format == "PNG":
+                picture.verify()  # its checksums; no pixel is computed
+        if found == size and picture.format == "JPEG":
+            check_jpeg(data)
+    except CameraError as e:
+        return str(e)
+    except (OSError, TypeError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return "missing or damaged, or neither PNG nor JPEG"
     if found != size:
-        remedy = "record pictures of one size in one dataset"
-        raise EpisodeError(f"{where} has another shape than {size}", found=found, remedy=remedy)
+        return f"of another shape than {size} in meta/info.json, found {found}"
+    return "" if mode == "RGB" else f"not in colours (RGB), found {quote(mode)}"
 
 
 def check_video(path: Path, size: tuple[int, int]) -> None:

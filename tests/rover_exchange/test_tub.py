@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import cv2
@@ -110,19 +111,36 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
 
 
-@pytest.mark.parametrize(("off", "found"), [(0.0, {"hole_in_time"}), (0.3, {"stood_unrecorded"})])
-def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, off, found):
+GAPS = {"hole_in_time", "gaps_unrecorded"}
+
+
+@pytest.mark.parametrize(
+    ("off", "gap_ms", "found"), [(0.1, 250, {"stood_unrecorded"}), (0.0, 250, GAPS), (0.1, 223, GAPS)]
+)
+def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, off, gap_ms, found):
     """donkeycar's default: indexes go on, and three real tubs fell into 305 to 1,300 pieces of three frames."""
     rows, ms = records(80), 1_629_500_000_000
     for i, row in enumerate(rows):
-        ms += 50 if i % 4 else 250
+        ms += 50 if i % 4 else gap_ms
         row.update({"_timestamp_ms": ms, "user/throttle": 0.3 if i else off})
     recordings = read_tub(tub(tmp_path / "tub", rows), LEFT)
+    bridged = found == {"stood_unrecorded"}
     assert kinds(recordings).keys() == found
-    assert len(recordings.episodes) == (1 if off else 20)
-    if off:
-        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.3, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
-        assert "AUTO_RECORD_ON_THROTTLE" in recordings.faults[0].note
+    assert len(recordings.episodes) == (1 if bridged else 20)
+    if bridged:
+        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.1, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
+    assert any("AUTO_RECORD_ON_THROTTLE" in fault.note for fault in recordings.faults)
+
+
+def test_a_tub_that_was_merged_with_itself_or_has_another_middle_is_said(tmp_path):
+    rows = records(70) + [row | {"_index": row["_index"] + 70} for row in records(70)]
+    for row in rows:
+        row["user/angle"] = row["user/angle"] / 2 + 0.5
+    root = tub(tmp_path / "tub", rows)
+    for i in range(70):
+        shutil.copy(root / f"images/{i}_cam_image_array_.jpg", root / f"images/{i + 70}_cam_image_array_.jpg")
+    recordings = read_tub(root, Car())
+    assert len(recordings.samples) == 70 and {"copy", "one_sided_steering"} <= kinds(recordings).keys()
 
 
 def test_what_is_broken_is_counted(tmp_path):

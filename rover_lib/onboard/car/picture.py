@@ -55,12 +55,22 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
             found = f"{width}x{height} pixels in {scans} scans"
             raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
+        if b"Exif\0\0" in data and _is_turned(data):
+            remedy = "turn its pixels, as mogrify -auto-orient does"
+            raise CameraError("a JPEG that its EXIF data turn over", remedy=remedy)
         try:
             return simplejpeg.decode_jpeg(data, colours, **scale)
         except ValueError as error:
             return simplejpeg.decode_jpeg(_check_only_filler(data, error), colours, strict=False, **scale)
     except (ValueError, KeyError) as error:  # KeyError: a header without colours
         raise CameraError("a JPEG is damaged or cut short", found=error, remedy="check the camera's cable") from None
+
+
+def _is_turned(data: bytes) -> bool:
+    """Whether most programs show a picture turned, while decoders do not turn it."""
+    encoded, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8
+    shown, plain = (np.asarray(cv2.imdecode(encoded, flags | more)) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION))
+    return not np.array_equal(shown, plain)
 
 
 def _check_only_filler(data: bytes, warning: ValueError) -> bytes:

@@ -5,6 +5,8 @@ older one. The duty is the pulse's share of its period.
 """
 
 import math
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,22 +16,16 @@ import numpy as np
 
 from rover_lib.onboard.car.pwm import Channel, PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording.episode import (
-    BURST_MIN,
-    CONTROL_FIELDS,
-    arduino_step_s,
-    driver_of,
-    find_backlog,
-    no_pulse,
-    number_of,
-)
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Fault, relative
+from rover_lib.onboard.recording import episode as written
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, relative
 from rover_lib.workshop.untrusted import quote
 
 EXACT = 1e-3  # an action agrees with a formula within this; recorded actions have 4 decimals
 FOLLOWS = 0.9  # the share of readings that must agree
 LEAST_READINGS = 8  # fewer do not show a formula, and are taken as recorded
+HALF = 0.4, 0.6  # where the middle of steering is straight ahead if it lies from 0 to 1
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
+DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 Item = TypeVar("Item")
 
 
@@ -78,6 +74,29 @@ class Faults:
     def listed(self) -> tuple[Fault, ...]:
         return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
 
+    def nothing_usable(self, what: str, remedy: str) -> EpisodeError:
+        """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
+        kinds: Counter[str] = Counter()
+        first: dict[str, str] = {}
+        for fault in self.listed():
+            if fault.handled == "left out":
+                kinds[fault.kind] += fault.count
+                first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
+        most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
+        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
+        found = first[most[0]] if most else ""
+        what = f"{self.root}: {what} ({worst or 'empty'})"
+        return EpisodeError(what, found=found or None, remedy="" if "; " in found else remedy)
+
+
+def note_one_sided(episodes: Sequence[Episode], faults: Faults) -> None:
+    """Add a fault if steering looks as if it were 0.5 straight ahead, as from 0 to 1 in some cars' files."""
+    steering = np.array([sample.chunk[0, 0] for episode in episodes for sample in episode.samples])
+    low, middle, high = np.quantile(steering, (0, 0.5, 1))
+    if 0 <= low < HALF[0] <= middle <= HALF[1] < high:
+        note = f"from {low:.2f} to {high:.2f}, half of it below {middle:.2f}: 0 must be straight ahead, is 0.5 here?"
+        faults.add(faults.root, "one_sided_steering", note)
+
 
 @dataclass(frozen=True)
 class Control:
@@ -100,9 +119,9 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
             continue
-        lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
-        wanted = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
-        values = {n: number for n in wanted if (number := number_of(row.get(n))) is not None}
+        lost = [name for name in ACTION_NAMES if written.no_pulse(row, name)]
+        wanted = [name for name in written.CONTROL_FIELDS if name.split("_")[0] not in lost]
+        values = {n: number for n in wanted if (number := written.number_of(row.get(n))) is not None}
         if bad := [name for name in wanted if name not in values]:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
             continue  # the recorder did not write such a row, so nothing in it can be trusted
@@ -112,7 +131,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
             continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
-        if (driver := driver_of(row)) is None:
+        if (driver := written.driver_of(row)) is None:
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
         read.append((i, values, lost, driver))
@@ -132,7 +151,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
         controls.append(Control(*times_s, pair, driver, pulses))
-    went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
+    went_on = [written.arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
     return in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
 
@@ -208,7 +227,7 @@ def _take(
 
 def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
+    late = written.find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
     placed: list[Control] = []
     moved = dropped = 0
     farthest_s = 0.0
@@ -220,12 +239,12 @@ def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Co
             start -= 1
         run, end = controls[start:end], start
         placed.append(run[-1])
-        if len(run) - 1 < BURST_MIN:
+        if len(run) - 1 < written.BURST_MIN:
             placed.extend(reversed(run[:-1]))
             continue
         for k in range(len(run) - 2, -1, -1):
             control, after = run[k], run[k + 1]
-            step_s = arduino_step_s(control.arduino_s, after.arduino_s)
+            step_s = written.arduino_step_s(control.arduino_s, after.arduino_s)
             if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
                 dropped += k + 1
                 break

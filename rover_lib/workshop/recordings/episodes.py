@@ -13,8 +13,9 @@ sample, because its state would be invented.
 
 import csv
 import math
+import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
-from rover_lib.onboard.errors import CarError, EpisodeError
+from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
 from rover_lib.onboard.kinds import EPISODE_FILES
 from rover_lib.onboard.recording.episode import (
     CONTROL_FIELDS,
@@ -42,16 +44,14 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.pictures import Pictures
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, Recordings, Sample, Source
-from rover_lib.workshop.recordings.strangers import name_stranger
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What DATA has under these names, and where it is again with which columns.
 TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
-DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,58 +96,43 @@ def load_recordings(
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
     if lerobot_dataset.is_dataset(root):
         return lerobot_dataset.load_dataset(source, chunk, progress)
-    if source.action_names not in ((), ACTION_NAMES):
-        what, found = f"{root}: our recordings name their actions", f"--action-names {','.join(source.action_names)}"
-        raise EpisodeError(what, found=found, remedy="leave it out")
-    if source.cameras:
-        what, found = f"{root}: our recordings have one camera", f"--camera {','.join(source.cameras)}"
-        raise EpisodeError(what, found=found, remedy="leave it out")
+    for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
+        if names not in ((), ACTION_NAMES):
+            what, found = f"{root}: our recordings have one camera and name their actions", ",".join(names)
+            raise EpisodeError(what, found=f"{option} {found}", remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
         if any((root / name).exists() for name in EPISODE_FILES):
-            root, folders = root.parent, [root]  # so that faults and hashes name the episode here too
+            root, folders, others = root.parent, [root], []  # so that faults and hashes name the episode here too
         else:
-            folders = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
+            others = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
+            folders = [p for p in others if any((p / name).exists() for name in EPISODE_FILES)]
     except OSError as e:
         remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
         raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
-    if not killed and (stranger := name_stranger(root)):
-        raise EpisodeError(f"{root}: {stranger[0]}, not our recordings", remedy=stranger[1])
     if not folders:
-        remedy = finish if killed else "give the folder that holds episode_*"
-        many = f"{len(killed)} killed ones" if killed else None
-        raise EpisodeError(f"{root}: no episode folders in it", found=many, remedy=remedy)
+        inside = quote_all(sorted(p.name for p in root.iterdir())) or None
+        what, remedy = "no episode folders in it", finish if killed else READ
+        if not killed and (stranger := name_stranger(root)):
+            what, remedy = f"{stranger[0]}, not our recordings", stranger[1]
+        raise EpisodeError(f"{root}: {what}", found=inside, remedy=remedy)
     faults = Faults(root)
-    pictures = Pictures(faults)
     for part in killed:
         faults.add(part, "killed_recording", finish)
+    for folder in sorted({*others} - {*folders}):
+        faults.add(folder, "no_episode", f"neither {DATA} nor CSV files; drives in folders of it are not read")
     listed = progress(folders, desc="reading episodes", total=len(folders))
-    loaded = [_load_episode(folder, chunk, sync_s, faults, pictures) for folder in listed]
+    loaded = [_load_episode(folder, chunk, sync_s, faults) for folder in listed]
     episodes = tuple(episode for episode in loaded if episode)
-    pictures.keep()
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
-        raise nothing_usable(f"{root}: no usable sample in {len(folders)} folder(s)", faults.listed(), remedy)
+        raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
     return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
 
 
-def nothing_usable(what: str, faults: Iterable[Fault], remedy: str) -> EpisodeError:
-    """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
-    kinds: Counter[str] = Counter()
-    first: dict[str, str] = {}
-    for fault in faults:
-        if fault.handled == "left out":
-            kinds[fault.kind] += fault.count
-            first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
-    most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
-    worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
-    found = first[most[0]] if most else ""
-    return EpisodeError(f"{what} ({worst or 'empty'})", found=found or None, remedy="" if "; " in found else remedy)
-
-
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults, pictures: Pictures) -> Episode | None:
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
     """Read one folder's episode. None if it has no usable sample; a fault then says why."""
     try:
         with limited_memory():
@@ -168,7 +153,7 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults, pictu
     except EpisodeError as e:
         faults.add(folder, "no_formula", str(e))
         return None
-    frames = _read_frames(folder, frames_source, frame_rows, faults, pictures)
+    frames = _read_frames(folder, frames_source, frame_rows, faults)
     samples: tuple[Sample, ...] = ()
     if controls and frames:
         controls = place_bursts(controls, source, faults)
@@ -219,11 +204,10 @@ def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
     return list(table)
 
 
-def _read_frames(folder: Path, path: Path, rows: list, faults: Faults, pictures: Pictures) -> list[_Frame]:
+def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
-    frames: list[_Frame] = []
+    listed: list[tuple[int, float, str]] = []
     numbers: set[float] = set()
-    home = folder.resolve()
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
@@ -238,8 +222,9 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults, pictures:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
         numbers.add(number)
-        picture = folder / name.replace("\\", "/")
-        frames.append(_Frame(int(number), time_s, picture, pictures.size_of(home, picture, name, path)))
+        listed.append((int(number), time_s, name))
+    found = check_pictures(folder, [name for *_, name in listed], path, faults)
+    frames = [_Frame(number, time_s, *each) for (number, time_s, _), each in zip(listed, found, strict=True)]
     sizes = Counter(f.size for f in frames if f.size)
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
     for i, frame in enumerate(frames):
@@ -256,6 +241,29 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults, pictures:
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
     return kept
+
+
+def check_pictures(
+    folder: Path, names: Sequence[str], listing: Path, faults: Faults, inside: str = "."
+) -> list[tuple[Path, tuple[int, int] | None]]:
+    """Return each listed picture's path and its (height, width): None, and a fault, unless it is there and whole.
+
+    names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`.
+    """
+    found: list[tuple[Path, tuple[int, int] | None]] = []
+    for name in names:
+        path, size = folder / inside / name.replace("\\", "/"), None
+        try:
+            if os.path.realpath(path).startswith(f"{os.path.realpath(folder)}{os.sep}"):
+                size = check_jpeg(read_plain(path, MOST_BYTES))
+            else:
+                faults.add(listing, "path_leaves_folder", f"{quote(name)} is outside of the episode")
+        except CameraError as e:
+            faults.add(path, "broken_jpeg", str(e))
+        except (OSError, ValueError):  # not there, unreadable, a long name, a zero byte
+            faults.add(listing, "frame_missing", f"{quote(name)} is listed but cannot be read")
+        found.append((path, size))
+    return found
 
 
 def _actions_of(

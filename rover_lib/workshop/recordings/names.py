@@ -11,9 +11,9 @@ from rover_lib.workshop.untrusted import quote, quote_all
 
 STATE, ACTION = "observation.state", "action"
 Named = tuple[tuple[str, ...], tuple[int, ...]]  # names and their columns: a car's [steering, throttle], or as they lie
-OTHER_WORDS = {
-    "steering": {"steering", "steer", "angle", "angular", "turn", "yaw", "rudder"},
-    "throttle": {"throttle", "gas", "speed", "linear", "accelerator", "acceleration", "forward"},
+OTHER_WORDS = {  # how they begin; of a name with words for both, as angular_velocity, the first counts
+    "steering": "steer|ang|turn|yaw|rudder|rotat|theta|wheel|wz",
+    "throttle": "throttl|gas|speed|lin|accel|forward|vel|drive|pedal|motor|vx",
 }
 
 
@@ -34,8 +34,8 @@ def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
     """Return a car's names in the order of `names`, if their words mean steering and throttle, once each; else None."""
     read = []
     for name in names:
-        words = set(re.findall("[a-z]+", name.lower()))
-        read += [channel for channel, known in OTHER_WORDS.items() if words & known]
+        words = [word.lower() for word in re.findall("[A-Z]?[a-z]+|[A-Z]+", name)]
+        read += [channel for channel in CHANNELS if any(re.match(OTHER_WORDS[channel], word) for word in words)][:1]
     return tuple(read) if sorted(read) == sorted(CHANNELS) and len(names) == len(read) else None
 
 
@@ -48,19 +48,19 @@ def settle_names(
     """
     meant = read_as_car(own)
     say = f"{option} {','.join(meant or own)}"
-    if said and meant and meant != said:
+    if said and meant and said not in (meant, own):
         what = f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}"
         raise error(what, remedy=f"say {say}, or nothing")
     if meant and meant != own and not said:
-        raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=f"if they are, say {say}")
+        remedy = f"if they are, say {say}, else {option} {','.join(own)}"
+        raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=remedy)
     return said or own
 
 
 def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
     """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
-    own = _names(features[STATE])
-    (size,) = features[STATE]["shape"]
-    if own and not (said and own == _names(features[ACTION])):
+    own, size = _names(features[STATE]), features[STATE]["shape"][0]
+    if own and own != _names(features[ACTION]):
         said = (read_as_car(own) or own) if said else own
     elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
         said = tuple(f"state_{i}" for i in range(size))
@@ -82,8 +82,10 @@ def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[
         found = quote(features[key].get("names"))
         raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
     if len(names) != size or len(set(names)) != size:
-        what = f"{root}: '{key}' has {size} numbers, their names are {quote_all(names)}"
-        raise EpisodeError(what, remedy="name each once: --action-names with commas between")
+        what = f"{root}: '{key}' has {size} numbers in meta/info.json, their names are {quote_all(names)}"
+        given = said not in ((), own)
+        remedy = "name each once: --action-names with commas between" if given else "correct its shape and names there"
+        raise EpisodeError(what, remedy=remedy)
     if set(names) == set(CHANNELS):
         return CHANNELS, tuple(names.index(name) for name in CHANNELS)
     return names, tuple(range(size))

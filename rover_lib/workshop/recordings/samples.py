@@ -24,6 +24,7 @@ REPAIRED = (
     *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
     *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
 )
+TAKEN = ("another_export", "another_total", "one_sided_steering")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -104,7 +105,8 @@ class Fault:
             return "repaired"
         if self.kind.endswith("_recomputed"):
             return "recomputed from the pulses"
-        return "taken as recorded" if self.kind.endswith("_disagrees_with_pulse") else "left out"
+        taken = self.kind in TAKEN or self.kind.endswith("_disagrees_with_pulse")
+        return "taken as recorded" if taken else "left out"
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,11 +76,20 @@ def test_what_is_torn_after_filler_is_torn(from_end, missing):
     assert is_taken(filled) == is_taken(whole)
 
 
+def test_a_picture_that_its_exif_data_turn_is_refused():
+    """Other programs show it turned; nobody can say what a policy was trained on."""
+    for orientation, taken in ((1, True), (3, False), (6, False)):
+        tag = b"\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0])
+        exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + tag + bytes(4)
+        assert is_taken(WHOLE[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + WHOLE[2:]) is taken
+
+
 def is_taken(data):
     with suppress(CameraError):
         return decode_jpeg(data).shape[:2] == check_jpeg(data)
     with pytest.raises(CameraError):
         check_jpeg(data)
+    return False
 
 
 def test_a_file_that_is_none(tmp_path):

@@ -17,7 +17,6 @@ from recorded import edit_json, real_recordings
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
-from rover_lib.workshop.recordings import pictures
 from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
@@ -186,14 +185,6 @@ def test_missing_and_truncated_pictures_cost_their_own_sample_only(tmp_path):
     assert [s.state.tolist() for s in recordings.samples] == [s.state.tolist() for s in left]
 
 
-def test_a_picture_is_decoded_once_to_see_whether_it_is_torn(tmp_path, monkeypatch):
-    """Each load decoded all of them, and took four times as long."""
-    record(tmp_path)
-    load(tmp_path)
-    monkeypatch.delattr(pictures, "check_jpeg")
-    assert len(load(tmp_path).samples) == 40
-
-
 def as_another(folder, change):
     """A copy of a recording, changed, under another name."""
     copy = shutil.copytree(folder, folder.with_name("episode_20270101_000099"))
@@ -206,12 +197,18 @@ def encoded_anew(folder):
         cv2.imwrite(str(path), half, [cv2.IMWRITE_JPEG_QUALITY, 40])
 
 
+def brighter(folder):
+    for path in (folder / "frames").iterdir():
+        cv2.imwrite(str(path), cv2.add(cv2.imread(str(path)), (40, 40, 40, 0)))
+
+
 COPIES = [
     lambda folder: None,
     encoded_anew,
     lambda folder: edit(folder, lambda content: content["frame_samples"].pop(7)),
     lambda folder: edit(folder, lambda content: content["frame_samples"].__delitem__(slice(20))),
-    lambda folder: edit(folder, lambda content: content["frame_samples"].__delitem__(slice(None, None, 2))),
+    lambda folder: edit(folder, lambda content: content.update(frame_samples=content["frame_samples"][::4])),
+    brighter,
 ]
 
 
@@ -241,23 +238,40 @@ def test_equal_actions_before_other_scenes_are_no_copy(tmp_path):
 @pytest.mark.parametrize(
     ("file", "words"),
     [
-        ("model_metadata.json", "DeepRacer"),
-        ("40_30_ab.jpg", "JetRacer"),
+        ("models/a/model_metadata.json", "DeepRacer"),
+        ("xy_112_080_ab.jpg", "JetRacer"),
+        ("set/40_30_ab.jpg", "JetRacer"),
         ("policy_best.ckpt", "the first ACT"),
         ("episode_0.hdf5", "the first ACT"),
         ("IMG/../driving_log.csv", "Udacity"),
+        ("2026-01-01--0/rlog.zst", "openpilot"),
         ("drive.bag", "ROS bag"),
-        ("tub_1/manifest.json", "a folder of 1 donkeycar tubs, not our recordings; rover export-dataset"),
+        ("record_7.json", "donkeycar 3.*convert_to_tub_v2.py"),
+        ("data/chunk-000/file-000.parquet", "copy the whole dataset"),
+        ("drives.zip", "unpack it"),
+        ("notes.md", "no episode folders in it, found .*notes.md; only folders of episodes"),
+        ("tub_1/manifest.json", "a folder of 1 donkeycar tubs, not our recordings, found tub_1; rover export-dataset"),
         ("more/episode_1/episode_data.json", "a folder of 1 folders of recordings"),
     ],
 )
 def test_what_others_bring_is_called_what_it_is(tmp_path, file, words):
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
-    (tmp_path / file).with_name("catalog_0.catalog").touch()
+    if file.startswith("tub"):
+        (tmp_path / file).with_name("catalog_0.catalog").touch()
     with pytest.raises(EpisodeError, match=words) as e:
         load(tmp_path)
     assert "record again" not in str(e.value)
+
+
+def test_other_folders_between_episodes_are_named(tmp_path):
+    """A backup in its own folder, and what computers leave."""
+    shutil.copytree(record(tmp_path), tmp_path / "backup" / "episode_20260101_120000")
+    for name in (".ipynb_checkpoints", "__MACOSX"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "._episode_20260101_120000").touch()
+    recordings = load(tmp_path)
+    assert kinds(recordings) == {"no_episode": 1} and len(recordings.samples) == 40
 
 
 NO_PULSES = [

@@ -81,7 +81,7 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (info(codebase_version="v1.6"), "only v2 and v3"),
         (info(codebase_version="v4.0"), "only v2 and v3"),
         (info(fps=0), "frames per second"),
-        (info(codebase_version="v2.1", features={}), "no features, and meta/episodes_stats.jsonl is missing"),
+        (info(codebase_version="v2.1", features={}), "features with dtype and shape, and meta/episodes_stats.jsonl is"),
         ("[" * 100_000, "JSON"),
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (features(front=None), "has no camera"),
@@ -90,11 +90,10 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
-        (features(action=TWO | {"names": ["steering", "steering"]}), "name each once"),
+        (features(action=TWO | {"names": ["steering", "steering"]}), "correct its shape and names"),
         (features(), "has no meta/episodes"),
-        (features(**{"observation.images.x/../../../outside": info()["features"]["action"]}), "plain features"),
-        (features(**{f"f{i}": TWO for i in range(40_000)}), "plain features"),
-        (info(data_path="../elsewhere/{chunk_index}"), "plain features"),
+        (features(**{f"f{i}": TWO for i in range(40_000)}), "features with dtype"),
+        (info(data_path=None), "lacks a data_path"),
     ],
 )
 def test_what_is_no_cars_dataset_is_refused(tmp_path, content, says):
@@ -218,11 +217,11 @@ POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
         # what LeRobot accepts without a word
         ("image", EPISODES_AT, column("length", 33), "belong together"),
         ("image", DATA, column("frame_index", 1), "belong together"),
-        ("image", DATA, column("timestamp", 2.0), "frames come at another rate"),
-        ("image", DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "neither PNG nor JPEG"),
+        ("image", DATA, column("timestamp", 2.0, 3), "frames come at another rate"),
+        ("image", DATA, column("episode_index", 1), "belong together"),
+        ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(data_path="../x")), "leads out of the"),
         ("image", "data", lambda p: p.symlink_to(p.rename(p.parents[1] / "elsewhere")), "leads out of the dataset"),
         ("image", DATA, column("action"), "columns are not those of meta/info.json: a broken dataset, found action"),
-        ("image", DATA, column("observation.state", [0.1, np.inf]), "throttle of 'observation.state' is inf"),
         ("image", DATA, column("action", [30.0, 0.1]), "steering of 'action' is 30"),
         ("video", EPISODES_AT, column(f"videos/{CAM}/to_timestamp", 0.4), "episode 0, and 0 more, have another part"),
     ],
@@ -233,11 +232,32 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
     assert says in refused(root)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "damage", "kind", "left"),
+    [
+        (DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "broken_picture", 32),
+        (DATA, column(CAM, None, 3), "broken_picture", 32),
+        (DATA, column("observation.state", [0.1, np.nan]), "not_finite", 23),
+        ("meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=99)), "another_total", 33),
+    ],
+)
+def test_what_is_damaged_is_left_out_and_what_is_denied_is_said(copied, file, damage, kind, left):
+    root = copied()
+    damage(root / file)
+    recordings = load_recordings(root, CHUNK)
+    assert [fault.kind for fault in recordings.faults] == [kind] and len(recordings.samples) == left
+
+
 # ---- what others write in another way ------------------------------------------------------------------------------
 
 
 def table(path, change):
     parquet.write_table(change(parquet.read_table(path)), path)
+
+
+def moved(t, name, by):
+    return t.set_column(t.column_names.index(name), name, pyarrow.array([v + by for v in t[name].to_pylist()]))
 
 
 def language(root):
@@ -256,9 +276,9 @@ def openpi(root):
 
 def leftovers(root):
     """A Mac's, Windows', notebooks', and a copy beside the file."""
+    shutil.copytree(root / "meta/episodes/chunk-000", root / "meta/episodes/.ipynb_checkpoints")
     for name in ("._file-000.parquet", ".DS_Store", "Thumbs.db", "desktop.ini", "file-000 (1).parquet"):
-        for folder in ("data/chunk-000", "meta/episodes/chunk-000", "data/.ipynb_checkpoints", "meta"):
-            (root / folder).mkdir(exist_ok=True)
+        for folder in ("data/chunk-000", "meta/episodes/chunk-000", "meta"):
             (root / folder / name).write_bytes(b"\0\5\26\7" + bytes(60))
 
 
@@ -268,12 +288,8 @@ def version_2(root):
     for i, episode in enumerate(episodes):
         part = rows.slice(episode["dataset_from_index"], episode["length"])
         parquet.write_table(part, root / f"data/chunk-000/episode_{i:06d}.parquet")
-    for name, keys in (("episodes", ("episode_index", "length")), ("tasks", ("task_index", "task"))):
-        told = episodes
-        if name == "tasks":
-            told = [{"task_index": i, "task": e["tasks"][0]} for i, e in enumerate(episodes)]
-        lines = [json.dumps({key: row[key] for key in keys}) for row in told]
-        (root / f"meta/{name}.jsonl").write_text("\n".join(lines) + "\n")
+    lines = [json.dumps({key: row[key] for key in ("episode_index", "length", "tasks")}) for row in episodes]
+    (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
     path = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
     edit(root / "meta/info.json", lambda c: c.update(codebase_version="v2.1", data_path=path))
 
@@ -290,7 +306,9 @@ OTHERS_WAYS = [
     (leftovers, set()),
     (openpi, set()),
     (lambda root: column("dataset_to_index", 10, 2)(root / EPISODES_AT), {"scrambled_index"}),
-    (version_2, {"no_statistics"}),
+    (version_2, set()),
+    (lambda root: table(root / DATA, lambda t: moved(t, "index", 100)), set()),
+    (lambda root: table(root / DATA, lambda t: moved(t, "timestamp", 1e6)), set()),
     (lambda root: edit(root / "meta/info.json", lambda c: c["features"]["action"].update(names=[[*CAR]])), set()),
     (lambda root: edit(root / "meta/info.json", lambda c: c["features"][CAM].update(shape=[3, *SIZE])), set()),
 ]
@@ -322,8 +340,18 @@ def second_camera(root):
     edit(root / "meta/info.json", lambda c: c["features"].update({"observation.images.left": c["features"][CAM]}))
 
 
-def other_key(root):
-    edit(root / "meta/info.json", lambda c: c["features"].update(act=c["features"].pop("action")))
+def renamed(old, new):
+    """Rename a feature, in meta/info.json and in the table."""
+
+    def change(root):
+        table(root / DATA, lambda t: t.rename_columns([new if name == old else name for name in t.column_names]))
+        edit(root / "meta/info.json", lambda c: c["features"].update({new: c["features"].pop(old)}))
+
+    return change
+
+
+def shaped(key, shape):
+    return lambda root: edit(root / "meta/info.json", lambda c: c["features"][key].update(shape=shape))
 
 
 def as_printed(message, root, whole):
@@ -334,10 +362,14 @@ def as_printed(message, root, whole):
         return Source.of(root, camera=re.search(r"found (\w+),", message)[1])
     if found := re.search(r"such as (.+)$", message):
         return Path(found[1])
-    if "name its column 'action'" in message:
-        edit(root / "meta/info.json", lambda c: c["features"].update(action=c["features"].pop("act")))
+    if found := re.search(r"call it '(.+?)' in meta/info.json and in the tables", message):
+        renamed("act" if found[1] == "action" else "observation.joints", found[1])(root)
     elif "correct the rate" in message:
         edit(root / "meta/info.json", lambda c: c.update(fps=FPS))
+    elif "correct its shape and names" in message:
+        shaped("observation.state", [2])(root)
+    elif "correct meta/info.json" in message:
+        shaped(CAM, [*SIZE, 3])(root)
     else:
         assert message.endswith("copy the whole dataset again")
         shutil.rmtree(root)
@@ -352,7 +384,10 @@ TRIGGERS = [
     (named(action=["Throttle", "Steering"], state=["Throttle", "Steering"]), (1, 0)),
     (named(action=["linear.vel", "angular.vel"], state=["linear.vel", "angular.vel"]), (1, 0)),
     (second_camera, (0, 1)),
-    (other_key, (0, 1)),
+    (renamed("action", "act"), (0, 1)),
+    (renamed("observation.state", "observation.joints"), (0, 1)),
+    (shaped("observation.state", [3]), (0, 1)),
+    (shaped(CAM, [144, 128, 3]), (0, 1)),
     (lambda root: edit(root / "meta/info.json", lambda c: c.update(fps=30)), (0, 1)),
     (lambda root: (root / DATA).unlink(), (0, 1)),
     (lambda root: (root / EPISODES_AT).write_bytes(b"PAR1"), (0, 1)),
@@ -412,7 +447,7 @@ def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
     pictures[10:20] = pictures[:10]
     table(root / DATA, change)
     recordings = load_recordings(root, CHUNK)
-    assert {fault.kind: fault.count for fault in recordings.faults} == {"broken_jpeg": 1, "copy": 1}
+    assert {fault.kind: fault.count for fault in recordings.faults} == {"broken_picture": 1, "copy": 1}
     assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
 
 
