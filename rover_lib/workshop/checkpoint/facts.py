@@ -24,19 +24,8 @@ from rover_lib.workshop.untrusted import quote, quote_all
 USER, GUESS = "--facts", "a guess"
 WORDS = yaml.safe_load(Path(__file__).with_name("keys.yml").read_text())
 SMALL = 64  # numbers or keys; more are weights
-NOTHING: tuple[Any, ...] = (
-    None,
-    False,
-    0,
-    1,
-    "",
-    "none",
-    "identity",
-    "rgb",
-    [],
-    (),
-    {},
-)  # values that change nothing, unlike True
+# Values that change nothing, unlike True.
+NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", [], (), {})
 
 
 class Facts:
@@ -146,11 +135,12 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _flatten(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Yield ("action_stats.mean", [0.0, 0.4]): dicts opened unless they name numbers, small tensors as lists."""
+    """Yield ("action_stats.mean", [0.0, 0.4]): dicts opened unless they number names, small tensors as lists."""
     if isinstance(value, (Tensor, np.ndarray, np.generic)):
         count = value.numel() if isinstance(value, Tensor) else value.size
         value = value.tolist() if count <= SMALL else f"{count} numbers"
-    if not isinstance(value, Mapping) or len(value) > SMALL or read_as_car(flat_names(value)):
+    numbered = isinstance(value, Mapping) and read_as_car(tuple(value)) and all(map(is_number, value.values()))
+    if not isinstance(value, Mapping) or len(value) > SMALL or numbered:
         yield key, value
         return
     for name, inner in value.items():

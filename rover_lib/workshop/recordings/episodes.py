@@ -12,10 +12,12 @@ sample, because its state would be invented.
 """
 
 import csv
+import json
 import math
 import os
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -40,6 +42,7 @@ from rover_lib.onboard.recording.episode import (
     read_car_of,
 )
 from rover_lib.onboard.stage import read_plain
+from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
@@ -248,14 +251,23 @@ def check_pictures(
 ) -> list[tuple[Path, tuple[int, int] | None]]:
     """Return each listed picture's path and its (height, width): None, and a fault, unless it is there and whole.
 
-    names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`.
+    names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`. Those that
+    are whole are kept in the cache, and decoded again only after they have changed.
     """
     found: list[tuple[Path, tuple[int, int] | None]] = []
+    home, known, whole = os.path.realpath(folder), dict[str, Any](), dict[str, Any]()
+    cache = cache_root() / f"pictures-{key_of({'in': home})}.json"
+    with suppress(OSError, ValueError):  # none yet, or half of one
+        known = dict(read_json(cache))
     for name in names:
         path, size = folder / inside / name.replace("\\", "/"), None
         try:
-            if os.path.realpath(path).startswith(f"{os.path.realpath(folder)}{os.sep}"):
-                size = check_jpeg(read_plain(path, MOST_BYTES))
+            if os.path.realpath(path).startswith(f"{home}{os.sep}"):
+                there = path.stat()
+                # The time of any change: a copy may bring along the time of its content.
+                key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
+                height, width = whole[key] = known.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
+                size = height, width
             else:
                 faults.add(listing, "path_leaves_folder", f"{quote(name)} is outside of the episode")
         except CameraError as e:
@@ -263,6 +275,10 @@ def check_pictures(
         except (OSError, ValueError):  # not there, unreadable, a long name, a zero byte
             faults.add(listing, "frame_missing", f"{quote(name)} is listed but cannot be read")
         found.append((path, size))
+    if whole.keys() - known.keys():
+        with suppress(OSError):
+            cache.parent.mkdir(parents=True, exist_ok=True)
+            cache.write_text(json.dumps(whole))
     return found
 
 
