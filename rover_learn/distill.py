@@ -80,15 +80,9 @@ def distill(
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     if share is None and config == replace(teacher.config, vae_layers=0):
         raise TrainingError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
-    given: dict[str, Any] = {
-        "recipe": recipe,
-        "machine": machine,
-        "progress": progress,
-        "opened": opened,
-        "share": share,
-    }
-    action_range = opened.recordings.action_range()
-    return Distillation(origin=teacher, config=config, action_range=action_range, **given).make(folder)
+    given: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "opened": opened}
+    given |= {"share": share, "action_range": opened.recordings.action_range()}
+    return Distillation(origin=teacher, config=config, **given).make(folder)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -48,15 +48,11 @@ CAR_ACTIONS = ("steering", "throttle")
 MOST_SIZE = 4096  # of an embedding
 
 
-def is_name(value: Any) -> bool:
-    """Whether a manifest may give this name to a camera, a state or an action."""
-    return isinstance(value, str) and 0 < len(value) <= NAME_LENGTH and "/" not in value
-
-
 def _are_names(values: Any) -> bool:
-    if not isinstance(values, list) or not all(map(is_name, values)):
-        return False
-    return 1 <= len(values) <= MOST_NAMES and len(set(values)) == len(values)
+    """Whether a manifest may give these names to cameras, states or actions."""
+    words = isinstance(values, list) and all(isinstance(value, str) and "/" not in value for value in values)
+    short = words and all(0 < len(value) <= NAME_LENGTH for value in values)
+    return short and 1 <= len(values) <= MOST_NAMES and len(set(values)) == len(values)
 
 
 def _are_cameras(cameras: Any) -> bool:

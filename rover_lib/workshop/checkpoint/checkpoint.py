@@ -141,9 +141,8 @@ class Checkpoint:
             cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
             if c.cameras != cameras:
                 notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
-            config = replace(
-                config, cameras=cameras, rate_hz=(layout.rate_hz if "rate" in guessed else None) or c.rate_hz
-            )
+            rate_hz = (layout.rate_hz if "rate" in guessed else None) or c.rate_hz
+            config = replace(config, cameras=cameras, rate_hz=rate_hz)
             given: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}
             known |= {fact: (given[fact], INFO if same else f"{GUESS}, {INFO}") for fact in guessed}
         return replace(self._told(config, known, notes), weights=weights)

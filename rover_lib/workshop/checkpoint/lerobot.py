@@ -82,6 +82,7 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
             facts.say("rate", float(origin.get("rate_hz", RATE_HZ)), ORIGIN)
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
+        pictures = tuple(inner.affine(k, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for k in images)
         config = ActConfig(
             cameras=tuple(camera_names(images)),
             image_sizes=sizes,
@@ -100,9 +101,7 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
             pre_norm=said.pre_norm,
             activation=said.feedforward_activation,
             rate_hz=facts.default("rate", RATE_HZ, by),
-            image_norm=tuple(
-                inner.affine(key, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for key in images
-            ),
+            image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
             action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
