@@ -57,7 +57,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
     for key in ("config", "model_state_dict"):
         if not isinstance(content, dict) or not isinstance(content.get(key), dict):
             found = quote_all(content) if isinstance(content, dict) else type(content).__name__
-            remedy = "is this a trainer checkpoint, or only its weights?"
+            remedy = "is it the trainer's, or only weights? those of the first ACT, ALOHA's, are of another network"
             raise CheckpointError(f"{path}: no '{key}' in it", found=found, remedy=remedy)
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
     weights = name_weights(path, content["model_state_dict"])

@@ -57,7 +57,7 @@ OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-
 
 def _broken(what: str, found: object = None) -> EpisodeError:
     """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
-    return EpisodeError(f"{what}: a broken dataset", found=found, remedy="copy the whole dataset again")
+    return EpisodeError(f"{what}: a broken dataset", found=found, remedy="copy it whole, or let LeRobot write it anew")
 
 
 def is_dataset(root: Path) -> bool:
@@ -174,7 +174,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     listed = progress(dataset.entries, desc="reading episodes", total=len(dataset.entries))
     episodes = [episode for entry in listed if (episode := dataset.episode(entry, chunk)).samples]
     if not episodes:
-        raise faults.nothing_usable("no usable sample", "copy the whole dataset again")
+        raise faults.nothing_usable("no usable sample", "copy it whole, or let LeRobot write it anew")
     if layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     return Recordings(dataset.root, leave_out_copies(episodes, faults), faults.listed(), source, layout)

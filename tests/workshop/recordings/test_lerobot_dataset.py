@@ -371,7 +371,7 @@ def as_printed(message, root, whole):
     elif "correct meta/info.json" in message:
         shaped(CAM, [*SIZE, 3])(root)
     else:
-        assert message.endswith("copy the whole dataset again")
+        assert message.endswith("let LeRobot write it anew")
         shutil.rmtree(root)
         shutil.copytree(whole, root)
     return root
