@@ -4,12 +4,11 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from command import rover
 from recorded import record_there_and_back
-from test_episodes import edit, load, record
+from test_episodes import burst, edit, load, record, redrawn
 
 from rover_exchange.export_dataset import export_dataset
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
@@ -69,10 +68,8 @@ def test_repairs_and_omissions_are_reported(recorded, tmp_path):
     first = recorded / "episode_20260101_120000"
 
     def change(content):
-        controls = content["control_samples"]
-        for k, control in enumerate(controls[:10]):  # they waited in a buffer
-            control["system_timestamp"] = controls[10]["system_timestamp"] - 0.0003 * (10 - k)
-        controls[4].update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
+        burst(content, 10)
+        content["control_samples"][4].update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
 
     edit(first, change)
     (first / "frames/frame_000008.jpg").unlink()
@@ -111,8 +108,7 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     edit(slow, slower)
     refused("15.0 in episode_20260101_120001")
     shutil.rmtree(slow)
-    for picture in (other / "frames").iterdir():
-        cv2.imwrite(str(picture), np.full((18, 64, 3), 99, np.uint8))
+    redrawn(lambda picture: np.full((18, 64, 3), 99, np.uint8))(other)
     refused("64x18 among those of 32x18")
     refused("found 32x9", size=(9, 32))
     report = export_dataset(tmp_path / "mixed", tmp_path / "out", size=(36, 64))
