@@ -180,9 +180,6 @@ def column(name, value=..., row=0):
     return change
 
 
-POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "file", "damage", "says"),
@@ -211,7 +208,6 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
 @pytest.mark.parametrize(
     ("file", "damage", "kind", "left"),
     [
-        (DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "broken_picture", 32),
         (DATA, column(CAM, None, 3), "broken_picture", 32),
         (DATA, column("observation.state", [0.1, np.nan]), "not_finite", 23),
         ("meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=99)), "another_total", 33),
