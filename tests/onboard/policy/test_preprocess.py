@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from policies import smooth_frame
+from policies import normalise, smooth_frame
 
-from rover_learn.training import normalise
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 
