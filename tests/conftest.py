@@ -2,6 +2,7 @@
 
 import os
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,9 @@ os.environ.setdefault("ROVER_AS_ROOT", "1")
 # No deadline for hypothesis's examples: one that waits for another program's turn has not failed.
 settings.register_profile("shared machine", deadline=None)
 settings.load_profile("shared machine")
+# Before anything imports datasets, whose tables would stay in the user's cache.
+TABLES = tempfile.TemporaryDirectory(prefix="rover-tables-")
+os.environ["HF_DATASETS_CACHE"] = TABLES.name
 USERS_CACHE = os.environ.get("ROVER_CACHE", "")  # empty is as unset
 LEFT_MB = 150
 _give_back_from = [0.0]  # megabytes held, above which a test's end frees what is left

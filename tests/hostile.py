@@ -1,11 +1,18 @@
 """Pictures that no camera sends, small enough to make in a test."""
 
 import io
+import os
+import resource
+import signal
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from PIL import Image
+
+from rover_lib.onboard.errors import RoverError
 
 
 def scene(seed=0, size=(640, 360)) -> np.ndarray:
@@ -69,3 +76,30 @@ HOSTILE = {
     "20,000 scans": progressive(scene(size=(64, 36)), 20_000),
     "9 MB": WHOLE[:-2] + bytes(9_000_000) + b"\xff\xd9",
 }
+
+
+def outcome_of(read, path: Path, most_s=10, most_bytes=500_000_000) -> str:
+    """What a reader says of a file, in a child that may take this much more: its sentence, or what it did instead."""
+    out, into = os.pipe()
+    if not (child := os.fork()):
+        said = "nothing"
+        try:
+            # Its own time counts: a fork of this process, which may have gigabytes, waits for the kernel to copy them.
+            signal.setitimer(signal.ITIMER_VIRTUAL, most_s)
+            signal.alarm(6 * most_s)
+            torch.set_num_threads(1)  # a fork has none of the threads that OpenMP began before, and would wait
+            now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (now + most_bytes,) * 2)
+            said = f"returned {str(read(path))[:100]}"
+        except RoverError as error:
+            said = f"said {error}"
+        except BaseException as error:
+            said = f"raised {type(error).__name__}"
+        finally:
+            os.write(into, said.encode()[:4000])
+            os._exit(0)
+    os.close(into)
+    with os.fdopen(out) as file:
+        said = file.read()
+    os.waitpid(child, 0)
+    return said or f"went on for {most_s} s"

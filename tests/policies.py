@@ -104,12 +104,8 @@ def saved_processors(policy: "ACTPolicy", folder: Path, stats: dict | None) -> t
     return inner, outer
 
 
-def normalised(policy: "ACTPolicy", mode: str) -> tuple:
-    """Return LeRobot's two processors, which normalise all inputs and outputs by `mode`, and their statistics."""
-    from lerobot.configs.types import NormalizationMode
-    from lerobot.policies.act.processor_act import make_act_pre_post_processors
-
-    policy.config.normalization_mapping = dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode(mode))
+def saved_normalised(policy: "ACTPolicy", folder: Path) -> tuple:
+    """Save a policy whose inputs and outputs are all normalised by mean and deviation, and return its processors."""
     low, high = torch.tensor([-0.3, 0.1]), torch.tensor([0.9, 0.4])
     numbers = {"mean": (low + high) / 2, "std": high - low, "min": low, "max": high}
     colours = {"mean": (0.5, 0.4, 0.3), "std": (0.2, 0.3, 0.25), "min": (0.0, 0.1, 0.05), "max": (1.0, 0.9, 0.95)}
@@ -118,7 +114,7 @@ def normalised(policy: "ACTPolicy", mode: str) -> tuple:
         "observation.state": numbers,
         "action": numbers,
     }
-    return *make_act_pre_post_processors(policy.config, stats), stats
+    return saved(policy, folder, stats)
 
 
 def check_is(checkpoint, policy: "ACTPolicy", inner, outer) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from policies import smooth_frame
 
+from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 
@@ -73,4 +74,40 @@ def record_drives(root: Path, drives: int = 4, frames: int = 24) -> Path:
                 writer.control(t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
             for i in range(frames):
                 writer.frame(0.1 + i / 30, smooth_frame(rng, 54, 96))
+    return root
+
+
+def record_there_and_back(folder: Path, car: Car) -> Path:
+    """Record an episode of two seconds, whose second half goes backwards if the car can. Returns its folder."""
+    with EpisodeWriter(folder, About("there and back", car=car), resolution=(64, 36)) as writer:
+        for n in range(60):
+            pulses = car.pwm.pulses(0.5, -0.1 if n >= 30 and car.reverses else 0.1)
+            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, car.numbers[0], car.numbers[4])
+            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
+    return folder
+
+
+def lerobot_dataset(
+    root: Path, cameras: dict, names: Sequence[str], rate_hz: int, lengths: Sequence[int], kind: str, largest: float
+) -> Path:
+    """Write a dataset by LeRobot's own writer, of one episode of each of these lengths, in frames. Returns `root`.
+
+    cameras: name -> (height, width). kind: "image" or "video". States and actions are random, from 0 to `largest`.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    sides, numbers = ["height", "width", "channels"], ("observation.state", "action")
+    pictures = {f"observation.images.{name}": (*size, 3) for name, size in cameras.items()}
+    features: dict[str, dict] = {key: {"dtype": kind, "shape": s, "names": sides} for key, s in pictures.items()}
+    for key in numbers:
+        features[key] = {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+    video = {"use_videos": kind == "video", "video_backend": "pyav"}
+    made, rng = LeRobotDataset.create("local/made", rate_hz, features, root=root, **video), np.random.default_rng(0)
+    for episode, frames in enumerate(lengths):
+        for _ in range(frames):
+            row: dict[str, Any] = {key: smooth_frame(rng, *shape[:2]) for key, shape in pictures.items()}
+            row |= {key: rng.uniform(0, largest, len(names)).astype(np.float32) for key in numbers}
+            made.add_frame(row | {"task": f"hit the {episode}. balloon"})
+        made.save_episode()
+    made.finalize()
     return root

@@ -148,13 +148,11 @@ TURNED = {
     "02_calibrate": ("calibrate", {"samples": 7, "seed": 3, "smooth": 0.7}),
     "03_quantize": (
         "quantize",
-        {
-            "observers": ["minmax"], "float_blocks": ["backbone.stem"], "modes": ["mixed"], "choosing_frames": 2,
-        },
+        {"observers": ["minmax"], "float_blocks": ["backbone.stem"], "modes": ["mixed"], "choosing_frames": 2},
     ),
     "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
     "05_benchmark": (f"benchmark-{runs.socket.gethostname()}", {"iterations": 3, "threads": 1}),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 from executed import run_cells
-from policies import TINY, lerobot_policy, smooth_frame
+from policies import TINY, lerobot_policy, saved
+from recorded import lerobot_dataset
 
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import PolicyError
@@ -22,40 +23,16 @@ JOINTS = tuple(f"joint_{i}" for i in range(14))
 EPISODES, FRAMES, RADIANS = 4, 12, 1.5
 
 
-def dataset(root):
-    """A few episodes by LeRobot's own writer."""
+def trained(root, folder):
+    """A LeRobot policy of random weights that moves about as its dataset does. Returns what LeRobot plans with it."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    numbers = {"dtype": "float32", "shape": (len(JOINTS),), "names": list(JOINTS)}
-    pictures = {
-        f"observation.images.{name}": {"dtype": "image", "shape": (*size, 3), "names": ["height", "width", "channels"]}
-        for name, size in CAMERAS.items()
-    }
-    features = pictures | {"observation.state": numbers, "action": numbers}
-    made = LeRobotDataset.create("local/odd", RATE_HZ, features, root=root, use_videos=False)
-    rng = np.random.default_rng(0)
-    for _ in range(EPISODES):
-        for _ in range(FRAMES):
-            row = {key: smooth_frame(rng, *pictures[key]["shape"][:2]) for key in pictures}
-            for key in ("observation.state", "action"):
-                row[key] = rng.uniform(0, RADIANS, len(JOINTS)).astype(np.float32)
-            made.add_frame(row | {"task": "move"})
-        made.save_episode()
-    made.finalize()
-    return LeRobotDataset("local/odd", root)
-
-
-def trained(seen, folder):
-    """A LeRobot policy with random weights, which moves about as its dataset does; and what LeRobot plans with it."""
-    from lerobot.policies.act.processor_act import make_act_pre_post_processors
-
+    seen = LeRobotDataset("local/odd", root)
     cameras = {f"observation.images.{name}": size for name, size in CAMERAS.items()}
     shape = {**TINY, "vision_backbone": "resnet34", "chunk_size": 100}
     policy = lerobot_policy(cameras, len(JOINTS), len(JOINTS), **shape)
     stats = {k: {s: torch.as_tensor(v) for s, v in seen.meta.stats[k].items()} for k in seen.meta.stats}
-    inner, outer = make_act_pre_post_processors(policy.config, stats)
-    for part in (policy, inner, outer):
-        part.save_pretrained(folder)
+    inner, outer = saved(policy, folder, stats)
 
     def plan(row):
         item = {k: v for k, v in seen[row].items() if k.startswith("observation.")}
@@ -65,12 +42,10 @@ def trained(seen, folder):
     return plan
 
 
-def test_goes_the_whole_way(tmp_path, monkeypatch, capsys):
-    import datasets
-
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+def test_goes_the_whole_way(tmp_path, capsys):
     run_dir = tmp_path / "run"
-    theirs = trained(dataset(tmp_path / "dataset"), tmp_path / "policy")
+    dataset = lerobot_dataset(tmp_path / "dataset", CAMERAS, JOINTS, RATE_HZ, [FRAMES] * EPISODES, "image", RADIANS)
+    theirs = trained(dataset, tmp_path / "policy")
     given = {"checkpoint": str(tmp_path / "policy"), "episodes": str(tmp_path / "dataset")}
     for name in NAMES:  # which know each other only by files
         run_cells(name, run_dir, **QUICK, **given)

@@ -4,30 +4,22 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from command import rover
-from test_episodes import edit, load, record
+from recorded import record_there_and_back
+from test_episodes import burst, edit, load, record, redrawn
 
 from rover_exchange.export_dataset import export_dataset
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.workshop.recordings.samples import car_of
 
 CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
 
 # Importing LeRobot and encoding tiny pictures as AV1 takes seconds.
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path, monkeypatch):
-    import datasets
-
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
 
 
 @pytest.fixture
@@ -76,10 +68,8 @@ def test_repairs_and_omissions_are_reported(recorded, tmp_path):
     first = recorded / "episode_20260101_120000"
 
     def change(content):
-        controls = content["control_samples"]
-        for k, control in enumerate(controls[:10]):  # they waited in a buffer
-            control["system_timestamp"] = controls[10]["system_timestamp"] - 0.0003 * (10 - k)
-        controls[4].update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
+        burst(content, 10)
+        content["control_samples"][4].update(throttle_raw_us=0, throttle_period_us=0, throttle_normalized=0.0)
 
     edit(first, change)
     (first / "frames/frame_000008.jpg").unlink()
@@ -118,8 +108,7 @@ def test_what_cannot_be_one_dataset_is_refused(recorded, tmp_path):
     edit(slow, slower)
     refused("15.0 in episode_20260101_120001")
     shutil.rmtree(slow)
-    for picture in (other / "frames").iterdir():
-        cv2.imwrite(str(picture), np.full((18, 64, 3), 99, np.uint8))
+    redrawn(lambda picture: np.full((18, 64, 3), 99, np.uint8))(other)
     refused("64x18 among those of 32x18")
     refused("found 32x9", size=(9, 32))
     report = export_dataset(tmp_path / "mixed", tmp_path / "out", size=(36, 64))
@@ -187,18 +176,9 @@ def test_interventions_are_lerobots(mixed, tmp_path):
 # ---- whose car
 
 
-def backwards(folder, name, car):
-    """Record an episode of two seconds whose second half goes backwards if the car can."""
-    with EpisodeWriter(folder / name, About("there and back", car=car), resolution=(64, 36)) as writer:
-        for n in range(60):
-            pulses = car.pwm.pulses(0.5, -0.1 if n >= 30 and car.reverses else 0.1)
-            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, car.numbers[0], car.numbers[4])
-            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
-
-
 def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
     """Our report says whose car it is. Without it, a dataset counts as this machine's car's."""
-    backwards(tmp_path / "mine", "episode_20260101_120000", CRAWLER)
+    record_there_and_back(tmp_path / "mine/episode_20260101_120000", CRAWLER)
     export_dataset(tmp_path / "mine", tmp_path / "out")
     again = load(tmp_path / "out")
     assert car_of(again.samples) == CRAWLER and again.action_range()["throttle"] == pytest.approx((-0.1, 0.1))
@@ -208,7 +188,7 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
     (tmp_path / "car.yml").write_text(yaml_of(CRAWLER))
     monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
     assert car_of(load(tmp_path / "out").samples) == CRAWLER
-    backwards(tmp_path / "mine", "episode_20260101_120001", Car())
+    record_there_and_back(tmp_path / "mine/episode_20260101_120001", Car())
     driven(record(tmp_path / "held", frames=20), ("nobody", 0))
     for folder, word in (("mine", "several cars"), ("held", "no two whole frames")):
         with pytest.raises(EpisodeError, match=word):

@@ -2,7 +2,6 @@
 
 import os
 import resource
-import signal
 from pathlib import Path
 
 import av
@@ -11,13 +10,12 @@ import hostile
 import numpy as np
 import pyarrow
 import pytest
-import torch
 from pyarrow import parquet
 
 from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.flight_log import read_log
-from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
@@ -105,7 +103,6 @@ def test_only_files_in_the_folder_or_in_the_hubs_cache_are_read(tmp_path):
             check_inside(root, root / name)
 
 
-MOST_S, MOST_BYTES = 10, 500_000_000
 READERS = {
     "run.json": lambda path: read_stage(path, "run"),
     "car.yml": read_car,
@@ -125,47 +122,20 @@ def without_end(path: Path) -> None:
 THINGS = {"a pipe": os.mkfifo, "a device": lambda path: path.symlink_to("/dev/zero"), "a terabyte": without_end}
 
 
-def outcome_of(read, path: Path) -> str:
-    """What a reader says of a file, read in a child: its sentence, or what it did instead."""
-    out, into = os.pipe()
-    if not (child := os.fork()):
-        said = "nothing"
-        try:
-            # Its own time counts: a fork of this process, which may have gigabytes, waits for the kernel to copy them.
-            signal.setitimer(signal.ITIMER_VIRTUAL, MOST_S)
-            signal.alarm(6 * MOST_S)
-            torch.set_num_threads(1)  # a fork has none of the threads that OpenMP began before, and would wait
-            now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-            resource.setrlimit(resource.RLIMIT_AS, (now + MOST_BYTES,) * 2)
-            said = f"returned {str(read(path))[:100]}"
-        except RoverError as error:
-            said = f"said {error}"
-        except BaseException as error:
-            said = f"raised {type(error).__name__}"
-        finally:
-            os.write(into, said.encode()[:4000])
-            os._exit(0)
-    os.close(into)
-    with os.fdopen(out) as file:
-        said = file.read()
-    os.waitpid(child, 0)
-    return said or f"went on for {MOST_S} s"
-
-
 @pytest.mark.parametrize("name", READERS)
 def test_a_sentence_at_once(tmp_path, name):
     for thing, make in THINGS.items():
         path = tmp_path / thing / name
         path.parent.mkdir(parents=True)
         make(path)
-        said = outcome_of(READERS[name], path)
+        said = hostile.outcome_of(READERS[name], path)
         assert said.startswith("said "), f"{thing} as {name}: {said}"
 
 
 def test_a_car_that_refers_to_itself_many_times(tmp_path):
     lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12))]
     (tmp_path / "car.yml").write_text("\n".join([*lines, "steering: *a11"]))
-    assert outcome_of(read_car, tmp_path / "car.yml").startswith("said ")
+    assert hostile.outcome_of(read_car, tmp_path / "car.yml").startswith("said ")
 
 
 SMALL_VALUES = {
@@ -182,4 +152,4 @@ def test_what_takes_many_times_its_size(tmp_path, name):
     (tmp_path / "episode_data.json").touch()
     (tmp_path / name).write_bytes(SMALL_VALUES[name])
     read = load_recordings if name.startswith(("episode", "control")) else lambda path: read_tub(path, Car())
-    assert outcome_of(read, tmp_path).startswith("said ")
+    assert hostile.outcome_of(read, tmp_path).startswith("said ")

@@ -54,20 +54,13 @@ def test_another_content_is_another_version(own, monkeypatch, tmp_path):
 
 
 def test_the_rover_needs_the_same_on_both_sides():
-    def dependencies(path: Path) -> list[str]:
-        return tomllib.loads(path.read_text())["project"]["dependencies"]
-
-    rovers = dependencies(v.ONBOARD / "pyproject.toml")
-    assert dependencies(ROOT / "pyproject.toml") == rovers
-    ours, theirs = (
-        tomllib.loads(p.read_text())["project"]["optional-dependencies"]
-        for p in (ROOT / "pyproject.toml", v.ONBOARD / "pyproject.toml")
-    )
+    whole, onboard = (tomllib.loads((p / "pyproject.toml").read_text())["project"] for p in (ROOT, v.ONBOARD))
+    assert whole["dependencies"] == onboard["dependencies"]
+    ours, theirs = whole["optional-dependencies"], onboard["optional-dependencies"]
     assert theirs["view"] == ours["view"] and re.search(r"^aiohttp==", w.VIEW.read_text(), re.MULTILINE)
     assert ours["torch"] == theirs["torch"] and set(ours["torch"]) < set(ours["workshop"])
-    rovers += theirs["torch"]
     pinned = set(re.findall(r"^([\w-]+)==", w.REQUIREMENTS["torch"].read_text(), re.MULTILINE))
-    assert {re.split(r"[=<>]", line)[0] for line in rovers} <= pinned
+    assert {re.split(r"[=<>]", line)[0] for line in onboard["dependencies"] + theirs["torch"]} <= pinned
 
 
 def test_the_others_come_by_hash_for_each_python_and_aarch64(tmp_path, monkeypatch):

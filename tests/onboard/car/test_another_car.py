@@ -1,11 +1,11 @@
 """A car other than the first: its recordings, its artifacts, its reverse, and its policy on a different car."""
 
-import json
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from recorded import content_of, edit_json, record_there_and_back
 
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -14,37 +14,24 @@ from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.drive.session import arm_capped
 from rover_lib.onboard.errors import ArtifactError, CarError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import About, EpisodeWriter, read_car_of
+from rover_lib.onboard.recording.episode import read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 
 CRAWLER = read_car(Path(__file__).parents[3] / "lab" / "cars" / "crawler.yml")
 
 
-def episode(folder, car, name="episode_20260101_000000"):
-    with EpisodeWriter(folder / name, About("back and forth", car=car), resolution=(64, 36)) as writer:
-        for n in range(60):
-            throttle = 0.1 if n < 30 or not car.reverses else -0.1
-            pulses = car.pwm.pulses(0.5, throttle)
-            periods = car.numbers[0], car.numbers[4]
-            writer.control(n / 30, n * 33, pulses.steering_us, pulses.throttle_us, *periods)
-            writer.frame(n / 30, np.full((36, 64, 3), n, np.uint8))
-    return folder / name
-
-
 def test_a_recording_carries_its_car(tmp_path):
-    folder = episode(tmp_path, CRAWLER)
-    assert read_car_of(folder) == CRAWLER and read_car_of(episode(tmp_path / "first", Car())) == Car()
-    controls = json.loads((folder / "episode_data.json").read_text())["control_samples"]
-    assert {row["throttle_raw_us"] for row in controls} == {1550, 1450}
+    folder = record_there_and_back(tmp_path / "episode_0", CRAWLER)
+    assert read_car_of(folder) == CRAWLER
+    assert read_car_of(record_there_and_back(tmp_path / "first/episode_0", Car())) == Car()
+    assert {row["throttle_raw_us"] for row in content_of(folder)["control_samples"]} == {1550, 1450}
     actions = np.concatenate([s.chunk for s in load_recordings(tmp_path).samples])
     assert (actions[:, 1].min(), actions[:, 1].max(), actions[0, 0]) == pytest.approx((-0.1, 0.1, 0.5))
 
 
 def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):
-    good, bad = episode(tmp_path, CRAWLER), episode(tmp_path, CRAWLER, "episode_20260101_000100")
-    content = json.loads((bad / "episode_data.json").read_text())
-    content["metadata"]["car"]["steering"]["neutral_us"] = 5
-    (bad / "episode_data.json").write_text(json.dumps(content))
+    good, bad = (record_there_and_back(tmp_path / name, CRAWLER) for name in ("episode_0", "episode_1"))
+    edit_json(bad / "episode_data.json", lambda content: content["metadata"]["car"]["steering"].update(neutral_us=5))
     recordings = load_recordings(tmp_path)
     assert [e.id for e in recordings.episodes] == [good.name]
     assert any(fault.kind == "no_car" for fault in recordings.faults)

@@ -3,8 +3,6 @@
 import itertools
 import os
 import re
-import subprocess
-import sys
 from contextlib import suppress
 
 import cv2
@@ -18,33 +16,12 @@ from hypothesis import strategies as st
 from rover_lib.onboard.car.picture import block_sums, brightness, check_jpeg, decode_jpeg, read_jpeg
 from rover_lib.onboard.errors import CameraError
 
-MOST_MB, MOST_S = 300, 5
-
 
 def test_what_is_not_all_of_a_cameras_picture_is_refused_cheaply(tmp_path):
-    """In a child that may take no more than 300 MB and 5 s beyond what it began with, for any of them."""
-    for i, data in enumerate(HOSTILE.values()):
-        (tmp_path / f"{i:03d}.jpg").write_bytes(data)
-    code = f"""
-import resource, sys, time
-from pathlib import Path
-from rover_lib.onboard.errors import CameraError
-from rover_lib.onboard.car.picture import read_jpeg
-def most_mb(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-before = most_mb()
-taken = int(Path("/proc/self/statm").read_text().split()[0]) * 4096
-resource.setrlimit(resource.RLIMIT_AS, (taken + {MOST_MB} * 1_000_000,) * 2)
-worst_s = 0
-for path in sorted(Path(sys.argv[1]).iterdir()):
-    begin = time.process_time()
-    try: read_jpeg(path); sys.exit(f"{{path}} was taken")
-    except CameraError: worst_s = max(worst_s, time.process_time() - begin)
-print(most_mb() - before, worst_s)
-"""
-    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    mb, seconds = map(float, done.stdout.split())
-    assert mb < MOST_MB and seconds < MOST_S
+    for name, data in HOSTILE.items():
+        (tmp_path / "picture.jpg").write_bytes(data)
+        said = hostile.outcome_of(read_jpeg, tmp_path / "picture.jpg", most_s=5, most_bytes=300_000_000)
+        assert said.startswith("said "), f"{name}: {said}"
 
 
 def test_what_a_camera_may_send_is_decoded_as_opencv_does():

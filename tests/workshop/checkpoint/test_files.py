@@ -4,13 +4,11 @@ import json
 import resource
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, memory_samples
+from policies import TINY, check_is, lerobot_policy, memory_samples
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
-from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_can_hold, write_lerobot, write_trainer
@@ -33,21 +31,6 @@ def config(tiny):
     return replace(tiny.config, vae_layers=0)
 
 
-def lerobots_chunk(folder, sample, config):
-    """Return the chunk, (C, A), that LeRobot's own classes plan, its processors included."""
-    from lerobot.policies.act.modeling_act import ACTPolicy
-    from lerobot.policies.factory import make_pre_post_processors
-
-    policy = ACTPolicy.from_pretrained(folder)
-    before, after = make_pre_post_processors(policy.config, pretrained_path=str(folder))
-    frame = prepare_frame(sample.frame_bgr(), *config.image_sizes[0]).astype(np.float32) / 255
-    observation = {
-        "observation.images.cam_front": torch.from_numpy(frame).permute(2, 0, 1),
-        "observation.state": torch.from_numpy(sample.state),
-    }
-    return after(policy.predict_action_chunk(before(observation)))[0]
-
-
 def test_the_trainers_file(config, weights, tmp_path):
     for path in (tmp_path / "best_model.pth", tmp_path / "again.pth"):
         write_trainer(path, config, weights, 0.25, ORIGIN, **SETTINGS)
@@ -64,6 +47,9 @@ def test_the_trainers_file(config, weights, tmp_path):
     ids=["raw actions", "normalised"],
 )
 def test_lerobots_folder(config, weights, tmp_path, norms):
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
     config = replace(config, **norms)
     write_lerobot(tmp_path / "pretrained_model", config, weights, ORIGIN)
     read = load_checkpoint(tmp_path / "pretrained_model")
@@ -71,7 +57,8 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     expected = predictions(ACT(config, weights), [inputs_of(sample, config)])[0]
     ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
     assert (ours - expected).abs().max() < 1e-5
-    assert (lerobots_chunk(tmp_path / "pretrained_model", sample, config) - expected).abs().max() < 1e-5
+    policy = ACTPolicy.from_pretrained(tmp_path / "pretrained_model")
+    check_is(read, policy, *make_pre_post_processors(policy.config, str(tmp_path / "pretrained_model")))
 
 
 def test_a_full_disk_is_one_sentence(config, weights, tmp_path):

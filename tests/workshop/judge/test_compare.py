@@ -37,17 +37,10 @@ class Fixed:
         return self.base + np.float32(off)
 
 
-def sample(pads=0, recorded=((0, 0),) * CHUNK):
-    is_pad = np.arange(CHUNK) >= CHUNK - pads
-    frame = np.zeros((4, 6, 3), np.uint8)
-    return SimpleNamespace(
-        frame_bgr=lambda: frame,
-        state=np.zeros(2, np.float32),
-        chunk=np.float32(recorded),
-        is_pad=is_pad,
-        episode="episode",
-        frame_name="frame_000001.jpg",
-    )
+def sample(pads=0):
+    seen = {"frame_bgr": lambda: np.zeros((4, 6, 3), np.uint8), "state": np.zeros(2, np.float32)}
+    did = {"chunk": np.zeros((CHUNK, 2), np.float32), "is_pad": np.arange(CHUNK) >= CHUNK - pads}
+    return SimpleNamespace(**seen, **did, episode="episode", frame_name="frame_000001.jpg")
 
 
 @pytest.fixture
@@ -76,9 +69,8 @@ def test_padded_steps_count_in_the_plan_but_not_against_the_recording(report):
     assert report.is_pad.sum() == 2
     assert found["steering_mae_pct"] == pytest.approx(0.008 / 6 / 0.8 * 100, rel=1e-4)
     # FP32 against a recorded (0, 0): the steps 0.1, 0.2, 0.3 of frame 1, and 0.1 of frame 2
-    assert report.recorded_error(report.reference)["steering_vs_recorded_pct"] == pytest.approx(
-        0.7 / 4 / 0.8 * 100, rel=1e-4
-    )
+    recorded = report.recorded_error(report.reference)
+    assert recorded["steering_vs_recorded_pct"] == pytest.approx(0.7 / 4 / 0.8 * 100, rel=1e-4)
 
 
 def test_an_error_is_also_the_delay_that_moves_the_plan_as_far():
@@ -93,9 +85,8 @@ def test_an_error_is_also_the_delay_that_moves_the_plan_as_far():
     for less_pct, passed in ((0.1, False), (0.0, True), (-0.1, True)):  # those that lost worlds steered less
         found["modes"]["static"]["steering_less_pct"] = less_pct
         assert compare.gates(found, LIMITS)[0]["passed"] is passed
-    assert (
-        compare.gates(metrics_of(worst_tenth_pct=0.05, steering_less_pct=-0.1) | looking, LIMITS)[0]["passed"] is False
-    )
+    worse = metrics_of(worst_tenth_pct=0.05, steering_less_pct=-0.1) | looking
+    assert compare.gates(worse, LIMITS)[0]["passed"] is False
 
 
 def test_the_worst_tenth_and_the_highest_errors_by_hand():

@@ -14,9 +14,10 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import TINY, lerobot_policy, memory_samples, normalised, smooth_frame
+from policies import TINY, lerobot_policy, memory_samples, saved_normalised
 from pyarrow import parquet
 from recorded import edit_json as edit
+from recorded import lerobot_dataset as make_dataset
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -78,14 +79,12 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        (info(codebase_version="v1.6"), "only v2 and v3"),
         (info(codebase_version="v4.0"), "only v2 and v3"),
         (info(fps=0), "frames per second"),
         (info(codebase_version="v2.1", features={}), "features with dtype and shape, and meta/episodes_stats.jsonl is"),
         ("[" * 100_000, "JSON"),
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (features(front=None), "has no camera"),
-        (features(left=info()["features"]["observation.images.front"]), "has 2 cameras, found front, left"),
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
         (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
@@ -115,38 +114,15 @@ def test_our_own_recordings_say_their_names_themselves(tmp_path):
 # ---- what LeRobot's writer made ------------------------------------------------------------------------------------
 
 
-def make(root, kind):
-    """EPISODES of FRAMES by LeRobot's writer."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    row = {"dtype": "float32", "shape": (2,), "names": list(CAR)}
-    picture = {"dtype": kind, "shape": (*SIZE, 3), "names": ["height", "width", "channels"]}
-    features = {CAM: picture, "observation.state": row, "action": row}
-    video = {"use_videos": kind == "video", "video_backend": "pyav"}
-    made = LeRobotDataset.create("local/made", FPS, features, root=root, **video)
-    rng = np.random.default_rng(0)
-    for episode in range(EPISODES):
-        for _ in range(FRAMES + episode):
-            row = {
-                CAM: smooth_frame(rng, *SIZE),
-                "observation.state": rng.uniform(0, 0.5, 2).astype(np.float32),
-                "action": rng.uniform(0, 0.5, 2).astype(np.float32),
-                "task": f"hit the {episode}. balloon",
-            }
-            made.add_frame(row)
-        made.save_episode()
-    made.finalize()
-    return root
-
-
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory):
-    """Makes each kind once; LeRobot's tables go into a cache of this module's."""
-    import datasets as huggingface
+    """Makes each kind once."""
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(huggingface.config, "HF_DATASETS_CACHE", tmp_path_factory.mktemp("cache"))
-        yield functools.cache(lambda kind="image": make(tmp_path_factory.mktemp("made") / kind, kind))
+    def make(kind="image"):
+        root = tmp_path_factory.mktemp("made") / kind
+        return make_dataset(root, {"cam_front": SIZE}, CAR, FPS, range(FRAMES, FRAMES + EPISODES), kind, 0.5)
+
+    return functools.cache(make)
 
 
 @pytest.fixture
@@ -204,14 +180,10 @@ def column(name, value=..., row=0):
     return change
 
 
-POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 128 72\nshowpage\n"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "file", "damage", "says"),
     [
-        ("image", DATA, lambda p: p.unlink(), "has no data/chunk-000/file-000.parquet"),
         ("image", EPISODES_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be read"),
         ("video", VIDEO_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be decoded"),
         # what LeRobot accepts without a word
@@ -236,7 +208,6 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
 @pytest.mark.parametrize(
     ("file", "damage", "kind", "left"),
     [
-        (DATA, column(CAM, {"bytes": POSTSCRIPT, "path": "x.eps"}, -1), "broken_picture", 32),
         (DATA, column(CAM, None, 3), "broken_picture", 32),
         (DATA, column("observation.state", [0.1, np.nan]), "not_finite", 23),
         ("meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=99)), "another_total", 33),
@@ -479,10 +450,7 @@ def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, da
 def trained(tmp_path_factory):
     """A LeRobot policy of two numbers that its dataset calls [throttle, steering], with statistics of both."""
     folder = tmp_path_factory.mktemp("trained")
-    policy = lerobot_policy(**TINY)
-    inner, outer, _ = normalised(policy, "MEAN_STD")
-    for part in (policy, inner, outer):
-        part.save_pretrained(folder)
+    saved_normalised(lerobot_policy(**TINY), folder)
     return folder
 
 

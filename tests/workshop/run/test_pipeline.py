@@ -17,14 +17,6 @@ from rover_lib.workshop.run.pipeline import Recipe, export_onnx
 from rover_lib.workshop.run.session import Opened
 
 
-@pytest.fixture
-def loaded(tiny):
-    parts = SimpleNamespace(
-        calibration=tuple(memory_samples(4)), choosing=tuple(memory_samples(3, seed=1)), held_out=()
-    )
-    return Opened(tiny, None, parts)
-
-
 def test_the_schemes_of_a_run():
     recipe = Recipe.of(params())
     schemes = pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed", float_blocks=("head",)))
@@ -44,12 +36,11 @@ def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibra
 
 
 @pytest.mark.parametrize("another", ["artifact", "calibration"])
-def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(
-    artifacts, thin, loaded, tmp_path, monkeypatch, another
-):
+def test_a_run_whose_files_do_not_fit_each_other_gets_no_onnx_at_all(artifacts, thin, tmp_path, monkeypatch, another):
     """Not even the FP32 one, which would lie there beside a static policy that is another."""
-    policy, calibration = thin
-    monkeypatch.setattr(pipeline, "open_run", lambda *_: Opened(policy, None, loaded.parts))
+    (policy, calibration), few = thin, tuple(memory_samples(3))
+    parts = SimpleNamespace(calibration=few, choosing=few, held_out=())
+    monkeypatch.setattr(pipeline, "open_run", lambda *_: Opened(policy, None, parts))
     calibration.save(tmp_path / "calibration.pt")
     made = artifacts["static"] if another == "calibration" else artifacts["mixed"]
     (tmp_path / "policy_static.pt").write_bytes(made.read_bytes())

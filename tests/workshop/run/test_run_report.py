@@ -1,12 +1,12 @@
 """What a run ends with: run.json, words, and a card."""
 
-import json
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 import yaml
+from recorded import edit_json
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
@@ -22,12 +22,6 @@ def run_dir(tmp_path, monkeypatch):
     folder = tmp_path / "runs" / "mine"
     shutil.copytree(DEMO, folder)
     return folder
-
-
-def change_stage(path, part, **values):
-    content = json.loads(path.read_text())
-    content[part] |= values
-    path.write_text(json.dumps(content))
 
 
 def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
@@ -48,7 +42,7 @@ DRIVES = re.compile(
 def test_what_is_not_ready_is_never_asked_to_drive(run_dir):
     """Nothing that a user sees of its end says so."""
     guesses = {"warnings": ["this policy is no better than a guess without eyes: the mean plan"]}
-    change_stage(run_dir / "compare.json", "metrics", guesses=guesses)
+    edit_json(run_dir / "compare.json", lambda content: content["metrics"].update(guesses=guesses))
     judged = report.write(run_dir)["metrics"]
     (listed,) = runs(run_dir.parent)
     seen = {"end": report.text(judged), "list": listed["verdict"]}
@@ -56,22 +50,21 @@ def test_what_is_not_ready_is_never_asked_to_drive(run_dir):
     assert {where: found.group() for where, words in seen.items() if (found := DRIVES.search(words))} == {}
 
 
-def of_another_run(path):
-    content = json.loads(path.read_text())
-    content["inputs"] = {name: "0" * 64 for name in content["inputs"]}
-    return json.dumps(content)
+def of_another_run(content):
+    content["inputs"] = dict.fromkeys(content["inputs"], "0" * 64)
 
 
 def test_times_of_what_the_run_was_before_are_no_verdict(run_dir):
     """A run that is made again keeps the benchmarks of other hosts."""
     (own,) = run_dir.glob("benchmark-*.json")
-    (run_dir / "benchmark-a-host.json").write_text(of_another_run(own))
+    shutil.copy(own, run_dir / "benchmark-a-host.json")
+    edit_json(run_dir / "benchmark-a-host.json", of_another_run)
     inputs = report.write(run_dir)["inputs"]
     assert own.name in inputs and "benchmark-a-host.json" not in inputs
     own.unlink()
     with pytest.raises(RoverError, match="no benchmark of its artifacts"):
         report.write(run_dir)
-    (run_dir / "compare.json").write_text(of_another_run(run_dir / "compare.json"))
+    edit_json(run_dir / "compare.json", of_another_run)
     with pytest.raises(RoverError, match=r"compare\.json: is of other"):
         report.write(run_dir)
 
@@ -117,9 +110,7 @@ def test_a_card_says_what_the_verdict_says_and_replaces_only_cards(run_dir):
 
 
 def test_a_run_that_is_not_whole_or_of_another_version_has_no_verdict(run_dir, tmp_path):
-    content = json.loads((run_dir / "quantize.json").read_text())
-    del content["metrics"]["modes"]
-    (run_dir / "quantize.json").write_text(json.dumps(content))
+    edit_json(run_dir / "quantize.json", lambda content: content["metrics"].pop("modes"))
     with pytest.raises(RoverError, match="lack 'modes'"):
         report.write(run_dir)
     (run_dir / "compare.json").unlink()

@@ -1,12 +1,13 @@
 """A checkpoint that was trained on older firmware's actions, and one that was not, on the same recordings."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from recorded import record_drives
+from test_episodes import OLD as WAS
+from test_episodes import edit, rewritten
 
 from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -21,13 +22,8 @@ PWM = PwmCalibration()
 @pytest.fixture
 def old_recordings(tmp_path):
     """Drives as older firmware wrote them."""
-    for path in record_drives(tmp_path).glob("episode_*/episode_data.json"):
-        content = json.loads(path.read_text())
-        for row in content["control_samples"]:
-            for name, formula in OLD.items():
-                duty = 100 * row[f"{name}_raw_us"] / row[f"{name}_period_us"]
-                row[f"{name}_normalized"] = round(float(formula.actions(np.array(duty))), 4)
-        path.write_text(json.dumps(content))
+    for folder in record_drives(tmp_path).iterdir():
+        edit(folder, rewritten(WAS))
     return load_recordings(tmp_path)
 
 
