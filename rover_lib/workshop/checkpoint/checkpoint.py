@@ -251,9 +251,9 @@ def normalisation(c: ActConfig) -> dict[str, str]:
 
 def _words(c: ActConfig, facts: Facts) -> dict[str, Any]:
     """What reports say of a policy beyond its weights, and who says it."""
-    known = {fact: f"{value} ({by})" for fact, (value, by) in facts.known.items()}
     sizes = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(c.cameras, c.image_sizes, strict=True))
-    known |= {"size": f"{sizes} ({facts.source('size')})"}
+    words = {"size": sizes, "actions": ", ".join(c.action_names), "rate": f"{c.rate_hz:g} steps a second"}
+    known = {fact: f"{words.get(fact, value)} ({by})" for fact, (value, by) in facts.known.items()}
     guesses = [f"its {fact}: {by}" for fact, (_, by) in facts.known.items() if by.startswith(GUESS)]
     return {"known": known, "guesses": guesses, "normalisation": normalisation(c)}
 

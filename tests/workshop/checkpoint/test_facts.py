@@ -67,7 +67,7 @@ def test_files_beside_a_checkpoint_are_asked_about_or_read(tiny_policy, tmp_path
     stats.unlink()
     (tmp_path / "config.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
     found = load_checkpoint(path)
-    assert found.report["known"]["rate"] == "15.0 (config.yaml:fps)" and found.identity != found.sha256
+    assert found.report["known"]["rate"] == "15 steps a second (config.yaml:fps)" and found.identity != found.sha256
 
 
 def test_a_rate_and_an_order_are_used_and_other_keys_are_named(tiny, tiny_policy, tmp_path):
