@@ -9,6 +9,7 @@ import pytest
 from executed import run_cells
 
 from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import run_report
 from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
@@ -129,6 +130,14 @@ def test_root_learns_at_once_that_it_may_load_no_artifact(old_run, monkeypatch):
 
 
 # --- turning parameters ---
+
+
+def test_the_first_notebook_again_loads_what_its_run_was_made_of(tmp_path, monkeypatch):
+    write_stage(tmp_path / "load.json", "load", params={"checkpoint": "c.pth", "episodes": "e"}, metrics={}, inputs={})
+    given = []
+    monkeypatch.setattr(runs, "_execute", lambda source, folder, values, bars: given.append(values))
+    runs.execute("01_load", tmp_path, episodes="others")
+    assert given == [{"checkpoint": "c.pth", "episodes": "others"}]
 
 
 @pytest.mark.parametrize("name", runs.NAMES + runs.AFTERWARDS)

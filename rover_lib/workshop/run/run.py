@@ -13,10 +13,10 @@ import re
 import shutil
 import socket
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import nbformat
 from jupyter_client.kernelspec import KernelSpec
@@ -28,7 +28,7 @@ from rover_lib.onboard.durable import ASKED, build_folder, sync_disk
 from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
-from rover_lib.onboard.stage import atomic_path
+from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import run_folder
 
@@ -150,6 +150,8 @@ def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
     if not folder.is_dir():
         raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
     _refuse_unknown([source], overrides)
+    if name == NAMES[0] and (folder / "load.json").is_file():  # again what the run was made of, unless said otherwise
+        overrides = read_stage(folder / "load.json", "load")["params"] | overrides
     _execute(source, folder, overrides, False)
     return folder / source.name
 
@@ -171,7 +173,7 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
     how = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "kernel_manager_class": ThisPython}
-    with set_environment(KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
+    with patch.dict(os.environ, KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
@@ -195,19 +197,6 @@ def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
         lines.append(f"{name} = {literal}" + (f"  # {comment}" if comment else ""))
     cell.source = "\n".join(lines)
     return notebook
-
-
-@contextmanager
-def set_environment(values: dict[str, str]) -> Iterator[None]:
-    """Set these values in os.environ, which a kernel inherits, and restore the old ones afterwards."""
-    before = {key: os.environ[key] for key in values.keys() & os.environ.keys()}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for key in values:
-            del os.environ[key]
-        os.environ.update(before)
 
 
 def _sentence(error: Any) -> str:
