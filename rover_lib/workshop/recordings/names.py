@@ -12,7 +12,7 @@ from rover_lib.workshop.untrusted import quote, quote_all
 STATE, ACTION = "observation.state", "action"
 Named = tuple[tuple[str, ...], tuple[int, ...]]  # names and their columns: a car's [steering, throttle], or as they lie
 OTHER_WORDS = {  # how they begin; of a name with words for both, as angular_velocity, the first counts
-    "steering": "steer|ang|turn|yaw|rudder|rotat|theta|wheel|wz",
+    "steering": "steer|ang|turn|yaw|rudder|rot|theta|wheel|wz",
     "throttle": "throttl|gas|speed|lin|accel|forward|vel|drive|pedal|motor|vx",
 }
 
