@@ -336,7 +336,8 @@ def _stuck(run: Run) -> str | None:
             if (count := int(on[begin:end].sum())) > STUCK_MS:
                 return f"{count} ms of throttle until {armed + end} ms while the car stands"
     for _, ms, words in run.seen.drives:
-        if "does not move" in (words or "") and not stands[max(0, ms - 1400) : ms].all():
+        # The picture that it was judged by may be a tenth of a second old.
+        if "does not move" in (words or "") and not stands[max(0, ms - 1400) : ms - 100].all():
             return f"stopped at {ms} ms as stuck, and it moved"
     return None
 
