@@ -51,13 +51,14 @@ STATES = "state|joint|qpos|proprio"  # in other names of a state
 DRIVEN_BY = "driven_by"  # who drove where nobody intervened
 CAR = "car"  # and of them all, the content of their car.yml
 UNEVEN = 0.1  # the time between two frames may differ by this share
+WRITE_ANEW = "copy it whole, or let LeRobot write it anew"
 BATCH = 256  # pictures that are read at once
 OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-000-checkpoint.parquet"
 
 
 def _broken(what: str, found: object = None) -> EpisodeError:
     """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
-    return EpisodeError(f"{what}: a broken dataset", found=found, remedy="copy it whole, or let LeRobot write it anew")
+    return EpisodeError(f"{what}: a broken dataset", found=found, remedy=WRITE_ANEW)
 
 
 def is_dataset(root: Path) -> bool:
@@ -174,7 +175,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     listed = progress(dataset.entries, desc="reading episodes", total=len(dataset.entries))
     episodes = [episode for entry in listed if (episode := dataset.episode(entry, chunk)).samples]
     if not episodes:
-        raise faults.nothing_usable("no usable sample", "copy it whole, or let LeRobot write it anew")
+        raise faults.nothing_usable("no usable sample", WRITE_ANEW)
     if layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     return Recordings(dataset.root, leave_out_copies(episodes, faults), faults.listed(), source, layout)
