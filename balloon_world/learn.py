@@ -19,6 +19,7 @@ from balloon_world.drives import SEED, car_in_key, count_hits, drive_in, drive_m
 from balloon_world.record import BETWEEN_DRIVES, WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
+from rover_learn.training import Machine
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.pilot import Order
 from rover_lib.onboard.drive.plan import Settings
@@ -186,8 +187,8 @@ class _Lab:
         target, runs_dir = self._learned(arm, number), self.folder / "learned"
         if not (target.parent / "finetune.json").is_file():
             episodes, recipe = [self.run_dir / EPISODES, *recorded], self.experiment.recipe()
-            how: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "device": "cpu", "progress": self.progress}
-            finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), **how)
+            how: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "progress": self.progress}
+            finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), machine=Machine.of("cpu"), **how)
         learned = load(target.parent / CHECKPOINT, self.run_dir / EPISODES, self.progress)
         make_artifact(learned, target, pipeline.Recipe.of(params()), progress=self.progress)
 

@@ -23,7 +23,7 @@ REPEATED_STEPS, INTERRUPTED_AT = 120, 60  # of the trainings that should give th
 
 
 class Phases:
-    """What each phase takes, by its bar: steps, s, and data_s, of it waiting for data. stop_at: ends after so many."""
+    """A bar that times a training's phases, and its waiting for data. stop_at: interrupts after so many steps."""
 
     def __init__(self, stop_at: int | None = None):
         self.rows: dict[str, dict[str, float]] = {}
@@ -86,5 +86,5 @@ def measure(episodes: Path, device: str = "cuda", size: str = "full") -> dict[st
 def _train(episodes: Path, folder: Path, size: str, device: str, **options: Any) -> dict[str, torch.Tensor]:
     """Train with a cache of its own in this folder, and return the weights."""
     os.environ["ROVER_CACHE"] = str(folder / "cache")
-    made = train(episodes, folder / "policy.pth", size, device=device, **options)
+    made = train(episodes, folder / "policy.pth", size, machine=Machine.of(device), **options)
     return torch.load(made, weights_only=False)["model_state_dict"]

@@ -1,5 +1,6 @@
 """The commands that teach policies. `rover` has them by entry points of pyproject.toml."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,14 @@ if TYPE_CHECKING:
 
 
 def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
-    """Add what every training can be told: how long it lasts, and what it computes on."""
+    """Add what every training can be told: how long it lasts, and what it computes on, which it gets as a Machine."""
+
+    @functools.wraps(command)
+    def called(*args: Any, device: str | None, workers: int | None, amp: bool, **options: Any) -> None:
+        from rover_learn.training import Machine
+
+        return command(*args, machine=Machine.of(device, workers, amp), **options)
+
     for option in (
         click.option("--amp/--no-amp", default=False, show_default=True, help="Mixed precision, in bfloat16."),
         click.option("--workers", type=click.IntRange(min=0), help="Threads that read ahead [default: all for a GPU]."),
@@ -24,8 +32,8 @@ def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--batch", type=click.IntRange(min=1), help="Samples in each step [default: params.yml]."),
         click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml]."),
     ):
-        command = option(command)
-    return command
+        called = option(called)
+    return called
 
 
 def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:

@@ -61,18 +61,16 @@ def distill(
     *,
     runs_dir: Path | str = "runs",
     recipe: DistillRecipe | None = None,
-    device: str | None = None,
-    workers: int | None = None,
-    amp: bool = False,
+    machine: Machine | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Teach a student of that shape what the checkpoint plans on these recordings. Returns the run's folder.
 
-    recipe: params.yml's if None. device: 'cpu', 'cuda' or None for the best there is. Ended at any moment and started
+    recipe: params.yml's if None. machine: the best there is if None. Ended at any moment and started
     again with the same arguments, it goes on and gives the same student. The folder appears only when it is complete.
     Raises TrainingError for a student, a device or recordings that cannot be, and for a run that is there.
     """
-    folder, machine = free_folder(runs_dir, name), Machine.of(device, workers, amp)
+    folder, machine = free_folder(runs_dir, name), machine or Machine.of()
     recipe = recipe or DistillRecipe.of()
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint

@@ -73,19 +73,17 @@ def finetune(
     *,
     runs_dir: Path | str = "runs",
     recipe: FinetuneRecipe | None = None,
-    device: str | None = None,
-    workers: int | None = None,
-    amp: bool = False,
+    machine: Machine | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Let a checkpoint go on learning from old and new recordings, and return the run's folder.
 
     episodes: folders of recordings. The first has the old ones, which the checkpoint was trained on; the others have
     the new ones. An episode in which a policy drove is new in whichever folder it is. recipe: None takes that of
-    params.yml. device: 'cpu', 'cuda', or None for the best that there is. It resumes as `distill` does.
+    params.yml. machine: None takes the best that there is. It resumes as `distill` does.
     Raises TrainingError for a name, a device or recordings that cannot be used; CheckpointError, EpisodeError.
     """
-    folder, machine = free_folder(runs_dir, name), Machine.of(device, workers, amp)
+    folder, machine = free_folder(runs_dir, name), machine or Machine.of()
     recipe = recipe or FinetuneRecipe.of()
     parent, read = _open(checkpoint, [Source.of(each) for each in episodes], progress)
     material = _part_episodes(read, recipe)

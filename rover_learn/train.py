@@ -112,12 +112,10 @@ def train(
     size: str = "small",
     seed: int = 0,
     steps: int | None = None,
-    device: str | None = None,
-    progress: Progress = silent,
-    *,
     batch: int | None = None,
-    workers: int | None = None,
-    amp: bool = False,
+    *,
+    machine: Machine | None = None,
+    progress: Progress = silent,
     say: Callable[[str], object] = silent,
 ) -> Path:
     """Train a policy on recordings and write its checkpoint in the format of the user's trainer.
@@ -125,15 +123,15 @@ def train(
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
     part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
     size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
-    None: the recipe's. device, workers, amp: as of `Machine.of`. say: is told what it trains on, and how that went.
+    None: the recipe's. machine: None takes the best that there is. say: is told what it trains on, and how that went.
 
     Returns out_path, which appears complete or not at all; beside it are its <name>_curves/. On one machine's processor
     the same input gives the same weights, even if training was ended at any moment and started again; a GPU may add in
     another order. A checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
-    out_path, source = Path(out_path), Source.of(episodes)
-    machine = Machine.of(device, workers, amp)
+    out_path = Path(out_path)
+    machine = machine or Machine.of()
     kind = machine.device.type
     say(f"training on {machine.words()}")
     if size not in SIZES:
@@ -145,11 +143,11 @@ def train(
     if batch is not None:
         recipe = replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch)
     p = params()["calibration"]
-    recordings = load_recordings(source, SIZES[size].chunk, p["sync_s"], progress)
+    recordings = load_recordings(episodes, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
     made_of = {"size": asdict(SIZES[size]), "recipe": asdict(recipe), "seed": seed, "split": p}
     made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
-    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if amp else {})
+    made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})
     learners = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
     sources = () if size == "full" and steps is None else learners
     unfinished = cache_root() / f"training-{key_of(made_of, *sources)}"  # another device goes on, if its recipe is this
@@ -168,6 +166,11 @@ def train(
 
     made = cache_folder("checkpoint", key_of({**made_of, "device": kind}, *sources), make)
     shutil.rmtree(unfinished, ignore_errors=True)
+    return _leave(made, out_path)
+
+
+def _leave(made: Path, out_path: Path) -> Path:
+    """Copy a policy out of the cache, after its curves. Those of older programs have none."""
     if (curves := made / "curves").is_dir():
         shutil.copytree(curves, out_path.with_name(f"{out_path.stem}_curves"), dirs_exist_ok=True)
     with atomic_path(out_path) as temporary:
@@ -359,8 +362,7 @@ def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, 
         images = data.pictures(chosen[step * batch : (step + 1) * batch])
         return np.ascontiguousarray(images[:, :, ::-1]) if view == "mirrored" else images
 
-    count = -(-len(chosen) // batch)
-    for _, images in training.saved.steps(f"features, {view}", count, training.rng, read, maps=maps):
+    for _, images in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, read, maps=maps):
         with torch.no_grad():
             maps.append(backbone(loop.normalised(torch.from_numpy(images).to(training.device)))["feature_map"].cpu())
     return maps

@@ -92,8 +92,8 @@ class Machine:
 class Frames:
     """Samples as arrays with a row for each, and their pictures at one size.
 
-    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. workers:
-    threads that read pictures. kept: by row, those that were read, unless all of them need too much memory.
+    size: (height, width). states: (n, 2) float32. chunks: (n, chunk, 2) float32. is_pad: (n, chunk) bool. pool:
+    reads pictures, if there is one. kept: by row, those that were read, unless all of them need too much memory.
     """
 
     samples: tuple[Sample, ...]
@@ -101,7 +101,7 @@ class Frames:
     states: np.ndarray
     chunks: np.ndarray
     is_pad: np.ndarray
-    workers: int
+    pool: ThreadPoolExecutor | None
     kept: dict[int, np.ndarray] | None
 
     @classmethod
@@ -111,17 +111,16 @@ class Frames:
         is_pad = np.stack([s.is_pad for s in samples])
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         kept: dict[int, np.ndarray] | None = {} if 3 * len(samples) * math.prod(size) <= memory * MEMORY_SHARE else None
-        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad, workers, kept)
+        pool = ThreadPoolExecutor(workers) if workers else None  # decoders and OpenCV release the interpreter's lock
+        return cls(samples, size, states.astype(np.float32), chunks.astype(np.float32), is_pad, pool, kept)
 
     def __len__(self) -> int:
         return len(self.samples)
 
     def pictures(self, rows: np.ndarray) -> np.ndarray:
         """Return these rows' pictures, (n, height, width, 3) uint8 RGB. Raises EpisodeError if one is gone."""
-        if not self.workers:
-            return np.stack([self._picture(row) for row in rows.tolist()])
-        with ThreadPoolExecutor(self.workers) as pool:  # decoders and OpenCV release the interpreter's lock
-            return np.stack(list(pool.map(self._picture, rows.tolist())))
+        read = self.pool.map if self.pool else map
+        return np.stack(list(read(self._picture, rows.tolist())))
 
     def _picture(self, row: int) -> np.ndarray:
         if self.kept is not None and row in self.kept:

@@ -12,6 +12,7 @@ from rover_learn import training
 from rover_learn.distill import Distillation, DistillRecipe, distill, summary
 from rover_learn.phases import Learned
 from rover_learn.student import StudentShape
+from rover_learn.training import Machine
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
@@ -31,7 +32,7 @@ def recipe():
 
 @pytest.fixture(scope="module")
 def taught(car_policy, episodes, recipe, module_cache):
-    return distill(car_policy, episodes, "fast", SHAPE, runs_dir=module_cache, recipe=recipe, device="cpu")
+    return distill(car_policy, episodes, "fast", SHAPE, runs_dir=module_cache, recipe=recipe, machine=Machine.of("cpu"))
 
 
 def metrics_of(folder):
@@ -62,7 +63,7 @@ def test_killed_twice_in_the_middle_it_goes_on_and_gives_the_same(
     car_policy, episodes, recipe, taught, tmp_path, monkeypatch
 ):
     save_each_step(monkeypatch, distill_module)
-    arguments = {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    arguments = {"runs_dir": tmp_path, "recipe": recipe, "machine": Machine.of("cpu")}
     for at in (2, 8):  # in the backbone's phase with one step done, and in the transformer's with eight
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training, "descend", at)
@@ -79,7 +80,10 @@ def test_killed_twice_in_the_middle_it_goes_on_and_gives_the_same(
 @pytest.mark.slow
 def test_a_student_of_half_the_channels_keeps_its_zeros(car_policy, episodes, recipe, tmp_path, monkeypatch):
     """They stay zero in all phases, through an interrupt."""
-    shape, arguments = StudentShape(backbone_channels=0.5), {"runs_dir": tmp_path, "recipe": recipe, "device": "cpu"}
+    shape, arguments = (
+        StudentShape(backbone_channels=0.5),
+        {"runs_dir": tmp_path, "recipe": recipe, "machine": Machine.of("cpu")},
+    )
     save_each_step(monkeypatch, distill_module)
     steps = interrupt(monkeypatch, training, "descend", at=2)
     with pytest.raises(KeyboardInterrupt):
@@ -105,12 +109,13 @@ def test_a_run_that_is_there_is_not_overwritten(car_policy, episodes, tmp_path, 
     monkeypatch.setattr(Distillation, "leave", lambda self, new, *_: (new / "distill.json").touch())
     for _ in range(2):
         with pytest.raises(TrainingError, match="is there already"):
-            distill(car_policy, episodes, "fast", SHAPE, runs_dir=tmp_path, device="cpu")
+            distill(car_policy, episodes, "fast", SHAPE, runs_dir=tmp_path, machine=Machine.of("cpu"))
     assert not list((tmp_path / "fast").iterdir())
 
 
 @pytest.mark.parametrize("options", [{"shape": StudentShape()}, {"device": "tpu"}, {"name": "../fast"}])
 def test_what_cannot_be_taught_is_refused(car_policy, episodes, tmp_path, options):
+    given = {"name": "fast", "shape": SHAPE, "runs_dir": tmp_path / "runs", "device": "cpu", **options}
     with pytest.raises(TrainingError):
-        distill(car_policy, episodes, **{"name": "fast", "shape": SHAPE, "runs_dir": tmp_path / "runs", **options})
+        distill(car_policy, episodes, machine=Machine.of(given.pop("device")), **given)
     assert not (tmp_path / "runs").exists()

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from policies import smooth_frame
 
 from rover_learn.finetune import FinetuneRecipe, chance_of, change_points, finetune, human_samples, verdict
+from rover_learn.training import Machine
 from rover_lib.cli import main
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -57,7 +58,7 @@ def recipe():
 
 @pytest.fixture(scope="module")
 def taught(car_policy, old, new, recipe, module_cache):
-    return finetune(car_policy, [old, new], "better", runs_dir=module_cache, recipe=recipe, device="cpu")
+    return finetune(car_policy, [old, new], "better", runs_dir=module_cache, recipe=recipe, machine=Machine.of("cpu"))
 
 
 # --- what is learned from ---
@@ -109,7 +110,8 @@ def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old,
     for path in (*old.iterdir(), *new.iterdir()):
         (both / path.name).symlink_to(path)
     short = replace(recipe, transformer_steps=1, together_steps=0)
-    folder = finetune(taught / "pretrained_model", [both], "again", runs_dir=tmp_path, recipe=short, device="cpu")
+    how = {"runs_dir": tmp_path, "recipe": short, "machine": Machine.of("cpu")}
+    folder = finetune(taught / "pretrained_model", [both], "again", **how)
     metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
     assert [row["kind"] for row in metrics["held_out"]] == ["old", "old", "new"]
     weights = load_checkpoint(folder / "pretrained_model").weights
@@ -137,7 +139,7 @@ def shifted():
 def test_recordings_that_do_not_belong_to_the_old_ones_are_refused(says, options, car_policy, old, tmp_path):
     others = record(tmp_path / "others", drives=2, offset=90, **{"drivers": TAKEN_OVER, **options})
     with pytest.raises(TrainingError, match=says):
-        finetune(car_policy, [old, others], "better", runs_dir=tmp_path / "runs", device="cpu")
+        finetune(car_policy, [old, others], "better", runs_dir=tmp_path / "runs", machine=Machine.of("cpu"))
     assert not (tmp_path / "runs").exists()
 
 
@@ -149,7 +151,7 @@ def test_what_cannot_learn_is_refused(car_policy, old, new, tmp_path):
         ([old, old.parent / "." / old.name], "better", "given twice"),
     ):
         with pytest.raises(TrainingError, match=says):
-            finetune(car_policy, episodes, name, runs_dir=tmp_path / "runs", device="cpu")
+            finetune(car_policy, episodes, name, runs_dir=tmp_path / "runs", machine=Machine.of("cpu"))
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["there"]
 
 

@@ -11,11 +11,13 @@ from recorded import record_drives
 from rover_learn import train as train_module
 from rover_learn import training as training_module
 from rover_learn.train import SIZES, train
+from rover_learn.training import Machine
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.slow
+CPU, READING_AHEAD = Machine.of("cpu"), Machine.of("cpu", workers=2)
 
 # the keys of the user's best_model.pth
 CHECKPOINT_KEYS = [
@@ -39,7 +41,7 @@ def trained(drives, tmp_path_factory, set_params):
     folder = tmp_path_factory.mktemp("trained")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROVER_CACHE", str(folder / "cache"))
-        return train(drives, folder / "best_model.pth", device="cpu")
+        return train(drives, folder / "best_model.pth", machine=CPU)
 
 
 def test_the_checkpoint_is_the_trainers(trained):
@@ -72,9 +74,9 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     for kill_at in (2, 4, 6):  # in the second of backbone's steps, then of the transformer's and of all together's
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training_module, "descend", kill_at)
-            train(drives, out, device="cpu", workers=2)
+            train(drives, out, machine=READING_AHEAD)
         assert not out.exists()
-    resumed = train(drives, out, device="cpu", workers=2)
+    resumed = train(drives, out, machine=READING_AHEAD)
     killed, whole = (torch.load(path, weights_only=False) for path in (resumed, trained))
     assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(v, killed["model_state_dict"][k]) for k, v in whole["model_state_dict"].items())
@@ -86,8 +88,8 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
     with monkeypatch.context() as patch:  # now it is taken from the cache
         patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
-        assert train(drives, tmp_path / "again.pth", device="cpu").read_bytes() == out.read_bytes()
-    other = torch.load(train(drives, tmp_path / "other.pth", seed=1, device="cpu"), weights_only=False)
+        assert train(drives, tmp_path / "again.pth", machine=CPU).read_bytes() == out.read_bytes()
+    other = torch.load(train(drives, tmp_path / "other.pth", seed=1, machine=CPU), weights_only=False)
     name = "model.action_head.weight"
     assert not torch.equal(other["model_state_dict"][name], whole["model_state_dict"][name])
 
@@ -96,5 +98,6 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
 def test_what_cannot_be_trained_is_refused(drives, tmp_path, wrong, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RoverError):
-        train(**{"episodes": drives, "out_path": tmp_path / "best_model.pth", **wrong})
+        machine = Machine.of(wrong.pop("device", "cpu"))
+        train(**{"episodes": drives, "out_path": tmp_path / "best_model.pth", "machine": machine, **wrong})
     assert not list(tmp_path.iterdir())
