@@ -34,7 +34,7 @@ simavr = pytest.mark.skipif(bool(SIMAVR_MISSING), reason=f"needs the Debian pack
 ATTEMPTS = 5
 BEAT_S = 0.02
 PRIORITY = 1  # of a test in real time, if this user may; programs that it starts have ordinary priority
-LATE_S = 0.06  # with the 20 ms between two commands, about half of the 150 ms after which an Arduino stops
+LATE_S = 0.03  # a command waits for two or three threads in turn: so late each, they use up the 100 ms it has
 
 
 def until(condition: Callable[[], object], seconds: float = 20.0) -> None:

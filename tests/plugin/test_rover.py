@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
-from needs import real_time, until
+from needs import Late, real_time, until
 
-from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig
+from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, ride
 from lerobot_robot_rover.line import FEATURES, named
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError
@@ -31,12 +31,19 @@ def jpegs(blue=0):
 
 
 def turn(rover, action=GO, seconds=0.0):
-    """LeRobot's loop: an observation, an action, and the rest of its thirtieth. Gives the last observation."""
+    """LeRobot's loop: an observation, an action, and the rest of its thirtieth. Gives the last observation.
+
+    Raises Late where this loop itself was late: the car was rightly stopped, and the test would judge this machine.
+    """
     end = time.monotonic() + seconds
+    sent = math.inf
     while True:
         observation = rover.get_observation()
+        if time.monotonic() - sent > 0.8 * ride.HOLD_S:
+            raise Late("an observation took too long")
         rover.send_action(action)
-        if time.monotonic() >= end:
+        sent = time.monotonic()
+        if sent >= end:
             return observation
         time.sleep(1 / 60)
 
