@@ -139,7 +139,7 @@ def test_a_car_that_refers_to_itself_many_times(tmp_path):
 
 
 SMALL_VALUES = {
-    "episode_data.json": b"[" + b'{"":0},' * 4_000_000 + b"0]",
+    "episode_data.json": b"[" + b'{"":0},' * 400_000 + b"0]",
     "control_data.csv": b"a,b,c,d\n" + b"1\n" * 10_000_000,
     "manifest.json": b'{"paths": [' + b"0," * 4_000_000 + b"0]}",
     "catalog_0.catalog": b"1\n" * 4_000_000,
@@ -152,4 +152,4 @@ def test_what_takes_many_times_its_size(tmp_path, name):
     (tmp_path / "episode_data.json").touch()
     (tmp_path / name).write_bytes(SMALL_VALUES[name])
     read = load_recordings if name.startswith(("episode", "control")) else lambda path: read_tub(path, Car())
-    assert hostile.outcome_of(read, tmp_path).startswith("said ")
+    assert hostile.outcome_of(read, tmp_path, most_bytes=50_000_000).startswith("said ")
