@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rover_lib.onboard.errors import EpisodeError, RoverError
+from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -39,24 +39,6 @@ def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
     return tuple(read) if sorted(read) == sorted(CHANNELS) and len(names) == len(read) else None
 
 
-def settle_names(
-    where: str, own: tuple[str, ...], said: tuple[str, ...], option: str, error: type[RoverError]
-) -> tuple[str, ...]:
-    """Return the names of some numbers, in their order: the file's `own`, or those `said` by the user's `option`.
-
-    Raises `error` if the two deny each other, and asks by it whether other words mean steering and throttle.
-    """
-    meant = read_as_car(own)
-    say = f"{option} {','.join(meant or own)}"
-    if said and meant and said not in (meant, own):
-        what = f"{where} are {quote_all(own)}, and {option} says {quote_all(said)}"
-        raise error(what, remedy=f"say {say}, or nothing")
-    if meant and meant != own and not said:
-        remedy = f"if they are, say {say}, else {option} {','.join(own)}"
-        raise error(f"{where} are {quote_all(own)}: are they steering and throttle?", remedy=remedy)
-    return said or own
-
-
 def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
     """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
     own, size = _names(features[STATE]), features[STATE]["shape"][0]
@@ -68,10 +50,20 @@ def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) 
 
 
 def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
-    """Return a dataset's names of its states or actions, or those `said` by the user, as `Named` has them."""
+    """Return a dataset's names of its states or actions, or those `said` by the user, as `Named` has them.
+
+    Raises EpisodeError if the two deny each other, and asks by it whether other words mean steering and throttle.
+    """
     (size,) = features[key]["shape"]
     own = _names(features[key])
-    names = settle_names(f"{root}: the names of '{key}'", own, said, "--action-names", EpisodeError)
+    if meant := read_as_car(own):
+        where, say = f"{root}: the names of '{key}' are {quote_all(own)}", f"say --action-names {','.join(meant)}"
+        if said and said not in (meant, own):
+            raise EpisodeError(f"{where}, and --action-names says {quote_all(said)}", remedy=f"{say}, or nothing")
+        if meant != own and not said:
+            remedy = f"if they are, {say}, else --action-names {','.join(own)}"
+            raise EpisodeError(f"{where}: are they steering and throttle?", remedy=remedy)
+    names = said or own
     if not names:
         # The other numbers' order, if they have one.
         examples: list[Sequence[str]] = [_names(features.get(ACTION if key == STATE else STATE, {}))]

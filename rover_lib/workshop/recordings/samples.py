@@ -1,5 +1,6 @@
 """The common form of our recordings and LeRobot's: samples of each episode, their files, and what was wrong."""
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,12 +20,12 @@ OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has an
 LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
-HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
-REPAIRED = (
-    *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
-    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
-)
-TAKEN = ("another_export", "another_total", "one_sided_steering")
+HANDLED = {  # what is done about a fault, by its kind
+    "repaired": "serial_burst|unsorted_.*_times|reverse_on_a_car_without|stood_unrecorded|scrambled_index",
+    "recomputed from the pulses": ".*_recomputed",
+    "taken as recorded": "another_export|another_total|one_sided_steering|.*_disagrees_with_pulse",
+    "left out": ".*",
+}
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
@@ -101,12 +102,7 @@ class Fault:
     @property
     def handled(self) -> str:
         """What was done about it, one of HANDLED."""
-        if self.kind in REPAIRED:
-            return "repaired"
-        if self.kind.endswith("_recomputed"):
-            return "recomputed from the pulses"
-        taken = self.kind in TAKEN or self.kind.endswith("_disagrees_with_pulse")
-        return "taken as recorded" if taken else "left out"
+        return next(handled for handled, kinds in HANDLED.items() if re.fullmatch(kinds, self.kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,9 +214,8 @@ class Recordings:
     def action_range(self) -> dict[str, tuple[float, float]]:
         """Smallest and largest recorded value of each action. Errors are given as a share of this range."""
         actions = np.concatenate([s.chunk for s in self.samples])  # padding repeats values that are in it anyway
-        return {
-            n: (float(actions[:, i].min()), float(actions[:, i].max())) for i, n in enumerate(self.layout.action_names)
-        }
+        ends = zip(actions.min(0).tolist(), actions.max(0).tolist(), strict=True)
+        return dict(zip(self.layout.action_names, ends, strict=True))
 
     def recomputed(self) -> str:
         """Say which actions were recomputed from their pulses, in one sentence; empty if none were."""

@@ -23,7 +23,7 @@ from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_lerobot
+from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Layout, Source
