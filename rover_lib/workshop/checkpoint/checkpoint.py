@@ -107,11 +107,10 @@ class Checkpoint:
             found = f"recordings of {layout.rate_hz:g} frames a second"
             what = f"{self.path}: plans {c.rate_hz:g} steps a second"
             raise CheckpointError(what, found=found, remedy="give recordings of that rate")
-        numbers = [("action", c.action_names, layout.action_names)]
-        if c.sees_state:
-            numbers.insert(0, ("state", c.state_names, layout.state_names))
-        for what, own, theirs in numbers if "actions" not in guessed else []:
-            if set(own) != set(theirs) and set(files.TWO_ACTIONS) in (set(own), set(theirs)):
+        numbers = {"state": (c.state_names, layout.state_names), "action": (c.action_names, layout.action_names)}
+        for what, (own, theirs) in numbers.items():
+            known = "actions" not in guessed and (c.sees_state or what == "action")
+            if known and set(own) != set(theirs) and set(files.TWO_ACTIONS) in (set(own), set(theirs)):
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
@@ -217,14 +216,14 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
     path = Path(path)
     if path.is_dir():
         path = lerobot_folder(path)
-        kind, file, read = "lerobot", path / "model.safetensors", read_lerobot
+        kind, file = "lerobot", path / "model.safetensors"
     elif path.is_file():
-        kind, file, read = "trainer", path, files.read_trainer
+        kind, file = "trainer", path
     else:
         remedy = "give the trainer's .pth file, or LeRobot's pretrained_model folder"
         raise CheckpointError(f"{path}: not found, or neither a file nor a folder", remedy=remedy)
     facts = Facts(path, said)
-    config, weights, extra = read(path, facts)
+    config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else files.read_trainer(path, facts)
     check_limits(path, config)
     if (sha256 := sha256_of(file)) != checked:
         check_weights(path, config, weights, facts.unknown)

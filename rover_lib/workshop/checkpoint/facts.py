@@ -18,7 +18,7 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
-from rover_lib.workshop.recordings.names import flat_names, read_as_car
+from rover_lib.workshop.recordings.samples import flat_names, read_as_car
 from rover_lib.workshop.untrusted import quote, quote_all
 
 USER, GUESS = "--facts", "a guess"

@@ -33,7 +33,7 @@ COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
-JSON_BYTES = 1_000_000  # a trainer's settings take some kB
+JSON_BYTES = 1_000_000  # settings take some kB
 TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
 DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too
 KL_WEIGHT = 10.0
@@ -47,6 +47,10 @@ BESIDE = re.compile(r"(.*_)?(config|cfg|hparams|args)\.(json|ya?ml)")
 STATISTICS = re.compile(
     r"(.*_)?(stats|norm|normali[sz]er|normali[sz]ation|scaler)\.(pth?|json|ya?ml|pkl|np[yz]|safetensors)"
 )
+# best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core.
+SCALAR = np.float64(0).__reduce__()[0]
+NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+NUMPY += [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32))]
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 
 
@@ -170,14 +174,6 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
     )
 
 
-def _numpy_scalars() -> list[Any]:
-    """best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core."""
-    names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
-    dtypes = [type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32)]
-    scalar = np.float64(0).__reduce__()[0]
-    return [*((scalar, n) for n in names), np.dtype, *dtypes]
-
-
 def _read_pickle(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as z:
@@ -186,7 +182,7 @@ def _read_pickle(path: Path) -> Any:
             damaged = z.testzip() if stored else "compressed entries"
         if damaged:
             raise CheckpointError(f"{path}: damaged, the checksum of {damaged} does not match", remedy=COPY_AGAIN)
-        with torch.serialization.safe_globals(_numpy_scalars()):
+        with torch.serialization.safe_globals(NUMPY):
             # mmap: the optimizer's two thirds of the file are counted, never read
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except CheckpointError:

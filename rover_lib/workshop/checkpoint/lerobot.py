@@ -29,7 +29,6 @@ from rover_lib.workshop.untrusted import quote, quote_all, read_json
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
 
-JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
 PRETRAINED, CONFIG = "pretrained_model", "config.json"
 WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
 SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
@@ -255,7 +254,7 @@ class Normaliser:
 def _read_json(path: Path) -> dict[str, Any]:
     refuse_pointer(path, CheckpointError)
     with files.as_checkpoint_error(path):
-        return dict(read_json(path, JSON_BYTES))
+        return dict(read_json(path, files.JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
@@ -277,10 +276,9 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     from lerobot.policies.act.processor_act import make_act_pre_post_processors
 
     policy = lerobot_act(config, weights)
-    normed = {"VISUAL": True, "STATE": config.state_norm is not None, "ACTION": config.action_unnorm is not None}
-    policy.config.normalization_mapping = {
-        kind: NormalizationMode.MEAN_STD if acts else NormalizationMode.IDENTITY for kind, acts in normed.items()
-    }
+    raw, normed = NormalizationMode.IDENTITY, NormalizationMode.MEAN_STD
+    modes = {"STATE": normed if config.state_norm else raw, "ACTION": normed if config.action_unnorm else raw}
+    policy.config.normalization_mapping = {"VISUAL": normed, **modes}
     stats = {
         f"observation.images.{name}": _statistics(norm, (3, 1, 1))
         for name, norm in zip(config.cameras, config.image_norm, strict=True)

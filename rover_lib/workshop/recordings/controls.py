@@ -27,6 +27,8 @@ HALF = 0.4, 0.6  # where the middle of steering is straight ahead if it lies fro
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
 DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 Item = TypeVar("Item")
+Rows = list[tuple[int, dict[str, float], str]]  # the number of a control, its numbers, and who drove
+Actions = dict[int, float]  # of one channel, by the number of their control
 
 
 # What the user's recorder wrote before October 2025, as the channels that it meant.
@@ -58,15 +60,13 @@ class Faults:
 
     def nothing_usable(self, what: str, remedy: str) -> EpisodeError:
         """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
+        left = [fault for fault in self.listed() if fault.handled == "left out"]
         kinds: Counter[str] = Counter()
-        first: dict[str, str] = {}
-        for fault in self.listed():
-            if fault.handled == "left out":
-                kinds[fault.kind] += fault.count
-                first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
+        for fault in left:
+            kinds[fault.kind] += fault.count
         most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
         worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
-        found = first[most[0]] if most else ""
+        found = next((f"{fault.note} ({fault.file})" for fault in left if fault.kind == most[0]), "")
         what = f"{self.root}: {what} ({worst or 'empty'})"
         return EpisodeError(what, found=found or None, remedy="" if "; " in found else remedy)
 
@@ -96,7 +96,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
 
     Raises EpisodeError if a channel's actions follow no formula of its pulses.
     """
-    read: list[tuple[int, dict[str, float], str]] = []
+    read: Rows = []
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
@@ -135,9 +135,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
     return in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
 
-def _read_actions(
-    channel: Channel, rows: list[tuple[int, dict[str, float], str]], path: Path, faults: Faults
-) -> tuple[dict[int, float], dict[int, float], Channel | None]:
+def _read_actions(channel: Channel, rows: Rows, path: Path, faults: Faults) -> tuple[Actions, Actions, Channel | None]:
     """Return one channel's measured actions by the number of their control, as recorded and as their pulses mean them.
 
     And the older channel whose formula the recorded ones follow, if they do. Raises EpisodeError if they follow none.
@@ -180,17 +178,14 @@ def _refuse_other_pulses(channel: Channel, pulses_us: dict[int, float]) -> None:
     """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
     (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
-    if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        what = (
-            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us"
-        )
+    count = len(pulses_us)
+    if count >= LEAST_READINGS and 2 * len(far) > count:
+        what = f"{channel.name}: {len(far)} of {count} pulses lie far beyond this car's {low_us} to {high_us} us"
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
         raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
 
 
-def _take(
-    channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
-) -> dict[int, float]:
+def _take(channel: Channel, recorded: Actions, meant: Actions, recompute: bool, path: Path, faults: Faults) -> Actions:
     """Return one channel's actions as recorded, or, if `recompute`, as their pulses mean them where these deny them."""
     for i, action in list(recorded.items()):
         kind = None

@@ -15,11 +15,12 @@ import csv
 import json
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
-from rover_lib.onboard.kinds import EPISODE_FILES
+from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
@@ -38,7 +39,6 @@ from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
-from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
@@ -46,6 +46,9 @@ TABLES = {
     "control_samples": ("control_data.csv", written.CONTROL_FIELDS),
     "frame_samples": ("frame_data.csv", written.FRAME_FIELDS),
 }
+READ = "only folders of episodes, LeRobotDatasets and donkeycar tubs are read: write a LeRobotDataset of it"
+# what a file's path looks like, what its folder then is, and what to do
+STRANGERS, MOST_FILES = Path(__file__).with_name("strangers.txt"), 2000
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
@@ -110,9 +113,7 @@ def load_recordings(
     killed = written.find_killed(root)
     if not folders:
         inside = quote_all(sorted(p.name for p in root.iterdir())) or None
-        what, remedy = "no episode folders in it", finish if killed else READ
-        if not killed and (stranger := name_stranger(root)):
-            what, remedy = f"{stranger[0]}, not our recordings", stranger[1]
+        what, remedy = ("no episode folders in it", finish) if killed else _name_stranger(root)
         raise EpisodeError(f"{root}: {what}", found=inside, remedy=remedy)
     faults = Faults(root)
     for part in killed:
@@ -120,12 +121,29 @@ def load_recordings(
     for folder in sorted({*others} - {*folders}):
         faults.add(folder, "no_episode", f"neither {written.DATA} nor CSV files; drives in folders of it are not read")
     listed = progress(folders, desc="reading episodes", total=len(folders))
-    loaded = [_load_episode(folder, chunk, sync_s, faults) for folder in listed]
-    episodes = tuple(episode for episode in loaded if episode)
+    episodes = [episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults))]
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
     return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
+
+
+def _name_stranger(root: Path) -> tuple[str, str]:
+    """Return what a folder without episodes holds, as owners of other cars and robots have it, and what to do."""
+    inside = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")]
+    for kind, words, remedy in (
+        ("tub", "donkeycar tubs", "rover export-dataset {} OUT, and so for each"),
+        ("dataset", "LeRobotDatasets", "give one of them, such as {}"),
+        ("recordings", "folders of recordings", "give one of them, such as {}"),
+    ):
+        if found := [folder for folder in inside if kind in kinds_of(folder)]:
+            return f"a folder of {len(found)} {words}, not our recordings", remedy.format(found[0])
+    paths = [f"/{path.relative_to(root).as_posix()}" for path in islice(root.rglob("*"), MOST_FILES)]
+    for line in STRANGERS.read_text().splitlines():
+        pattern, words, *own = line.split("\t")
+        if any(re.search(pattern, path) for path in paths):
+            return f"{words}, not our recordings", own[0] if own else READ
+    return "no episode folders in it", READ
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
@@ -293,10 +311,10 @@ def _make_samples(
     known = np.array([all(pair) for pair in measured])
     actions = np.array([[c.actions[i] if c else 0 for i, c in enumerate(pair)] for pair in measured], np.float32)
     pulses_us = [[c.pulses_us[i] if c else math.nan for i, c in enumerate(pair)] for pair in measured]
-    faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", nearest.count(None))
+    without = nearest.count(None)
+    faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", without)
     note = f"controls near, but without a measured pulse within {sync_s * 1000:g} ms"
-    near = np.array([c is not None for c in nearest])
-    faults.add(folder, "frame_without_measurement", note, int((near & ~known).sum()))
+    faults.add(folder, "frame_without_measurement", note, len(frames) - without - int(known.sum()))
 
     steps_s = np.diff(times_s)
     longest_s = min(HOLE_INTERVALS * float(np.median(steps_s)), HOLE_S) if len(steps_s) else HOLE_S
@@ -308,12 +326,14 @@ def _make_samples(
     unknown_state = 0
     drivers = [c.driver if c else "" for c in nearest]
     held = np.array([driver == written.NOBODY for driver in drivers])
-    breaks = {*holes.tolist(), *(np.flatnonzero(held[1:] != held[:-1]) + 1).tolist()}
-    for segment in _segments(known, breaks):
+    breaks = np.union1d(holes, np.flatnonzero(held[1:] != held[:-1]) + 1)
+    with_action = np.flatnonzero(known)
+    cuts = np.flatnonzero((np.diff(with_action) > 1) | np.isin(with_action[1:], breaks)) + 1
+    for segment in np.split(with_action, cuts):
         n = len(segment)
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
-        for k, i in enumerate(segment):
+        for k, i in enumerate(segment.tolist()):
             if frames[i].size is None:
                 continue
             if k == 0 and i > 0:
@@ -325,13 +345,6 @@ def _make_samples(
             samples.append(Sample(*shown, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)
     return tuple(samples)
-
-
-def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
-    """Return runs of consecutive frames with actions, as lists of indices. A new run begins at an index in `holes`."""
-    index = np.flatnonzero(known).tolist()
-    cuts = [k for k, (before, i) in enumerate(pairwise(index), 1) if i > before + 1 or i in holes]
-    return [index[start:end] for start, end in pairwise([0, *cuts, len(index)])]
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:

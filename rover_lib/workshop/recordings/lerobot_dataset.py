@@ -26,10 +26,10 @@ from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.names import ACTION, STATE, name_numbers, name_states
-from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, camera_names
+from rover_lib.workshop.recordings.samples import ACTION, STATE, Episode, Layout, Recordings, Sample, Source
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
 
 INFO = Path("meta/info.json")
@@ -132,10 +132,7 @@ class LerobotSample(Sample):
         return f"frame {self.row}"
 
     def frame_bgr(self) -> Any:
-        """Read the picture, (h, w, 3) uint8 BGR; of several cameras, a dict by their names.
-
-        Raises EpisodeError if it cannot be decoded, or has another size than the others.
-        """
+        """Read the picture, as Sample does; of several cameras, a dict by their names. Raises EpisodeError likewise."""
         with _as_episode_error(f"{self.frame_path}: its frame {self.row} cannot be decoded"), limited_memory():
             frames = {name: camera.read_bgr(self.row) for name, camera in self.cameras.items()}
         return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
@@ -300,10 +297,8 @@ class _Dataset:
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
                 untrusted.check_video(file, size)
-        wrong = set()
-        for _, first_s, last_s, row in shown:
-            if abs((last_s - first_s) * self.fps - row["length"]) >= 1:
-                wrong.add(row["episode_index"])
+        other = [row for _, begin, end, row in shown if abs((end - begin) * self.fps - row["length"]) >= 1]
+        wrong = {row["episode_index"] for row in other}
         for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
                 wrong.add(after[3]["episode_index"])
@@ -339,10 +334,7 @@ class _Dataset:
 
 
 def _read_export(root: Path, episodes: int, marked: bool, faults: Faults) -> tuple[list[str], Car]:
-    """Return who drove in each episode where nobody intervened, and whose car; a fault if REPORT is of other episodes.
-
-    marked: whether the dataset marks interventions.
-    """
+    """Return who drove in each episode where nobody intervened, as a dataset may have `marked`, and whose car."""
     drivers, car = [POLICY if marked else HUMAN] * episodes, this_car()
     if (root / REPORT).is_file():
         try:
@@ -388,7 +380,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, str]]:
     """Find the names and columns of states and actions, and the cameras: by name the key."""
     features = info["features"]
-    keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
+    keys = recorded.camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
         raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
@@ -408,9 +400,9 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
         if len(row.get("shape") or ()) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
-    actions, action_order = name_numbers(root, features, ACTION, source.action_names)
+    actions, action_order = recorded.name_numbers(root, features, ACTION, source.action_names)
     has_state, given = STATE in features, source.action_names
-    states, state_order = name_states(root, features, given) if has_state else (actions, action_order)
+    states, state_order = recorded.name_states(root, features, given) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)
     return layout, {name: keys[name] for name in names}
 

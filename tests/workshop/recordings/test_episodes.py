@@ -55,10 +55,7 @@ def edit(folder, change):
 
 
 def kinds(recordings):
-    found = {}
-    for fault in recordings.faults:
-        found[fault.kind] = found.get(fault.kind, 0) + fault.count
-    return found
+    return {kind: n for kinds in recordings.faults_by_kind().values() for kind, n in kinds.items()}
 
 
 def load(root, **options):
