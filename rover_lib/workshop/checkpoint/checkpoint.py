@@ -23,7 +23,7 @@ from rover_lib.workshop.act_config import imagenet, lerobot_act
 from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts, is_nothing
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
-from rover_lib.workshop.recordings.samples import Layout, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
@@ -67,10 +67,9 @@ class Checkpoint:
         How well it still drives must be measured. Raises CheckpointError for several cameras, for a side of less than
         one feature (32 pixels), and if the aspect ratio changes by more than 5 %.
         """
-        trained_height, trained_width = self.config.image_sizes[0]
+        (trained_height, trained_width), *others = self.config.image_sizes
         sides = all(is_whole(side, FEATURE_PX) for side in (height, width))
-        one = len(self.config.cameras) == 1
-        if not one or not sides or is_squeezed((width, height), (trained_width, trained_height)):
+        if others or not sides or is_squeezed((width, height), (trained_width, trained_height)):
             what = f"{self.path}: cannot run at {quote(width)}x{quote(height)}"
             trained = f"{len(self.config.cameras)} cameras, the first of {trained_width}x{trained_height}"
             remedy = f"one camera, whole sides of at least {FEATURE_PX}, and an aspect ratio within 5 %"
@@ -110,7 +109,7 @@ class Checkpoint:
         numbers = {"state": (c.state_names, layout.state_names), "action": (c.action_names, layout.action_names)}
         for what, (own, theirs) in numbers.items():
             known = "actions" not in guessed and (c.sees_state or what == "action")
-            if known and set(own) != set(theirs) and set(files.TWO_ACTIONS) in (set(own), set(theirs)):
+            if known and set(own) != set(theirs) and set(ACTION_NAMES) in (set(own), set(theirs)):
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
@@ -129,7 +128,7 @@ class Checkpoint:
             return self
         config, weights = put_in_order(c, self.weights, states, actions)
         # A state that is not looked at may as well be the car's.
-        state_names = files.TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
+        state_names = ACTION_NAMES if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
         config = replace(config, state_names=state_names, action_names=layout.action_names)
         known: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
         if guessed:
@@ -155,7 +154,7 @@ class Checkpoint:
         own = np.array(theirs)[list(order)] + 1e-3
         apart, turned = np.abs(np.log(own / recorded)), np.abs(np.log(own[::-1] / recorded))
         if guessed and len(order) == 2 and turned.sum() + CLEARLY < apart.sum():
-            other = ",".join(files.TWO_ACTIONS[i] for i in order[::-1])
+            other = ",".join(ACTION_NAMES[i] for i in order[::-1])
             what = f"{self.path}: the statistics of its actions deny the order in {INFO}"
             raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say the policy's: {USER} actions={other}")
         return bool(apart.max() < SAME)

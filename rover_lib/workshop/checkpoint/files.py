@@ -21,13 +21,13 @@ from rover_lib.onboard.stage import atomic_path, plain, read_plain
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import imagenet
 from rover_lib.workshop.checkpoint.facts import Facts
+from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote, quote_all
 
 Weights = dict[str, Tensor]
 # Config, weights by LeRobot's names without the leading `model.`, and more for the report.
 Contents = tuple[ActConfig, Weights, dict[str, Any]]
 
-TWO_ACTIONS = ("steering", "throttle")
 MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_limits` has seen them all
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
@@ -76,7 +76,7 @@ def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
 
 def name_numbers(count: int, stem: str) -> tuple[str, ...]:
     """Return names for `count` numbers of which nothing but their count is known: two are a car's."""
-    return TWO_ACTIONS if count == 2 else tuple(f"{stem}_{i}" for i in range(count))
+    return ACTION_NAMES if count == 2 else tuple(f"{stem}_{i}" for i in range(count))
 
 
 @contextmanager

@@ -339,9 +339,7 @@ def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
     assert checkpoint.report["normalisation"]["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"
 
 
-SETTINGS = {
-    "learning_rate": 1e-4, "batch_size": 4, "data_dir": "episodes", "output_dir": "fast", "device": "cpu", "seed": 0
-}  # fmt: skip
+SETTINGS = {"learning_rate": 1e-4, "batch_size": 4, "data_dir": "in", "output_dir": "out", "device": "cpu", "seed": 0}
 ORIGIN = {"teacher_sha256": "ab" * 32, "steps": 3}
 
 
