@@ -26,8 +26,7 @@ from rover_lib.onboard.policy import preprocess
 from rover_lib.workshop import act
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.checkpoint.files import write_both
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, write_both
 from rover_lib.workshop.judge.recorded_range import Range
 from rover_lib.workshop.progress import Progress
 from rover_lib.workshop.recordings.samples import Sample

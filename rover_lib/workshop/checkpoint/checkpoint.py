@@ -10,25 +10,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from rover_lib.onboard.artifact.manifest import RULES
 from rover_lib.onboard.car.picture import is_squeezed
-from rover_lib.onboard.checked import is_whole
+from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop.act import ACT, ActConfig, Affine, inputs_of, predictions
-from rover_lib.workshop.checkpoint.contents import (
-    TWO_ACTIONS,
-    Contents,
-    check_limits,
-    check_weights,
-    put_in_order,
-    tensor_bytes,
-)
+from rover_lib.workshop.act import ACT, ACTIVATIONS, BACKBONES, ActConfig, Affine, inputs_of, predictions
+from rover_lib.workshop.act_config import imagenet, lerobot_act
+from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts, is_nothing
-from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot
-from rover_lib.workshop.checkpoint.trainer import read_trainer
-from rover_lib.workshop.recordings.samples import Layout, Sample, pick_evenly
+from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
@@ -72,10 +67,9 @@ class Checkpoint:
         How well it still drives must be measured. Raises CheckpointError for several cameras, for a side of less than
         one feature (32 pixels), and if the aspect ratio changes by more than 5 %.
         """
-        trained_height, trained_width = self.config.image_sizes[0]
+        (trained_height, trained_width), *others = self.config.image_sizes
         sides = all(is_whole(side, FEATURE_PX) for side in (height, width))
-        one = len(self.config.cameras) == 1
-        if not one or not sides or is_squeezed((width, height), (trained_width, trained_height)):
+        if others or not sides or is_squeezed((width, height), (trained_width, trained_height)):
             what = f"{self.path}: cannot run at {quote(width)}x{quote(height)}"
             trained = f"{len(self.config.cameras)} cameras, the first of {trained_width}x{trained_height}"
             remedy = f"one camera, whole sides of at least {FEATURE_PX}, and an aspect ratio within 5 %"
@@ -112,9 +106,10 @@ class Checkpoint:
             found = f"recordings of {layout.rate_hz:g} frames a second"
             what = f"{self.path}: plans {c.rate_hz:g} steps a second"
             raise CheckpointError(what, found=found, remedy="give recordings of that rate")
-        numbers = (("state", c.state_names, layout.state_names), ("action", c.action_names, layout.action_names))
-        for what, own, theirs in () if "actions" in guessed else numbers[not c.sees_state :]:
-            if set(own) != set(theirs) and set(TWO_ACTIONS) in (set(own), set(theirs)):
+        numbers = {"state": (c.state_names, layout.state_names), "action": (c.action_names, layout.action_names)}
+        for what, (own, theirs) in numbers.items():
+            known = "actions" not in guessed and (c.sees_state or what == "action")
+            if known and set(own) != set(theirs) and set(ACTION_NAMES) in (set(own), set(theirs)):
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
@@ -133,7 +128,7 @@ class Checkpoint:
             return self
         config, weights = put_in_order(c, self.weights, states, actions)
         # A state that is not looked at may as well be the car's.
-        state_names = TWO_ACTIONS if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
+        state_names = ACTION_NAMES if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
         config = replace(config, state_names=state_names, action_names=layout.action_names)
         known: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
         if guessed:
@@ -156,10 +151,10 @@ class Checkpoint:
         if not samples or theirs is None:
             return False
         recorded = np.std([s.chunk[0].astype(np.float64) for s in samples], 0) + 1e-3
-        apart = np.abs(np.log((np.array(theirs)[list(order)] + 1e-3) / recorded))
-        turned = np.abs(np.log((np.array(theirs)[list(order[::-1])] + 1e-3) / recorded))
+        own = np.array(theirs)[list(order)] + 1e-3
+        apart, turned = np.abs(np.log(own / recorded)), np.abs(np.log(own[::-1] / recorded))
         if guessed and len(order) == 2 and turned.sum() + CLEARLY < apart.sum():
-            other = ",".join(TWO_ACTIONS[i] for i in order[::-1])
+            other = ",".join(ACTION_NAMES[i] for i in order[::-1])
             what = f"{self.path}: the statistics of its actions deny the order in {INFO}"
             raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say the policy's: {USER} actions={other}")
         return bool(apart.max() < SAME)
@@ -193,9 +188,8 @@ class Checkpoint:
     def _told(self, config: ActConfig, known: dict[str, tuple[Any, str]], notes: Sequence[str]) -> "Checkpoint":
         """Return the same weights with another config, of which other facts are known."""
         facts = copy(self.facts)
-        facts.known = facts.known | known
-        report = self.report | _words(config, facts) | {"notes": [*self.report["notes"], *notes]}
-        return replace(self, config=config, facts=facts, report=report)
+        facts.known, facts.notes = facts.known | known, [*facts.notes, *notes]
+        return replace(self, config=config, facts=facts, report=self.report | _words(config, facts))
 
 
 def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | None = None) -> float:
@@ -221,13 +215,31 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
     path = Path(path)
     if path.is_dir():
         path = lerobot_folder(path)
-        facts = Facts(path, said)
-        return _checkpoint(path, "lerobot", path / "model.safetensors", checked, read_lerobot(path, facts), facts)
-    if not path.is_file():
+        kind, file = "lerobot", path / "model.safetensors"
+    elif path.is_file():
+        kind, file = "trainer", path
+    else:
         remedy = "give the trainer's .pth file, or LeRobot's pretrained_model folder"
         raise CheckpointError(f"{path}: not found, or neither a file nor a folder", remedy=remedy)
     facts = Facts(path, said)
-    return _checkpoint(path, "trainer", path, checked, read_trainer(path, facts), facts)
+    config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else files.read_trainer(path, facts)
+    check_limits(path, config)
+    if (sha256 := sha256_of(file)) != checked:
+        check_weights(path, config, weights, facts.unknown)
+    if facts.unknown:
+        facts.notes.append(f"nobody here knows what these keys mean, not used: {quote_all(facts.unknown)}")
+    acts = sum(weight.numel() for name, weight in weights.items() if not name.startswith("vae_"))
+    report = {
+        "format": kind,
+        "file_mb": file.stat().st_size / 1e6,
+        "weights_mb": files.tensor_bytes(weights) / 1e6,
+        "parameters": sum(weight.numel() for weight in weights.values()),
+        "parameters_acting": acts,
+        "int8_floor_mb": acts / 1e6,
+        **_words(config, facts),
+        **extra,
+    }
+    return Checkpoint(path, kind, config, weights, sha256, report, facts)
 
 
 def normalisation(c: ActConfig) -> dict[str, str]:
@@ -255,26 +267,93 @@ def _words(c: ActConfig, facts: Facts) -> dict[str, Any]:
     words = {"size": sizes, "actions": ", ".join(c.action_names), "rate": f"{c.rate_hz:g} steps a second"}
     known = {fact: f"{words.get(fact, value)} ({by})" for fact, (value, by) in facts.known.items()}
     guesses = [f"its {fact}: {by}" for fact, (_, by) in facts.known.items() if by.startswith(GUESS)]
-    return {"known": known, "guesses": guesses, "normalisation": normalisation(c)}
+    return {"known": known, "guesses": guesses, "normalisation": normalisation(c), "notes": facts.notes}
 
 
-def _checkpoint(path: Path, kind: str, file: Path, checked: str | None, read: Contents, facts: Facts) -> Checkpoint:
-    """file: the weights'. Raises CheckpointError unless config and weights agree."""
-    config, weights, extra = read
-    check_limits(path, config)
-    if (sha256 := sha256_of(file)) != checked:
-        check_weights(path, config, weights, facts.unknown)
-    acts = sum(weight.numel() for name, weight in weights.items() if not name.startswith("vae_"))
-    report = {
-        "format": kind,
-        "file_mb": file.stat().st_size / 1e6,
-        "weights_mb": tensor_bytes(weights) / 1e6,
-        "parameters": sum(weight.numel() for weight in weights.values()),
-        "parameters_acting": acts,
-        "int8_floor_mb": acts / 1e6,
-        **_words(config, facts),
-        **extra,
-    }
-    if facts.unknown:
-        report["notes"].append(f"nobody here knows what these keys mean, not used: {quote_all(facts.unknown)}")
-    return Checkpoint(path, kind, config, weights, sha256, report, facts)
+def check_limits(path: Path, c: ActConfig) -> None:
+    """Raise CheckpointError for sizes, names or a rate that no artifact's manifest may hold.
+
+    Plans of a million steps, from a file of a few megabytes, would fill the memory with the samples of a drive.
+    """
+    cameras = [{"name": n, "height": h, "width": w} for n, (h, w) in zip(c.cameras, c.image_sizes, strict=True)]
+    names = {"state_names": list(c.state_names), "action_names": list(c.action_names)}
+    values = {"cameras": cameras, **names, "chunk": c.chunk, "rate_hz": c.rate_hz}
+    if broken := broken_rule(values, {name: RULES[name] for name in values}):
+        name, must, found = broken
+        raise CheckpointError(f"{path}: {name} must be {must}", found=found, remedy=files.CORRECT_IT)
+
+
+def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown: Iterable[str] = ()) -> None:
+    """Raise CheckpointError unless LeRobot's ACT of this config has exactly these weights, and all are finite.
+
+    What is checked first either cannot run here, or would let LeRobot build something without end. unknown: keys that
+    nobody here knows, and that may be why.
+    """
+    for key, value, known in (("backbone", c.backbone, BACKBONES), ("activation", c.activation, ACTIVATIONS)):
+        if not isinstance(value, str) or value not in known:
+            what = f"{path}: {key} {quote(value)} is not known here"
+            raise CheckpointError(what, remedy=f"known are {', '.join(sorted(known))}")
+    sizes = (c.chunk, c.dim, c.heads, c.feedforward, c.encoder_layers, c.decoder_layers)
+    positions = tuple(weights["decoder_pos_embed.weight"].shape) if "decoder_pos_embed.weight" in weights else None
+    whole = all(is_whole(size, 1) for size in sizes)  # LeRobot 0.6 lets None pass
+    deep = not whole or c.encoder_layers + c.decoder_layers > len(weights)
+    if deep or positions != (c.chunk, c.dim) or c.dim % 4:  # a quarter of the width for each sine and cosine
+        what = f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)"
+        found = f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}"
+        raise CheckpointError(what, found=found, remedy=files.CORRECT_IT)
+    keys = quote_all(unknown)
+    forked = f"; nobody here knows {keys}: train with LeRobot's own ACT if that asks for other weights" if keys else ""
+    with files.as_checkpoint_error(path, files.CORRECT_IT + forked):
+        lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
+    if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
+        what = f"{path}: NaN or Inf in {quote_all(bad)}"
+        raise CheckpointError(what, remedy="training diverged, take an earlier checkpoint")
+
+
+def put_in_order(
+    c: ActConfig, weights: dict[str, Tensor], states: tuple[int, ...], actions: tuple[int, ...]
+) -> tuple[ActConfig, dict[str, Tensor]]:
+    """Return the policy with its numbers in another order. states, actions: for each number, where it is now."""
+
+    def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+        return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
+
+    weights = dict(weights)
+    for name, order, axis in (
+        ("encoder_robot_state_input_proj.weight", states, 1),
+        ("vae_encoder_robot_state_input_proj.weight", states, 1),
+        ("vae_encoder_action_input_proj.weight", actions, 1),
+        ("action_head.weight", actions, 0),
+        ("action_head.bias", actions, 0),
+    ):
+        if name in weights:
+            weights[name] = weights[name].index_select(axis, torch.tensor(order))
+    c = replace(c, state_norm=reorder(c.state_norm, states), action_unnorm=reorder(c.action_unnorm, actions))
+    return c, weights
+
+
+def write_both(
+    folder: Path, config: ActConfig, weights: files.Weights, loss: float, origin: dict[str, Any], **settings: Any
+) -> dict[str, str]:
+    """Write pretrained_model/ into a folder, and best_model.pth where the trainer's format can hold the policy.
+
+    That has 30 steps a second, ImageNet's normalisation of one camera, and no other. weights: by LeRobot's names
+    without the leading `model.`. loss: on held-out frames. settings: as `trainer_config` wants them.
+
+    Returns sha256 by name: of the weights' file of the one, and of the other. Raises as `atomic_path`.
+    """
+    written = [folder / "pretrained_model" / "model.safetensors"]
+    write_lerobot(folder / "pretrained_model", config, weights, origin)
+    norms = config.image_norm, config.state_norm, config.action_unnorm
+    if (*norms, config.rate_hz) == ((imagenet(),), None, None, files.RATE_HZ):
+        content = {
+            "epoch": 0,
+            "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},
+            "optimizer_state_dict": {},  # the training's was of another loss
+            "scheduler_state_dict": {},
+            "best_val_loss": np.float64(loss),
+            "config": files.trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
+        }
+        written.append(folder / "best_model.pth")
+        files.save_torch(written[-1], content)
+    return {path.name: sha256_of(path) for path in written}

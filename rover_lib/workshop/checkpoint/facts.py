@@ -18,7 +18,7 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
-from rover_lib.workshop.recordings.names import flat_names, read_as_car
+from rover_lib.workshop.recordings.samples import flat_names, read_as_car
 from rover_lib.workshop.untrusted import quote, quote_all
 
 USER, GUESS = "--facts", "a guess"
@@ -29,11 +29,11 @@ NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", []
 
 
 class Facts:
-    """The facts of the policy at `path`: {fact: (value, who says it)}, and the keys whose meaning is unknown."""
+    """The facts of the policy at `path`: {fact: (value, who says it)}, keys whose meaning is unknown, and notes."""
 
     def __init__(self, path: Path, said: str = ""):
         """said: what the user says, such as "rate=20 actions=throttle,steering size=64x48 ignore=KEY,KEY"."""
-        self.path, self.said = path, said
+        self.path, self.notes = path, list[str]()
         self.known, self.unknown = dict[str, tuple[Any, str]](), dict[str, Any]()
         try:
             given = dict(part.split("=", 1) for part in said.split())
@@ -87,7 +87,8 @@ class Facts:
                 refused[key] = value, f"which may mean {meaning}"
             elif noted:
                 self.unknown[key] = value
-        for key, (value, why) in refused.items():
+        if refused:
+            key, (value, why) = next(iter(refused.items()))
             raise self.refusal(key, value, why, ",".join(refused))
 
     def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:

@@ -1,56 +1,201 @@
-"""Checkpoints out: a policy's weights as the trainer's best_model.pth, and as LeRobot's pretrained_model/ folder.
+"""Checkpoints in files: what both formats hold, and the trainer's best_model.pth, read without running its code.
 
-`origin`, plain JSON, says where the weights come from; in LeRobot's folder also how many steps of a plan make a second.
+Pickles are read with weights_only=True, and what that refuses is refused by name.
 """
 
-import json
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
+import yaml
 from torch import Tensor
 
-from rover_lib.onboard.errors import CheckpointError
-from rover_lib.onboard.stage import atomic_path, sha256_of
-from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.act_config import imagenet, lerobot_act
-from rover_lib.workshop.checkpoint.contents import RATE_HZ
-from rover_lib.workshop.checkpoint.lerobot import ORIGIN
+from rover_lib.onboard.checked import is_whole
+from rover_lib.onboard.errors import CheckpointError, printable
+from rover_lib.onboard.stage import atomic_path, plain, read_plain
+from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.act_config import imagenet
+from rover_lib.workshop.checkpoint.facts import Facts
+from rover_lib.workshop.recordings.samples import ACTION_NAMES
+from rover_lib.workshop.untrusted import quote, quote_all
 
 Weights = dict[str, Tensor]
+# Config, weights by LeRobot's names without the leading `model.`, and more for the report.
+Contents = tuple[ActConfig, Weights, dict[str, Any]]
+
+MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_limits` has seen them all
+COPY_AGAIN = "copy it again, the whole folder if it is one"
+CORRECT_IT = "correct the config to what the policy was trained with"
+IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
+RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
+JSON_BYTES = 1_000_000  # settings take some kB
+TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
 DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too
 KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)
 GRAD_CLIP = 1.0
-EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
+KNOWN = {"epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config"}
+OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
+# Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
+BESIDE = re.compile(r"(.*_)?(config|cfg|hparams|args)\.(json|ya?ml)")
+STATISTICS = re.compile(
+    r"(.*_)?(stats|norm|normali[sz]er|normali[sz]ation|scaler)\.(pth?|json|ya?ml|pkl|np[yz]|safetensors)"
+)
+# best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core.
+SCALAR = np.float64(0).__reduce__()[0]
+NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+NUMPY += [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32))]
+SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 
 
-def trainer_can_hold(config: ActConfig) -> bool:
-    """Whether the trainer's format can hold it: 30 steps a second, ImageNet's normalisation of one camera, no other."""
-    normal = config.image_norm == (imagenet(),) and config.state_norm is None and config.action_unnorm is None
-    return normal and config.rate_hz == RATE_HZ
+def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
+    """Return the weights by LeRobot's names without `model.`.
 
-
-def write_trainer(
-    path: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
-) -> None:
-    """One file in the format of the user's trainer, without an optimizer's state, which was of another loss.
-
-    config: one that `trainer_can_hold`. weights: by LeRobot's names without the leading `model.`. settings: as
-    `trainer_config` wants them. Raises as `atomic_path`.
+    Raises CheckpointError unless all names begin so and all weights are dense floats with values.
     """
-    content = {
-        "epoch": 0,
-        "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},
-        "optimizer_state_dict": {},
-        "scheduler_state_dict": {},
-        "best_val_loss": np.float64(best_val_loss),
-        "config": trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
+    # A batch norm counts its batches; LeRobot's are frozen and drop the count.
+    state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
+    odd = []
+    for key, weight in state.items():
+        dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
+        if not isinstance(key, str) or not dense or not weight.is_floating_point():  # as a quantized tensor is not
+            odd.append(key)
+    if odd:
+        what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
+        raise CheckpointError(what, remedy="save policy.state_dict() as it was trained")
+    if outside := [k for k in state if not k.startswith("model.")]:
+        raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
+    return {k.removeprefix("model."): v for k, v in state.items()}
+
+
+def name_numbers(count: int, stem: str) -> tuple[str, ...]:
+    """Return names for `count` numbers of which nothing but their count is known: two are a car's."""
+    return ACTION_NAMES if count == 2 else tuple(f"{stem}_{i}" for i in range(count))
+
+
+@contextmanager
+def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
+    """Turn whatever LeRobot, or a reader below it, raises into a CheckpointError of one sentence."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except Exception as e:  # each library raises types of its own
+        reason = printable(" ".join(f"{type(e).__name__}: {e}".split())[:200])
+        raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None
+
+
+def tensor_bytes(value: Any) -> int:
+    """Return the bytes of all tensors in nested dicts, lists and tuples."""
+    if isinstance(value, Tensor):
+        return value.numel() * value.element_size()
+    if isinstance(value, (dict, list, tuple)):
+        return sum(map(tensor_bytes, value.values() if isinstance(value, dict) else value))
+    return 0
+
+
+def read_trainer(path: Path, facts: Facts) -> Contents:
+    """facts: what its keys and the files beside it say is added.
+
+    Raises CheckpointError for a file that is damaged, would run code, or lacks something.
+    """
+    content = _read_pickle(path)
+    for key in ("config", "model_state_dict"):
+        if not isinstance(content, dict) or not isinstance(content.get(key), dict):
+            found = quote_all(content) if isinstance(content, dict) else type(content).__name__
+            remedy = "is it the trainer's, or only weights? those of the first ACT, ALOHA's, are of another network"
+            raise CheckpointError(f"{path}: no '{key}' in it", found=found, remedy=remedy)
+    raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
+    weights = name_weights(path, content["model_state_dict"])
+    loss = content.get("best_val_loss")  # NaN if the training had diverged
+    with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
+        loss = None if loss is None else float(loss)
+    facts.default("size", (raw.get("image_height"), raw.get("image_width")), "config.image_height")
+    with as_checkpoint_error(path):
+        facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
+        facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
+        for file in sorted(path.parent.iterdir()):
+            if STATISTICS.fullmatch(file.name) and file.name not in facts.ignored:
+                raise facts.refusal(file.name, "beside it", "which may mean how its numbers are normalised")
+            said = yaml.safe_load(read_plain(file, JSON_BYTES)) if BESIDE.fullmatch(file.name) else None
+            if isinstance(said, dict) and "input_features" not in said:  # that is LeRobot's, of another format
+                facts.read({k: v for k, v in said.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
+    extra = {
+        "epoch": plain(content.get("epoch")),
+        "best_val_loss": loss,
+        "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
+        "trainer_config": plain(raw),
     }
-    save_torch(path, content)
+    return _config(path, raw, weights, facts), weights, extra
+
+
+def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> ActConfig:
+    """Make the config from the trainer's, from what only the shapes of the weights say, and from the facts."""
+
+    def whole(key: str, default: int | None = None) -> int:
+        if not is_whole(value := raw.get(key, default), 1, 1_000_000):
+            what = f"{path}: config '{key}' must be a whole number from 1 to a million"
+            raise CheckpointError(what, found=quote(value), remedy=CORRECT_IT)
+        return value
+
+    def last(name: str) -> int:
+        shape = tuple(weights[name].shape) if name in weights else ()
+        if not shape or not 1 <= shape[-1] <= MOST:
+            raise CheckpointError(f"{path}: no weight '{name}' of a known shape", found=shape, remedy=IS_IT_WHOLE)
+        return shape[-1]
+
+    if raw.get("n_obs_steps", 1) != 1:
+        what = f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}"
+        raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
+    size = whole("image_height"), whole("image_width")
+    whole("rate_hz", default=30)
+    return ActConfig(
+        cameras=(TRAINER_CAMERA,),
+        image_sizes=(facts.default("size", size, "config.image_height"),),
+        backbone=facts.default("backbone", raw.get("vision_encoder", ""), "config.vision_encoder"),
+        rate_hz=facts.default("rate", RATE_HZ, OF_TRAINER),
+        image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
+        state_names=name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
+        action_names=facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER),
+        latent=last("encoder_latent_input_proj.weight"),
+        vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
+        chunk=facts.default("chunk", whole("chunk_size"), "config.chunk_size"),
+        dim=whole("hidden_size"),
+        heads=whole("n_heads"),
+        feedforward=whole("feedforward_dim"),
+        encoder_layers=whole("n_encoder_layers"),
+        decoder_layers=whole("n_decoder_layers"),
+    )
+
+
+def _read_pickle(path: Path) -> Any:
+    try:
+        with zipfile.ZipFile(path) as z:
+            # torch.load accepts overwritten weight bytes; the zip's CRC does not. torch compresses nothing.
+            stored = all(e.compress_type == zipfile.ZIP_STORED for e in z.infolist())
+            damaged = z.testzip() if stored else "compressed entries"
+        if damaged:
+            raise CheckpointError(f"{path}: damaged, the checksum of {damaged} does not match", remedy=COPY_AGAIN)
+        with torch.serialization.safe_globals(NUMPY):
+            # mmap: the optimizer's two thirds of the file are counted, never read
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except CheckpointError:
+        raise
+    except Exception as e:  # zipfile and torch say in many types that a file is damaged
+        if wanted := re.search(r"GLOBAL ([\w.]+)", str(e)):
+            what = f"{path}: refused, reading it would run code (it asks for '{wanted[1]}')"
+            raise CheckpointError(what, remedy="save only tensors, numbers and strings in a checkpoint") from None
+        # torch puts advice before it, to read it unsafely
+        reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
+        what = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
+        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if isinstance(e, zipfile.BadZipFile) else ""
+        raise CheckpointError(what, remedy=COPY_AGAIN + older) from None
 
 
 def save_torch(path: Path, content: Any) -> None:
@@ -60,65 +205,6 @@ def save_torch(path: Path, content: Any) -> None:
     """
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         torch.save(content, file)
-
-
-def write_lerobot(folder: Path, config: ActConfig, weights: Weights, origin: dict[str, Any]) -> None:
-    """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_trainer`.
-
-    Raises CheckpointError on a full disk.
-    """
-    # here, because it takes ten seconds to import
-    from lerobot.configs.types import NormalizationMode
-    from lerobot.policies.act.processor_act import make_act_pre_post_processors
-
-    policy = lerobot_act(config, weights)
-    normed = {"VISUAL": True, "STATE": config.state_norm is not None, "ACTION": config.action_unnorm is not None}
-    policy.config.normalization_mapping = {
-        kind: NormalizationMode.MEAN_STD if acts else NormalizationMode.IDENTITY for kind, acts in normed.items()
-    }
-    stats = {
-        f"observation.images.{name}": _statistics(norm, (3, 1, 1))
-        for name, norm in zip(config.cameras, config.image_norm, strict=True)
-    }
-    if config.state_norm is not None:
-        stats["observation.state"] = _statistics(config.state_norm, (-1,))
-    if (scaled := config.action_unnorm) is not None:
-        stats["action"] = {"mean": torch.tensor(scaled.shift), "std": torch.tensor(scaled.scale)}
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        policy.save_pretrained(folder)
-    except SafetensorError as error:
-        raise CheckpointError(f"{folder}: cannot be written whole", remedy="is the disk full?") from error
-    for processor in make_act_pre_post_processors(policy.config, stats):
-        processor.save_pretrained(folder)
-    (folder / ORIGIN).write_text(json.dumps(origin | {"rate_hz": config.rate_hz}, indent=2) + "\n")
-
-
-def write_both(
-    folder: Path, config: ActConfig, weights: Weights, best_val_loss: float, origin: dict[str, Any], **settings: Any
-) -> dict[str, str]:
-    """pretrained_model/ in a folder, and best_model.pth where `trainer_can_hold`. Arguments as of `write_trainer`.
-
-    Returns sha256 by name: of the weights' file of the one, and of the other.
-    """
-    files = {"model.safetensors": folder / "pretrained_model" / "model.safetensors"}
-    write_lerobot(folder / "pretrained_model", config, weights, origin)
-    if trainer_can_hold(config):
-        files["best_model.pth"] = folder / "best_model.pth"
-        write_trainer(files["best_model.pth"], config, weights, best_val_loss, origin, **settings)
-    return {name: sha256_of(path) for name, path in files.items()}
-
-
-def find_written(folder: Path) -> Path:
-    """What `write_both` left there for `load_checkpoint`: the trainer's file where there is one."""
-    trainers = folder / "best_model.pth"
-    return trainers if trainers.is_file() else folder / "pretrained_model"
-
-
-def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
-    """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
-    scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
-    return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}
 
 
 def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
@@ -141,3 +227,7 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
         "log_freq": 1, "save_freq": 1, "num_workers": 0,
     }  # fmt: skip
     return shape | training | known | ({} if rate_hz == RATE_HZ else {"rate_hz": rate_hz})
+
+
+KNOWN_CONFIG = {*trainer_config(ActConfig()), "learning_rate", "batch_size", "data_dir", "output_dir", "device", "seed"}
+KNOWN_CONFIG |= {"rate_hz", "use_vae", "origin"}

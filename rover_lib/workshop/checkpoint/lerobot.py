@@ -4,6 +4,7 @@ LeRobot's own classes read the config and the processors. What they accept witho
 statistics and so is left as it is, is checked here.
 """
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import fields
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -18,14 +20,8 @@ from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.checkpoint.contents import (
-    MOST,
-    RATE_HZ,
-    Contents,
-    as_checkpoint_error,
-    name_numbers,
-    name_weights,
-)
+from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
 from rover_lib.workshop.recordings.samples import camera_names
 from rover_lib.workshop.untrusted import quote, quote_all, read_json
@@ -33,12 +29,12 @@ from rover_lib.workshop.untrusted import quote, quote_all, read_json
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
 
-JSON_BYTES = 1_000_000  # LeRobot's config.json: 3 kB
 PRETRAINED, CONFIG = "pretrained_model", "config.json"
 WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
 SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
 IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
 Sizes = tuple[tuple[int, int], ...]
+EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 SAME = {"chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
 NOT_OF_POLICY = {"policy", "optimizer", "scheduler", "eval", "wandb", "env"}  # sections of train_config.json
 ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
@@ -62,32 +58,32 @@ def lerobot_folder(path: Path) -> Path:
     raise CheckpointError(what, found=quote_all(found) or "none", remedy=remedy)
 
 
-def read_lerobot(folder: Path, facts: Facts) -> Contents:
+def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
     """facts: what its files say is added. Raises CheckpointError for missing, damaged or other policies' files."""
     raw = _of_today(folder, _read_json(folder / CONFIG))
-    said, notes = _act_config(folder, raw, facts)
+    said = _act_config(folder, raw, facts)
     tensors, inside = _read_safetensors(folder / WEIGHTS), dict[str, Tensor]()
     # Statistics of before LeRobot had processors.
     for key in () if (folder / OUTER[0]).exists() else (*said.input_features, *said.output_features):
         for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
             inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
-    weights = name_weights(folder, tensors)
+    weights = files.name_weights(folder, tensors)
     inner, outer = Normaliser(folder, *INNER, said, inside), Normaliser(folder, *OUTER, said, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
-    with as_checkpoint_error(folder):
+    with files.as_checkpoint_error(folder):
         sizes = _trained_sizes(folder, raw, tuple((f.shape[1], f.shape[2]) for f in images.values()), facts)
         by = ORIGIN if origin else GUESS
         if origin:
-            facts.say("rate", float(origin.get("rate_hz", RATE_HZ)), ORIGIN)
+            facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
         pictures = tuple(inner.affine(k, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for k in images)
         config = ActConfig(
             cameras=tuple(camera_names(images)),
             image_sizes=sizes,
-            state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
-            action_names=facts.default("actions", name_numbers(actions.shape[0], "action"), by),
+            state_names=files.name_numbers(numbers.shape[0] if numbers else 2, "state"),
+            action_names=facts.default("actions", files.name_numbers(actions.shape[0], "action"), by),
             chunk=facts.default("chunk", said.chunk_size, CONFIG),
             dim=said.dim_model,
             heads=said.n_heads,
@@ -100,13 +96,13 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
             dilation=bool(said.replace_final_stride_with_dilation),
             pre_norm=said.pre_norm,
             activation=said.feedforward_activation,
-            rate_hz=facts.default("rate", RATE_HZ, by),
+            rate_hz=facts.default("rate", files.RATE_HZ, by),
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
             action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
         )
-    report = {"optimizer_mb": 0.0, "written_here": bool(origin), "notes": notes}
+    report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
     return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
 
 
@@ -115,7 +111,7 @@ def _of_today(folder: Path, raw: dict[str, Any]) -> dict[str, Any]:
     if "type" in raw or not {"input_shapes", "output_shapes"} <= raw.keys():
         return raw
     raw, mapping = raw | {"type": "act"}, dict[str, str]()
-    with as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
+    with files.as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
         for part in ("input", "output"):
             shapes, modes = raw.pop(f"{part}_shapes"), raw.pop(f"{part}_normalization_modes", {})
             kinds = {k: "ACTION" if k == "action" else "VISUAL" if "image" in k else "STATE" for k in shapes}
@@ -145,7 +141,7 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     steps = [t for t in (transforms.get("tfs") or {}).values() if t.get("weight", 1) > 0]
     for step in (t for t in steps if t["type"] not in WORDS["random"] and transforms.get("enable")):
         to = step["kwargs"].get("size")
-        whole = all(is_whole(n, 1, MOST) for n in (to if isinstance(to, list) else [to]))
+        whole = all(is_whole(n, 1, files.MOST) for n in (to if isinstance(to, list) else [to]))
         if step["type"] != "Resize" or not whole or len(steps) > transforms.get("max_num_transforms", 3):
             what = f"{path}: some or all of its pictures were changed by {quote(step['type'])}"
             raise CheckpointError(what, remedy=f"train without it, or if it is another training's, remove {TRAINED}")
@@ -156,16 +152,13 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     return (facts.value("size"),) if len(sizes) == 1 and facts.source("size") == USER else sizes
 
 
-def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> tuple["ACTConfig", list[str]]:
-    """Return the config as LeRobot reads it, and notes on what it asks for beyond the network.
-
-    Raises CheckpointError.
-    """
+def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
+    """Return the config as LeRobot reads it; a note says what it asks for beyond the network."""
     path = folder / CONFIG
     if raw.get("type") != "act":
         what = f"{path}: policy type is {quote(raw.get('type'))}"
         raise CheckpointError(what, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
 
@@ -174,21 +167,20 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> tuple["ACTCo
         said = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in known} | {"device": "cpu"})
         cameras = [tuple(camera.shape) for camera in said.image_features.values()]
         rows = [tuple(row.shape) for row in (said.robot_state_feature, said.action_feature) if row]
-        whole = all(is_whole(n, 1, MOST) for shape in (*cameras, *rows) for n in shape)
+        whole = all(is_whole(n, 1, files.MOST) for shape in (*cameras, *rows) for n in shape)
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
     if not (cameras and said.action_feature and whole and right) or said.env_state_feature:
         features = {**said.input_features, **said.output_features}
         found = quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items())
         remedy = "train with cameras (3, height, width), numbers in 'action', and in 'observation.state' or none"
         raise CheckpointError(f"{folder}: its features are not a car's", found=found, remedy=remedy)
-    notes = []
     if said.temporal_ensemble_coeff is not None:
         coefficient = f"temporal_ensemble_coeff is {said.temporal_ensemble_coeff}"
-        notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
+        facts.notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
     facts.default("size", cameras[0][1:], SIZE_OF_BASE)
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         facts.read({k: v for k, v in raw.items() if k not in {*known, "type", "pretrained_revision"}}, "")
-    return said, notes
+    return said
 
 
 class Normaliser:
@@ -210,7 +202,7 @@ class Normaliser:
             self.step.load_state_dict(inside)
             return
         content, read = _read_json(self.where), []
-        with as_checkpoint_error(self.where):
+        with files.as_checkpoint_error(self.where):
             for step in content["steps"]:
                 name, config = step["registry_name"], step.get("config") or {}
                 if name == normalises:
@@ -261,8 +253,8 @@ class Normaliser:
 
 def _read_json(path: Path) -> dict[str, Any]:
     refuse_pointer(path, CheckpointError)
-    with as_checkpoint_error(path):
-        return dict(read_json(path, JSON_BYTES))
+    with files.as_checkpoint_error(path):
+        return dict(read_json(path, files.JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
@@ -270,5 +262,42 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         what = f"{printable(str(path))}: not found, or not a file"
         raise CheckpointError(what, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         return load_file(path)
+
+
+def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], origin: dict[str, Any]) -> None:
+    """A folder that LeRobot's ACTPolicy.from_pretrained and its processors load. weights: as for `write_both`.
+
+    Raises CheckpointError on a full disk.
+    """
+    # here, because it takes ten seconds to import
+    from lerobot.configs.types import NormalizationMode
+    from lerobot.policies.act.processor_act import make_act_pre_post_processors
+
+    policy = lerobot_act(config, weights)
+    raw, normed = NormalizationMode.IDENTITY, NormalizationMode.MEAN_STD
+    modes = {"STATE": normed if config.state_norm else raw, "ACTION": normed if config.action_unnorm else raw}
+    policy.config.normalization_mapping = {"VISUAL": normed, **modes}
+    stats = {
+        f"observation.images.{name}": _statistics(norm, (3, 1, 1))
+        for name, norm in zip(config.cameras, config.image_norm, strict=True)
+    }
+    if config.state_norm is not None:
+        stats["observation.state"] = _statistics(config.state_norm, (-1,))
+    if (scaled := config.action_unnorm) is not None:
+        stats["action"] = {"mean": torch.tensor(scaled.shift), "std": torch.tensor(scaled.scale)}
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        policy.save_pretrained(folder)
+    except SafetensorError as error:
+        raise CheckpointError(f"{folder}: cannot be written whole", remedy="is the disk full?") from error
+    for processor in make_act_pre_post_processors(policy.config, stats):
+        processor.save_pretrained(folder)
+    (folder / ORIGIN).write_text(json.dumps(origin | {"rate_hz": config.rate_hz}, indent=2) + "\n")
+
+
+def _statistics(norm: Affine, shape: tuple[int, ...]) -> dict[str, Tensor]:
+    """Mean and standard deviation whose normalisation, LeRobot's eps included, is x * scale + shift."""
+    scale, shift = torch.tensor(norm.scale, dtype=torch.float64), torch.tensor(norm.shift, dtype=torch.float64)
+    return {"mean": (-shift / scale).float().reshape(shape), "std": (1 / scale - EPS).float().reshape(shape)}

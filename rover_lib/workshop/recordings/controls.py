@@ -27,36 +27,20 @@ HALF = 0.4, 0.6  # where the middle of steering is straight ahead if it lies fro
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
 DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 Item = TypeVar("Item")
+Rows = list[tuple[int, dict[str, float], str]]  # the number of a control, its numbers, and who drove
+Actions = dict[int, float]  # of one channel, by the number of their control
 
 
-@dataclass(frozen=True)
-class Formula:
-    """action = (duty % - neutral_pct) / span_pct, clipped to [low, high]."""
-
-    neutral_pct: float
-    span_pct: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, channel: Channel) -> "Formula":
-        return cls(channel.neutral_pct, channel.span_pct, channel.low, channel.high)
-
-    def __str__(self) -> str:
-        duty = f"(duty % - {self.neutral_pct:.3g})" if self.neutral_pct else "duty %"
-        return f"{duty} / {self.span_pct:.3g}"
-
-    def actions(self, duties_pct: np.ndarray) -> np.ndarray:
-        return ((duties_pct - self.neutral_pct) / self.span_pct).clip(self.low, self.high)
-
-    def is_followed(self, actions: np.ndarray, duties_pct: np.ndarray) -> bool:
-        """Whether recorded actions, (n,), are those of this formula at their duties, all but a few."""
-        agrees = np.abs(self.actions(duties_pct) - actions) <= EXACT
-        return len(actions) > 0 and agrees.mean() >= FOLLOWS
+# What the user's recorder wrote before October 2025, as the channels that it meant.
+OLD = {
+    "steering": replace(PwmCalibration().steering, neutral_pct=7.0, span_pct=2.42),
+    "throttle": replace(PwmCalibration().throttle, neutral_pct=0.0, span_pct=70.0),
+}
 
 
-# What the user's recorder wrote before October 2025.
-OLD = {"steering": Formula(7.0, 2.42, -1.0, 1.0), "throttle": Formula(0.0, 70.0, 0.0, 1.0)}
+def _formula(channel: Channel) -> str:
+    duty = f"(duty % - {channel.neutral_pct:.3g})" if channel.neutral_pct else "duty %"
+    return f"{duty} / {channel.span_pct:.3g}"
 
 
 @dataclass
@@ -76,15 +60,13 @@ class Faults:
 
     def nothing_usable(self, what: str, remedy: str) -> EpisodeError:
         """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
+        left = [fault for fault in self.listed() if fault.handled == "left out"]
         kinds: Counter[str] = Counter()
-        first: dict[str, str] = {}
-        for fault in self.listed():
-            if fault.handled == "left out":
-                kinds[fault.kind] += fault.count
-                first.setdefault(fault.kind, f"{fault.note} ({fault.file})")
+        for fault in left:
+            kinds[fault.kind] += fault.count
         most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
         worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
-        found = first[most[0]] if most else ""
+        found = next((f"{fault.note} ({fault.file})" for fault in left if fault.kind == most[0]), "")
         what = f"{self.root}: {what} ({worst or 'empty'})"
         return EpisodeError(what, found=found or None, remedy="" if "; " in found else remedy)
 
@@ -114,7 +96,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
 
     Raises EpisodeError if a channel's actions follow no formula of its pulses.
     """
-    read: list[tuple[int, dict[str, float], list[str], str]] = []
+    read: Rows = []
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
@@ -134,19 +116,17 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         if (driver := written.driver_of(row)) is None:
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
-        read.append((i, values, lost, driver))
-    pairs = {}
-    formulas = {}
+        read.append((i, values, driver))
+    pairs, formulas = {}, {}
     for name in ACTION_NAMES:
-        rows_of = {i: values for i, values, lost, _ in read if name not in lost}
-        recorded, meant, formula = _read_actions(pwm.channel(name), rows_of, path, faults)
+        recorded, meant, older = _read_actions(pwm.channel(name), read, path, faults)
         pairs[name] = recorded, meant
-        if formula:
-            formulas[name] = str(formula)
+        if older:
+            formulas[name] = _formula(older)
     # Too few readings to show a formula are of older firmware too, if the other channel's are.
     actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
     controls = []
-    for i, values, _, driver in read:
+    for i, values, driver in read:
         pair = actions["steering"].get(i), actions["throttle"].get(i)
         pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
@@ -155,60 +135,57 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
     return in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
 
-def _read_actions(
-    channel: Channel, rows: dict[int, dict[str, float]], path: Path, faults: Faults
-) -> tuple[dict[int, float], dict[int, float], Formula | None]:
+def _read_actions(channel: Channel, rows: Rows, path: Path, faults: Faults) -> tuple[Actions, Actions, Channel | None]:
     """Return one channel's measured actions by the number of their control, as recorded and as their pulses mean them.
 
-    And the older formula that the recorded ones follow, if they do. Raises EpisodeError if they follow none.
+    And the older channel whose formula the recorded ones follow, if they do. Raises EpisodeError if they follow none.
     """
-    name, old = channel.name, OLD[channel.name]
-    recorded, meant, duties_pct = {}, {}, {}
-    for i, values in rows.items():
-        action, pulse_us, period_us = (values[f"{name}_{part}"] for part in ("normalized", "raw_us", "period_us"))
-        if any(math.isnan(v) for v in (action, pulse_us, period_us)):
-            continue  # the caller has counted it, with the field's name
+    name = channel.name
+    old = replace(OLD[name], period_us=channel.period_us, by_pulse=channel.by_pulse)
+    recorded, meant, of_old, pulses_us = {}, {}, {}, {}
+    for i, values, _ in rows:
+        parts = [values.get(f"{name}_{part}", math.nan) for part in ("normalized", "raw_us", "period_us")]
+        if any(map(math.isnan, parts)):
+            continue  # not measured, or the caller has counted it, with the field's name
+        action, pulse_us, period_us = parts
         expected = channel.action(pulse_us, period_us)
         if expected is None:
             kind = "zero_period" if period_us == 0 or pulse_us == 0 else "odd_period"
             note = f"control {i}: pulse {pulse_us:g} us of {period_us:g} us; such values are missing, not 0"
             faults.add(path, f"{name}_{kind}", note)
             continue
-        recorded[i], meant[i] = action, expected
-        duties_pct[i] = 100 * pulse_us / (channel.period_us if channel.by_pulse else period_us)
-    _refuse_other_pulses(channel, duties_pct)
+        recorded[i], meant[i], of_old[i] = action, expected, old.action(pulse_us, period_us) or 0.0
+        # as at the nominal period, so that one limit in microseconds holds
+        pulses_us[i] = pulse_us if channel.by_pulse else pulse_us / period_us * channel.period_us
+    _refuse_other_pulses(channel, pulses_us)
     # Firmware may have been changed within a recording, so only what disagrees must follow the older formula.
     wrong = [i for i in recorded if abs(recorded[i] - meant[i]) > EXACT]
-    follows_old = old.is_followed(np.array([recorded[i] for i in wrong]), np.array([duties_pct[i] for i in wrong]))
+    follows_old = wrong and np.mean([abs(recorded[i] - of_old[i]) <= EXACT for i in wrong]) >= FOLLOWS
     unlike = len(recorded) >= LEAST_READINGS and len(wrong) > (1 - FOLLOWS) * len(recorded)
     if not follows_old and not unlike:
         return recorded, meant, None
     seen = f"control {wrong[0]}: {recorded[wrong[0]]:g} recorded, its pulse says {meant[wrong[0]]:.4f}"
     if not follows_old:
-        what = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither {old} nor "
+        what = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither "
         remedy = "correct them, say in metadata.car which car it is, or record again"
-        raise EpisodeError(f"{what}{Formula.of(channel)}, this car's", found=seen, remedy=remedy)
-    note = f"recorded as {old} instead of {Formula.of(channel)}; {seen}; recomputed from the pulses"
+        raise EpisodeError(f"{what}{_formula(old)} nor {_formula(channel)}, this car's", found=seen, remedy=remedy)
+    note = f"recorded as {_formula(old)} instead of {_formula(channel)}; {seen}; recomputed from the pulses"
     faults.add(path, f"{name}_recomputed", note, len(wrong))
     return meant, meant, old
 
 
-def _refuse_other_pulses(channel: Channel, duties_pct: dict[int, float]) -> None:
+def _refuse_other_pulses(channel: Channel, pulses_us: dict[int, float]) -> None:
     """Raise EpisodeError if most pulses lie far beyond this car's: all would be recomputed as one end of its range."""
     (low_us, high_us), margin_us = channel.ends_us, FAR * channel.us_per_unit
-    pulses_us = {i: duty * channel.period_us / 100 for i, duty in duties_pct.items()}
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
-    if len(pulses_us) >= LEAST_READINGS and 2 * len(far) > len(pulses_us):
-        what = (
-            f"{channel.name}: {len(far)} of {len(pulses_us)} pulses lie far beyond this car's {low_us} to {high_us} us"
-        )
+    count = len(pulses_us)
+    if count >= LEAST_READINGS and 2 * len(far) > count:
+        what = f"{channel.name}: {len(far)} of {count} pulses lie far beyond this car's {low_us} to {high_us} us"
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
         raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
 
 
-def _take(
-    channel: Channel, recorded: dict[int, float], meant: dict[int, float], recompute: bool, path: Path, faults: Faults
-) -> dict[int, float]:
+def _take(channel: Channel, recorded: Actions, meant: Actions, recompute: bool, path: Path, faults: Faults) -> Actions:
     """Return one channel's actions as recorded, or, if `recompute`, as their pulses mean them where these deny them."""
     for i, action in list(recorded.items()):
         kind = None
@@ -228,29 +205,23 @@ def _take(
 def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
     late = written.find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
-    placed: list[Control] = []
-    moved = dropped = 0
-    farthest_s = 0.0
-    end = len(controls)
-    while end:
-        # A burst and the live control that ends it: late[start..end-2] are true, late[end-1] is not.
-        start = end - 1
-        while start and late[start - 1]:
-            start -= 1
-        run, end = controls[start:end], start
-        placed.append(run[-1])
-        if len(run) - 1 < written.BURST_MIN:
-            placed.extend(reversed(run[:-1]))
+    ends = [i + 1 for i, is_late in enumerate(late) if not is_late]
+    placed, moved, dropped, farthest_s = list[Control](), 0, 0, 0.0
+    for start, end in pairwise([0, *ends]):
+        # A burst and the live control that ends it: the times of all others are not those of their measuring.
+        *waited, after = controls[start:end]
+        placed.append(after)
+        if len(waited) < written.BURST_MIN:
+            placed += reversed(waited)
             continue
-        for k in range(len(run) - 2, -1, -1):
-            control, after = run[k], run[k + 1]
+        for left, control in reversed([*enumerate(waited, 1)]):
             step_s = written.arduino_step_s(control.arduino_s, after.arduino_s)
             if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
-                dropped += k + 1
+                dropped += left
                 break
-            time_s = placed[-1].system_s - step_s
-            farthest_s = max(farthest_s, control.system_s - time_s)
-            placed.append(replace(control, system_s=time_s))
+            after = replace(control, system_s=after.system_s - step_s)
+            farthest_s = max(farthest_s, control.system_s - after.system_s)
+            placed.append(after)
             moved += 1
     note = f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived"
     faults.add(path, "serial_burst", note, moved)
@@ -265,14 +236,11 @@ def in_order(timed: list[tuple[float, Item]], went_on: list[bool], path: Path, w
     the one before it, whatever their times say.
     """
     times_s = [time_s for time_s, _ in timed]
-    end = next((i for i in range(2, len(timed)) if went_on[i - 1] and _was_set_back(times_s, i)), len(timed))
+    # Two times are later than the two that follow: one wrong time is no clock set back.
+    back = (i for i in range(2, len(timed)) if went_on[i - 1] and min(times_s[i - 2 : i]) > max(times_s[i : i + 2]))
+    end = next(back, len(timed))
     note = f"the clock was set back at {what} {end}; from there on, times may be those of other moments"
     faults.add(path, f"clock_set_back_at_{what}", note, len(timed) - end)
-    back = sum(b < a for a, b in pairwise(times_s[:end]))
-    faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", back)
+    unsorted = sum(b < a for a, b in pairwise(times_s[:end]))
+    faults.add(path, f"unsorted_{what}_times", f"{what}s were put in order of time", unsorted)
     return [item for _, item in sorted(timed[:end], key=lambda pair: pair[0])]
-
-
-def _was_set_back(times_s: list[float], i: int) -> bool:
-    """Whether the two times before `i` are later than those at `i` and `i + 1`: one wrong time is no clock set back."""
-    return min(times_s[i - 2 : i]) > max(times_s[i : i + 2])

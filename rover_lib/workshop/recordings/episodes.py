@@ -15,11 +15,12 @@ import csv
 import json
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,8 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
-from rover_lib.onboard.kinds import EPISODE_FILES
-from rover_lib.onboard.recording.episode import (
-    CONTROL_FIELDS,
-    DATA,
-    DATA_BYTES,
-    FRAME_FIELDS,
-    NOBODY,
-    car_in,
-    find_killed,
-    number_of,
-    read_car_of,
-)
+from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
+from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
@@ -48,11 +39,16 @@ from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
-from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
-# What DATA has under these names, and where it is again with which columns.
-TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
+# What the JSON file has under these names, and where it is again with which columns.
+TABLES = {
+    "control_samples": ("control_data.csv", written.CONTROL_FIELDS),
+    "frame_samples": ("frame_data.csv", written.FRAME_FIELDS),
+}
+READ = "only folders of episodes, LeRobotDatasets and donkeycar tubs are read: write a LeRobotDataset of it"
+# what a file's path looks like, what its folder then is, and what to do
+STRANGERS, MOST_FILES = Path(__file__).with_name("strangers.txt"), 2000
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
@@ -114,25 +110,40 @@ def load_recordings(
         remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
         raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {root} --finish` makes an episode of it"
-    killed = find_killed(root)
+    killed = written.find_killed(root)
     if not folders:
         inside = quote_all(sorted(p.name for p in root.iterdir())) or None
-        what, remedy = "no episode folders in it", finish if killed else READ
-        if not killed and (stranger := name_stranger(root)):
-            what, remedy = f"{stranger[0]}, not our recordings", stranger[1]
+        what, remedy = ("no episode folders in it", finish) if killed else _name_stranger(root)
         raise EpisodeError(f"{root}: {what}", found=inside, remedy=remedy)
     faults = Faults(root)
     for part in killed:
         faults.add(part, "killed_recording", finish)
     for folder in sorted({*others} - {*folders}):
-        faults.add(folder, "no_episode", f"neither {DATA} nor CSV files; drives in folders of it are not read")
+        faults.add(folder, "no_episode", f"neither {written.DATA} nor CSV files; drives in folders of it are not read")
     listed = progress(folders, desc="reading episodes", total=len(folders))
-    loaded = [_load_episode(folder, chunk, sync_s, faults) for folder in listed]
-    episodes = tuple(episode for episode in loaded if episode)
+    episodes = [episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults))]
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
     return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
+
+
+def _name_stranger(root: Path) -> tuple[str, str]:
+    """Return what a folder without episodes holds, as owners of other cars and robots have it, and what to do."""
+    inside = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")]
+    for kind, words, remedy in (
+        ("tub", "donkeycar tubs", "rover export-dataset {} OUT, and so for each"),
+        ("dataset", "LeRobotDatasets", "give one of them, such as {}"),
+        ("recordings", "folders of recordings", "give one of them, such as {}"),
+    ):
+        if found := [folder for folder in inside if kind in kinds_of(folder)]:
+            return f"a folder of {len(found)} {words}, not our recordings", remedy.format(found[0])
+    paths = [f"/{path.relative_to(root).as_posix()}" for path in islice(root.rglob("*"), MOST_FILES)]
+    for line in STRANGERS.read_text().splitlines():
+        pattern, words, *own = line.split("\t")
+        if any(re.search(pattern, path) for path in paths):
+            return f"{words}, not our recordings", own[0] if own else READ
+    return "no episode folders in it", READ
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
@@ -141,16 +152,15 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         with limited_memory():
             content, tables = _read_tables(folder, faults)
             # read_car_of reads larger files
-            car = car_in(content.get("metadata"), folder) if content else read_car_of(folder)
+            car = written.car_in(content.get("metadata"), folder) if content else written.read_car_of(folder)
     except (OSError, ValueError, csv.Error, MemoryError) as e:
         why = quote(str(e) or "too much memory")
-        faults.add(folder, "unreadable", f"neither {DATA} nor its CSV files can be read: {why}")
+        faults.add(folder, "unreadable", f"neither {written.DATA} nor its CSV files can be read: {why}")
         return None
     except CarError as e:
         faults.add(folder, "no_car", str(e))
         return None
     (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
-    label = content.get("action_label")
     try:
         controls, formulas = read_controls(source, control_rows, car.pwm, faults)
     except EpisodeError as e:
@@ -165,25 +175,18 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         note = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
         faults.add(folder, "nothing_usable", note)
         return None
-    return Episode(
-        id=folder.name,
-        path=folder,
-        label=label if isinstance(label, str) else "",
-        duration_s=frames[-1].time_s - frames[0].time_s,
-        frames=len(frame_rows),
-        controls=len(control_rows),
-        samples=samples,
-        files=tuple(p for name in EPISODE_FILES if (p := folder / name).is_file()),
-        formulas=formulas,
-    )
+    files = tuple(p for name in EPISODE_FILES if (p := folder / name).is_file())
+    counts = frames[-1].time_s - frames[0].time_s, len(frame_rows), len(control_rows)
+    label = said if isinstance(said := content.get("action_label"), str) else ""
+    return Episode(folder.name, folder, label, *counts, samples, files, formulas)
 
 
 def _read_tables(folder: Path, faults: Faults) -> tuple[dict[str, Any], dict[str, tuple[Path, list[Any]]]]:
-    """Return DATA's content, {} if it has none, and for controls and frames the file that has rows, and these.
+    """Return the JSON file's content, {} if it has none, and for controls and frames the file that has rows, and these.
 
-    The rows are DATA's, or where it has none the CSV file's. Raises OSError, ValueError and csv.Error for that one.
+    The rows are the JSON's, or where it has none the CSV file's. Raises OSError, ValueError and csv.Error for that one.
     """
-    path, content, why = folder / DATA, dict[str, Any](), "no rows of controls or frames in it"
+    path, content, why = folder / written.DATA, dict[str, Any](), "no rows of controls or frames in it"
     try:
         found = read_json(path)
         content = found if isinstance(found, dict) else {}
@@ -199,7 +202,7 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[dict[str, Any], dict[str
 
 
 def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
-    lines = read_plain(path, DATA_BYTES).decode("utf-8-sig", errors="replace").splitlines()
+    lines = read_plain(path, written.DATA_BYTES).decode("utf-8-sig", errors="replace").splitlines()
     # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
     table = csv.DictReader(lines, restval="missing")
     if missing := [name for name in fields if name not in (table.fieldnames or ())]:
@@ -215,10 +218,11 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
-        number, time_s, name = number_of(row.get("frame_id")), number_of(row.get("timestamp")), row.get("image_path")
+        number, time_s = written.number_of(row.get("frame_id")), written.number_of(row.get("timestamp"))
+        name = row.get("image_path")
         nan = math.isnan(number or 0) or math.isnan(time_s or 0)
         if nan or number is None or time_s is None or not isinstance(name, str) or not name:
-            said = quote_all(row.get(name) for name in FRAME_FIELDS)
+            said = quote_all(row.get(name) for name in written.FRAME_FIELDS)
             faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {said}")
             continue
         if number in numbers:
@@ -282,50 +286,36 @@ def check_pictures(
     return found
 
 
-def _actions_of(
-    frames: list[_Frame], controls: list[Control], sync_s: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Return for each frame its action, (n, 2) float32, whether it has one, (n,), whether any control is near, (n,),
-    and the pulses of each action in microseconds, (n, 2), and who drove.
-    """
-    times_s = np.array([f.time_s for f in frames])
-    actions = np.zeros((len(frames), len(ACTION_NAMES)), np.float32)
-    pulses_us = np.zeros((len(frames), len(ACTION_NAMES)))
-    known = np.ones(len(frames), bool)
-    for i in range(len(ACTION_NAMES)):
-        measured = [c for c in controls if c.actions[i] is not None]
-        near, index = _nearest(times_s, np.array([c.system_s for c in measured]), sync_s)
-        known &= near
-        if measured:
-            actions[:, i] = np.where(near, np.array([c.actions[i] for c in measured], np.float32)[index], 0)
-            pulses_us[:, i] = np.array([c.pulses_us[i] for c in measured])[index]
-    near, index = _nearest(times_s, np.array([c.system_s for c in controls]), sync_s)
-    return actions, known, near, pulses_us, [controls[i].driver for i in index]
-
-
-def _nearest(times_s: np.ndarray, sorted_s: np.ndarray, within_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """For each time, return whether the nearest of `sorted_s` is within `within_s`, and the index of that one."""
-    if not len(sorted_s):
-        return np.zeros(len(times_s), bool), np.zeros(len(times_s), int)
-    after = np.searchsorted(sorted_s, times_s).clip(1, max(len(sorted_s) - 1, 1)).clip(0, len(sorted_s) - 1)
-    before = (after - 1).clip(0)
-    index = np.where(np.abs(sorted_s[before] - times_s) <= np.abs(sorted_s[after] - times_s), before, after)
-    return np.abs(sorted_s[index] - times_s) <= within_s, index
+def _nearest(times_s: np.ndarray, controls: list[Control], within_s: float) -> list[Control | None]:
+    """Return for each time the nearest control, or None if that is farther away."""
+    if not controls:
+        return [None] * len(times_s)
+    system_s = np.array([c.system_s for c in controls])
+    index = np.searchsorted((system_s[1:] + system_s[:-1]) / 2, times_s)
+    near = np.abs(system_s[index] - times_s) <= within_s
+    return [controls[k] if is_near else None for k, is_near in zip(index.tolist(), near, strict=True)]
 
 
 def _make_samples(
     folder: Path, car: Car, frames: list[_Frame], controls: list[Control], chunk: int, sync_s: float, faults: Faults
 ) -> tuple[Sample, ...]:
-    actions, known, near, pulses_us, drivers = _actions_of(frames, controls, sync_s)
-    if not near.any():
+    times_s = np.array([f.time_s for f in frames])
+    nearest = _nearest(times_s, controls, sync_s)
+    if not any(nearest):
         gap_s = min(abs(frames[0].time_s - controls[-1].system_s), abs(controls[0].system_s - frames[-1].time_s))
         faults.add(folder, "no_overlap", f"frames and controls are {gap_s:.1f} s apart")
         return ()
-    faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", int((~near).sum()))
+    steering = _nearest(times_s, [c for c in controls if c.actions[0] is not None], sync_s)
+    throttle = _nearest(times_s, [c for c in controls if c.actions[1] is not None], sync_s)
+    measured = list(zip(steering, throttle, strict=True))
+    known = np.array([all(pair) for pair in measured])
+    actions = np.array([[c.actions[i] if c else 0 for i, c in enumerate(pair)] for pair in measured], np.float32)
+    pulses_us = [[c.pulses_us[i] if c else math.nan for i, c in enumerate(pair)] for pair in measured]
+    without = nearest.count(None)
+    faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", without)
     note = f"controls near, but without a measured pulse within {sync_s * 1000:g} ms"
-    faults.add(folder, "frame_without_measurement", note, int((near & ~known).sum()))
+    faults.add(folder, "frame_without_measurement", note, len(frames) - without - int(known.sum()))
 
-    times_s = np.array([f.time_s for f in frames])
     steps_s = np.diff(times_s)
     longest_s = min(HOLE_INTERVALS * float(np.median(steps_s)), HOLE_S) if len(steps_s) else HOLE_S
     holes = np.flatnonzero(steps_s > longest_s) + 1
@@ -334,42 +324,27 @@ def _make_samples(
 
     samples: list[Sample] = []
     unknown_state = 0
-    held = np.array([driver == NOBODY for driver in drivers])
-    breaks = {*holes.tolist(), *(np.flatnonzero(held[1:] != held[:-1]) + 1).tolist()}
-    for segment in _segments(known, breaks):
+    drivers = [c.driver if c else "" for c in nearest]
+    held = np.array([driver == written.NOBODY for driver in drivers])
+    breaks = np.union1d(holes, np.flatnonzero(held[1:] != held[:-1]) + 1)
+    with_action = np.flatnonzero(known)
+    cuts = np.flatnonzero((np.diff(with_action) > 1) | np.isin(with_action[1:], breaks)) + 1
+    for segment in np.split(with_action, cuts):
         n = len(segment)
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
-        for k, i in enumerate(segment):
+        for k, i in enumerate(segment.tolist()):
             if frames[i].size is None:
                 continue
             if k == 0 and i > 0:
                 unknown_state += 1
                 continue
             state = actions[i - 1] if k else np.asarray(NEUTRAL, np.float32)
-            samples.append(
-                Sample(
-                    episode=folder.name,
-                    frame_path=frames[i].path,
-                    time_s=float(times_s[i] - times_s[0]),
-                    state=state.copy(),
-                    chunk=chunks[k].copy(),
-                    is_pad=pads[k].copy(),
-                    row=i,
-                    driver=drivers[i],
-                    car=car,
-                    pulses_us=(float(pulses_us[i, 0]), float(pulses_us[i, 1])),
-                )
-            )
+            numbers = state.copy(), chunks[k], pads[k]
+            shown = folder.name, frames[i].path, float(times_s[i] - times_s[0])
+            samples.append(Sample(*shown, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
     faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)
     return tuple(samples)
-
-
-def _segments(known: np.ndarray, holes: set[int]) -> list[list[int]]:
-    """Return runs of consecutive frames with actions, as lists of indices. A new run begins at an index in `holes`."""
-    index = np.flatnonzero(known).tolist()
-    cuts = [k for k, (before, i) in enumerate(pairwise(index), 1) if i > before + 1 or i in holes]
-    return [index[start:end] for start, end in pairwise([0, *cuts, len(index)])]
 
 
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:

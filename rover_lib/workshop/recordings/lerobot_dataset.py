@@ -26,10 +26,10 @@ from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.names import ACTION, STATE, name_numbers, name_states
-from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, camera_names
+from rover_lib.workshop.recordings.samples import ACTION, STATE, Episode, Layout, Recordings, Sample, Source
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
 
 INFO = Path("meta/info.json")
@@ -85,14 +85,16 @@ class _Camera:
         Most decoders make a picture of a torn one. Of videos, the last picture of each is decoded: one that was cut
         lacks its end.
         """
+        if self.rows is None:
+            for row in {path: row for row, path in enumerate(self.paths)}.values():
+                with _as_episode_error(f"{self.paths[row]}: cannot be decoded"):
+                    self.read_bgr(row)
+            return set()
         found: list[str] = []
-        for batch in self.rows.iter(BATCH) if self.rows else ():
+        for batch in self.rows.iter(BATCH):
             encoded = [(picture or {}).get("bytes") or b"" for picture in batch[self.key]]
             found += [untrusted.check_encoded(data, self.size) for data in encoded]
         unusable = [row for row, why in enumerate(found) if why]
-        for path, row in () if self.rows else {path: row for row, path in enumerate(self.paths)}.items():
-            with _as_episode_error(f"{path}: cannot be decoded"):
-                self.read_bgr(row)
         if unusable:
             remedy = "" if len(unusable) < len(found) else f"; correct {INFO}, or write the pictures anew as RGB"
             note = f"the picture of '{self.key}' in row {unusable[0]}: {found[unusable[0]]}{remedy}"
@@ -101,7 +103,7 @@ class _Camera:
 
     def read_bgr(self, row: int) -> np.ndarray:
         """Read a picture, (h, w, 3) uint8 BGR. Raises EpisodeError and what decoders raise."""
-        if not self.rows:
+        if self.rows is None:
             from lerobot.datasets.video_utils import decode_video_frames
 
             with warnings.catch_warnings():
@@ -121,40 +123,19 @@ class _Camera:
 
 @dataclass(frozen=True, eq=False)
 class LerobotSample(Sample):
-    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera).
+    """A sample whose picture is one of many in `frame_path`, a parquet or mp4 file (that of the first camera)."""
 
-    cameras: by the policy's names.
-    """
-
-    cameras: Mapping[str, _Camera] = field(kw_only=True)
+    cameras: Mapping[str, _Camera] = field(kw_only=True)  # by the policy's names
 
     @property
     def frame_name(self) -> str:
         return f"frame {self.row}"
 
     def frame_bgr(self) -> Any:
-        """Read the picture, (h, w, 3) uint8 BGR; of several cameras, a dict by their names.
-
-        Raises EpisodeError if it cannot be decoded, or has another size than the others.
-        """
+        """Read the picture, as Sample does; of several cameras, a dict by their names. Raises EpisodeError likewise."""
         with _as_episode_error(f"{self.frame_path}: its frame {self.row} cannot be decoded"), limited_memory():
             frames = {name: camera.read_bgr(self.row) for name, camera in self.cameras.items()}
         return frames if len(frames) > 1 else self.turned(next(iter(frames.values())))
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """What meta/ says of an episode. ends: its first row and the next one's, None in version 2.
-
-    videos: by its camera's key, the file and from when to when in it, in seconds.
-    """
-
-    number: int
-    length: int
-    ends: tuple[int | None, int | None]
-    data: Path
-    videos: Mapping[str, tuple[Path, float, float]]
-    task: str
 
 
 def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Recordings:
@@ -173,7 +154,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
         with limited_memory(3 * sum(path.stat().st_size for path in files if path.is_file())):
             dataset.read_frames(files)
     listed = progress(dataset.entries, desc="reading episodes", total=len(dataset.entries))
-    episodes = [episode for entry in listed if (episode := dataset.episode(entry, chunk)).samples]
+    episodes = [episode for row in listed if (episode := dataset.episode(row, chunk)).samples]
     if not episodes:
         raise faults.nothing_usable("no usable sample", WRITE_ANEW)
     if layout.action_names == CHANNELS:
@@ -182,7 +163,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
 
 
 class _Dataset:
-    """What a dataset's folder holds. layout, keys: of its cameras, by their names. entries: by their numbers.
+    """What a dataset's folder holds. layout, keys: of its cameras, by their names. entries: meta/'s, by their numbers.
 
     columns: all frames' numbers by LeRobot's keys, in their order: states (n, S) and actions (n, A), float32 and by the
     layout's names, others (n,). unusable: rows without a whole picture.
@@ -205,26 +186,21 @@ class _Dataset:
             if not tables:
                 raise _broken(f"{self.root}: has no meta/episodes/*/*.parquet")
             rows = [row for path in tables for row in _read_table(self.root, path, "(?!stats/).*").to_pylist()]
-        self.entries = sorted(map(self._entry, rows), key=lambda entry: entry.number)
-        return list(dict.fromkeys(entry.data for entry in self.entries))
+        self.entries = sorted(rows, key=lambda row: row["episode_index"])
+        return list(dict.fromkeys(map(self._file, self.entries)))
 
-    def _entry(self, row: Mapping[str, Any]) -> _Entry:
-        """Version 2 has files of each episode, and version 3 files that its tables name."""
-        number, length = row["episode_index"], row["length"]
+    def _file(self, row: Mapping[str, Any], camera: str = "") -> Path:
+        """The file of an episode's frames, or its video: version 2 has one of each episode, version 3 names it."""
+        where, number = f"videos/{camera}" if camera else "data", row["episode_index"]
+        parts = {part: row[f"{where}/{part}"] for part in ("chunk_index", "file_index") if f"{where}/{part}" in row}
         own = {"episode_index": number, "episode_chunk": number // self.info.get("chunks_size", 1000)}
+        return self.root / self.info["video_path" if camera else "data_path"].format(**own, **parts, video_key=camera)
 
-        def path_of(template: str, where: str, **more: str) -> Path:
-            parts = {part: row[f"{where}/{part}"] for part in ("chunk_index", "file_index") if f"{where}/{part}" in row}
-            return self.root / self.info[template].format(**own, **parts, **more)
-
-        videos = {}
-        for key, feature in self.features.items():
-            if feature.get("dtype") == "video":
-                file, first_s = f"videos/{key}", row.get(f"videos/{key}/from_timestamp", 0.0)
-                last_s = row.get(f"videos/{key}/to_timestamp", length / self.fps)
-                videos[key] = path_of("video_path", file, video_key=key), first_s, last_s
-        ends = row.get("dataset_from_index"), row.get("dataset_to_index")
-        return _Entry(number, length, ends, path_of("data_path", "data"), videos, str((row.get("tasks") or [""])[0]))
+    def _shown(self, row: Mapping[str, Any], camera: str) -> tuple[Path, float, float]:
+        """The video of an episode, and from when to when in it that is shown, in seconds."""
+        first_s = row.get(f"videos/{camera}/from_timestamp", 0.0)
+        last_s = row.get(f"videos/{camera}/to_timestamp", row["length"] / self.fps)
+        return self._file(row, camera), first_s, last_s
 
     def read_frames(self, files: Sequence[Path]) -> None:
         """Read and check the frames' numbers, and find their pictures."""
@@ -245,7 +221,7 @@ class _Dataset:
         self._check_order()
         self._check_times()
         drivers, self.car = _read_export(self.root, len(self.entries), INTERVENTION in keys, self.faults)
-        self.drivers = {entry.number: driver for entry, driver in zip(self.entries, drivers, strict=True)}
+        self.drivers = {row["episode_index"]: driver for row, driver in zip(self.entries, drivers, strict=True)}
         self._check_numbers()
         self.cameras = {name: self._camera(key, self.layout.image_sizes[name]) for name, key in self.keys.items()}
         self.unusable = {row for camera in self.cameras.values() for row in camera.find_unusable(self.faults)}
@@ -256,7 +232,7 @@ class _Dataset:
         starts = np.flatnonzero(np.diff(number, prepend=-1))
         lengths = np.diff([*starts, len(number)])
         within = np.arange(len(number)) - np.repeat(starts, lengths)
-        said = np.array([[entry.number, entry.length] for entry in self.entries]).reshape(-1, 2)
+        said = np.array([[row["episode_index"], row["length"]] for row in self.entries]).reshape(-1, 2)
         whole = np.array_equal(said, np.stack([number[starts], lengths], 1))
         here = f"{len(starts)} episodes of {len(number)} frames"
         if not whole or not np.array_equal(self.columns["frame_index"], within):
@@ -265,8 +241,10 @@ class _Dataset:
         counts = self.info.get("total_episodes", len(starts)), self.info.get("total_frames", len(number))
         note = f"{quote(counts[0])} episodes of {quote(counts[1])} frames, and here are {here}: a part?"
         self.faults.add(self.root / INFO, "another_total", note, counts != (len(starts), len(number)))
-        ends = np.stack([starts, starts + lengths], 1).tolist()
-        scrambled = sum([*e.ends] not in ([None, None], end) for e, end in zip(self.entries, ends, strict=True))
+        scrambled = 0
+        for row, start, length in zip(self.entries, starts.tolist(), lengths.tolist(), strict=True):
+            ends = row.get("dataset_from_index"), row.get("dataset_to_index")
+            scrambled += ends not in ((None, None), (start, start + length))
         note = "dataset_from_index and _to_index of an early converter: convert it again by a newer LeRobot to train"
         self.faults.add(self.root / "meta/episodes", "scrambled_index", note, scrambled)
 
@@ -297,13 +275,13 @@ class _Dataset:
         """Find each row's picture of a camera."""
         if self.features[key]["dtype"] == "video":
             self._check_videos(key, size)
-            shown = [entry.videos[key] for entry in self.entries for _ in range(entry.length)]
+            shown = [part for row in self.entries for part in [self._shown(row, key)] * row["length"]]
             times_s = np.array([first_s for _, first_s, _ in shown]) + self.columns["timestamp"]
             return _Camera(key, size, [path for path, *_ in shown], times_s.tolist())
         from datasets import Dataset, Features, Image
         from lerobot.utils.utils import SuppressProgressBars
 
-        paths = [entry.data for entry in self.entries for _ in range(entry.length)]
+        paths = [path for row in self.entries for path in [self._file(row)] * row["length"]]
         with SuppressProgressBars():
             kept = Features({key: Image(decode=False)})
             rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=kept)
@@ -314,25 +292,27 @@ class _Dataset:
 
         The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
         """
-        shown = [(*entry.videos[key], entry) for entry in self.entries]
+        shown = [(*self._shown(row, key), row) for row in self.entries]
         for file in dict.fromkeys(path for path, *_ in shown):
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
                 untrusted.check_video(file, size)
-        wrong = {e.number for _, first_s, last_s, e in shown if abs((last_s - first_s) * self.fps - e.length) >= 1}
+        other = [row for _, begin, end, row in shown if abs((end - begin) * self.fps - row["length"]) >= 1]
+        wrong = {row["episode_index"] for row in other}
         for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
-                wrong.add(after[3].number)
+                wrong.add(after[3]["episode_index"])
         if wrong:
             found = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
             remedy = "merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again"
             raise EpisodeError(f"{self.root}: meta/episodes does not fit the videos", found=found, remedy=remedy)
 
-    def episode(self, entry: _Entry, chunk: int) -> Episode:
+    def episode(self, entry: Mapping[str, Any], chunk: int) -> Episode:
         """Make samples of an episode's frames; none, and a fault, if a number is missing."""
-        rows = np.flatnonzero(self.columns["episode_index"] == entry.number)
+        number = entry["episode_index"]
+        rows = np.flatnonzero(self.columns["episode_index"] == number)
         columns = {key: values[rows] for key, values in self.columns.items()}
-        n, name = len(rows), f"episode_{entry.number:06d}"
+        n, name = len(rows), f"episode_{number:06d}"
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = columns[ACTION][np.minimum(index, n - 1)], index >= n
         taken_over = columns.get(INTERVENTION, np.zeros(n)).astype(bool)
@@ -340,64 +320,41 @@ class _Dataset:
         finite = np.isfinite(columns[ACTION]).all() and np.isfinite(columns[STATE]).all()
         self.faults.add(self.root / name, "not_finite", "a number of its states or actions is missing", not finite)
         camera = next(iter(self.cameras.values()))
-        samples = tuple(
-            LerobotSample(
-                episode=name,
-                frame_path=camera.paths[row],
-                time_s=float(times_s[k]),
-                state=columns[STATE][k].copy(),
-                chunk=chunks[k].copy(),
-                is_pad=pads[k].copy(),
-                cameras=self.cameras,
-                row=row,
-                driver=HUMAN if taken_over[k] else self.drivers[entry.number],
-                car=self.car,
-            )
-            for k, row in enumerate(rows.tolist())
-            if finite and row not in self.unusable
-        )
-        files = [entry.videos[key][0] for key in self.keys.values() if key in entry.videos]
-        return Episode(
-            id=name,
-            path=self.root,
-            label=entry.task,
-            duration_s=float(times_s[-1]),
-            frames=n,
-            controls=n,
-            samples=samples,
-            files=(self.root / INFO, entry.data, *files),
-            corrects=bool(taken_over.any()),
-        )
+        samples = list[Sample]()
+        for k, row in enumerate(rows.tolist()):
+            if finite and row not in self.unusable:
+                driver = HUMAN if taken_over[k] else self.drivers[number]
+                numbers = columns[STATE][k], chunks[k], pads[k]
+                shown = name, camera.paths[row], float(times_s[k])
+                samples.append(LerobotSample(*shown, *numbers, row, driver, self.car, cameras=self.cameras))
+        videos = [self._file(entry, key) for key in self.keys.values() if self.features[key]["dtype"] == "video"]
+        files, label = (self.root / INFO, self._file(entry), *videos), str((entry.get("tasks") or [""])[0])
+        corrects = bool(taken_over.any())
+        return Episode(name, self.root, label, float(times_s[-1]), n, n, tuple(samples), files, corrects=corrects)
 
 
 def _read_export(root: Path, episodes: int, marked: bool, faults: Faults) -> tuple[list[str], Car]:
-    """Return who drove in each episode where nobody intervened, and whose car; a fault if REPORT is of other episodes.
-
-    marked: whether the dataset marks interventions.
-    """
+    """Return who drove in each episode where nobody intervened, as a dataset may have `marked`, and whose car."""
     drivers, car = [POLICY if marked else HUMAN] * episodes, this_car()
-    if not (root / REPORT).is_file():
-        return drivers, car
-    try:
-        report = untrusted.read_json(root / REPORT, INFO_BYTES)
-        car = Car.of(report[CAR], "the exported car")  # right also if somebody has removed episodes since
-        said = report[DRIVEN_BY]
-        if len(said) != episodes or not set(said) <= {POLICY, HUMAN}:
-            raise ValueError(f"it is of {len(said)} episodes, here are {episodes}, or has unknown words")
-    except (OSError, ValueError, TypeError, KeyError, CarError) as e:
-        faults.add(root / REPORT, "another_export", f"not used: {quote(str(e))}")
-        return drivers, car
-    return said, car
+    if (root / REPORT).is_file():
+        try:
+            report = untrusted.read_json(root / REPORT, INFO_BYTES)
+            car = Car.of(report[CAR], "the exported car")  # right also if somebody has removed episodes since
+            said = report[DRIVEN_BY]
+            if len(said) != episodes or not set(said) <= {POLICY, HUMAN}:
+                raise ValueError(f"it is of {len(said)} episodes, here are {episodes}, or has unknown words")
+            drivers = said
+        except (OSError, ValueError, TypeError, KeyError, CarError) as e:
+            faults.add(root / REPORT, "another_export", f"not used: {quote(str(e))}")
+    return drivers, car
 
 
 def _read_info(root: Path) -> dict[str, Any]:
     """Read meta/info.json. Raises EpisodeError."""
     path = root / INFO
     refuse_pointer(path, EpisodeError)
-    try:
+    with _as_episode_error(f"{path}: not readable as JSON"):
         info = untrusted.read_json(path, INFO_BYTES)
-    except (OSError, ValueError) as e:
-        raise _broken(f"{path}: not readable as JSON ({quote(str(e))})") from None
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "without a version"
     if not version.startswith(("v2", "v3")):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
@@ -423,7 +380,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, str]]:
     """Find the names and columns of states and actions, and the cameras: by name the key."""
     features = info["features"]
-    keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
+    keys = recorded.camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
         raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
@@ -443,9 +400,9 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
         if len(row.get("shape") or ()) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
-    actions, action_order = name_numbers(root, features, ACTION, source.action_names)
+    actions, action_order = recorded.name_numbers(root, features, ACTION, source.action_names)
     has_state, given = STATE in features, source.action_names
-    states, state_order = name_states(root, features, given) if has_state else (actions, action_order)
+    states, state_order = recorded.name_states(root, features, given) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)
     return layout, {name: keys[name] for name in names}
 
@@ -487,11 +444,10 @@ def _numbers(column: Any) -> np.ndarray:
     """A table's column as (rows, numbers). Raises ValueError for rows of different lengths, and missing ones."""
     from pyarrow import compute, types
 
-    if types.is_nested(column.type):
-        if len(compute.unique(compute.list_value_length(column))) > 1 or column.null_count:
-            raise ValueError("rows of different lengths")
-        return compute.list_flatten(column).to_numpy().reshape(len(column), -1)
-    return column.to_numpy().reshape(len(column), -1)
+    nested = types.is_nested(column.type)
+    if nested and (len(compute.unique(compute.list_value_length(column))) > 1 or column.null_count):
+        raise ValueError("rows of different lengths")
+    return (compute.list_flatten(column) if nested else column).to_numpy().reshape(len(column), -1)
 
 
 @contextmanager

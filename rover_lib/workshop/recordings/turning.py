@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -115,42 +115,36 @@ def measure_turning(episode: Episode) -> Turning:
     """Measure one drive of one camera."""
     samples = episode.samples
     steering = np.array([s.chunk[0, 0] for s in samples], float)
-    spread = float(steering.std()) if len(steering) else 0.0
-    nothing = Turning(episode.id, None, 0.0, spread)
-    if spread < LEAST_SPREAD / 2:
-        return nothing  # and no picture has to be read
+    best = Turning(episode.id, None, 0.0, float(steering.std()))
+    if best.spread < LEAST_SPREAD / 2:
+        return best  # and no picture has to be read
     try:
         times_s, shifts = _shifts(samples)
     except EpisodeError:
-        return nothing
-    if len(shifts) < LEAST_PAIRS:
-        return nothing
+        return best
     every_s = np.array([s.time_s for s in samples])
-    best = nothing
-    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7):
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(shifts) >= LEAST_PAIRS else ():
         steered = np.interp(times_s - delay_s, every_s, steering)
         found = _correlation(_smooth(steered), _smooth(shifts))
         if found and found[1] > best.sure:
-            best = Turning(episode.id, found[0], found[1], spread)
+            best = replace(best, correlation=found[0], sure=found[1])
     return best
 
 
 def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
     """Return when two pictures were compared, in seconds, and how fast the background moved right, in pixels/s."""
-    chosen = list(samples[::STEP])
     times_s, shifts = [], []
     before = None
-    for first, second in pairwise(chosen):
+    for first, second in pairwise(samples[::STEP]):
         if second.row - first.row != STEP:
             before = None
             continue
         before = _grey(first) if before is None else before
         after = _grey(second)
-        shift = _shift(before, after)
-        before = after
-        if shift is not None:
+        if (shift := _shift(before, after)) is not None:
             times_s.append((first.time_s + second.time_s) / 2)
             shifts.append(shift / (second.time_s - first.time_s))
+        before = after
     return np.array(times_s), np.array(shifts)
 
 

@@ -11,8 +11,7 @@ import torch
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
-from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
-from rover_lib.workshop.checkpoint.contents import check_limits
+from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, check_limits, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset

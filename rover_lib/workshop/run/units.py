@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
+from rover_lib.onboard.car.pwm import Channel
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation, planned_error
-from rover_lib.workshop.recordings.controls import OLD, Formula
+from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
@@ -43,7 +44,7 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
     return best
 
 
-def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Formula]) -> Checkpoint:
+def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Channel]) -> Checkpoint:
     """Return the policy with today's actions outside, and those of the formulas inside."""
     # What a file says is gain * action + offset.
     channels = [car.pwm.channel(name) for name in ACTION_NAMES]

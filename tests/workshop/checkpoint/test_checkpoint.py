@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pickle
+import resource
 import shutil
 import zipfile
 from dataclasses import replace
@@ -16,17 +17,19 @@ from policies import TINY, check_is, lerobot_policy, memory_samples, saved_norma
 from recorded import edit_json as edit
 from safetensors.torch import load_file, save_file
 
-from rover_lib.onboard.errors import CheckpointError
-from rover_lib.workshop.act import ACT, example_inputs, inputs_of
-from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.checkpoint.files import write_lerobot
-from rover_lib.workshop.checkpoint.lerobot import lerobot_folder
+from rover_lib.onboard.errors import CheckpointError, RoverError
+from rover_lib.workshop.act import ACT, Affine, example_inputs, inputs_of, predictions
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint, write_both
+from rover_lib.workshop.checkpoint.files import save_torch
+from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, write_lerobot
 from rover_lib.workshop.judge.compare import LerobotEager
+from rover_lib.workshop.recordings.samples import Layout
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 RENAMES = {"registry_name": "rename_observations_processor", "config": {"rename_map": {"a": "b"}}}
 STATE = "observation.state"
 INNER, OUTER, STATS = "policy_preprocessor.json", "policy_postprocessor.json", "stats.safetensors"
+CONFIG = "config.json"
 
 
 def write(content, path):
@@ -182,26 +185,6 @@ def in_step(change):
     return lambda content: change(content["steps"][0])
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda c: c.pop("type"), 'write "type": "act" into it'),
-        (lambda c: c.update(feedforward_activation="glu"), "'glu'"),
-        (lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
-        (lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
-        (lambda c: c.update(input_features={}), "features"),
-        (lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
-        (lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
-        (lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, -72, 128]), "features"),
-        (lambda c: c.update(chunk_size=16, n_action_steps=16), "config and weights do not agree"),
-        (lambda c: c["output_features"]["action"].update(type="STATE"), "features"),
-    ],
-)
-def test_refuses_other_lerobot_policies(copied, change, says):
-    edit(copied / "config.json", change)
-    assert says in refused(copied)
-
-
 def test_refuses_damaged_and_divided_folders(copied):
     weights = copied / "model.safetensors"
     for data in (b"short", (2**40).to_bytes(8, "little"), (2).to_bytes(8, "little") + b"{}"):
@@ -219,6 +202,17 @@ def test_refuses_damaged_and_divided_folders(copied):
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [
+        (CONFIG, lambda c: c.pop("type"), 'write "type": "act" into it'),
+        (CONFIG, lambda c: c.update(feedforward_activation="glu"), "'glu'"),
+        (CONFIG, lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
+        (CONFIG, lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
+        (CONFIG, lambda c: c.update(input_features={}), "features"),
+        (CONFIG, lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
+        (CONFIG, lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
+        (CONFIG, lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, -72, 128]), "features"),
+        (CONFIG, lambda c: c.update(chunk_size=16, n_action_steps=16), "config and weights do not agree"),
+        (CONFIG, lambda c: c["output_features"]["action"].update(type="STATE"), "features"),
+        # what would leave a feature raw
         (INNER, in_step(lambda s: s["config"]["norm_map"].pop("STATE")), "would not be normalised"),
         (INNER, in_step(lambda s: s["config"]["features"].pop(STATE)), "would not be normalised"),
         (INNER, in_step(lambda s: s["config"]["features"][STATE].update(type="ACTION")), "would not be normalised"),
@@ -231,7 +225,7 @@ def test_refuses_damaged_and_divided_folders(copied):
         (OUTER, lambda c: c["steps"].append(c["steps"][0]), "normalises 2 times"),
     ],
 )
-def test_a_feature_that_would_be_left_raw_is_refused(copied, file, change, says):
+def test_refuses_other_lerobot_policies(copied, file, change, says):
     edit(copied / file, change)
     assert says in refused(copied)
 
@@ -343,3 +337,78 @@ def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
     check_is(checkpoint, policy, inner, outer)
     assert checkpoint.report["normalisation"]["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"
     assert checkpoint.report["normalisation"]["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"
+
+
+SETTINGS = {"learning_rate": 1e-4, "batch_size": 4, "data_dir": "in", "output_dir": "out", "device": "cpu", "seed": 0}
+ORIGIN = {"teacher_sha256": "ab" * 32, "steps": 3}
+
+
+@pytest.fixture(scope="module")
+def weights():
+    policy = lerobot_policy(**TINY, use_vae=False)
+    return {k.removeprefix("model."): v for k, v in policy.state_dict().items()}
+
+
+@pytest.fixture(scope="module")
+def config(tiny):
+    return replace(tiny.config, vae_layers=0)
+
+
+def test_what_we_write_is_read_back(config, weights, tmp_path):
+    """In both formats where the trainer's can hold it: the same weights have one hash."""
+    hashes = write_both(tmp_path, config, weights, 0.25, ORIGIN, **SETTINGS)
+    assert hashes == write_both(tmp_path / "again", config, weights, 0.25, ORIGIN, **SETTINGS)
+    read = load_checkpoint(tmp_path / "best_model.pth")
+    assert read.config == config and read.report["best_val_loss"] == 0.25
+    assert read.report["trainer_config"]["origin"] == ORIGIN
+    assert all(torch.equal(read.weights[name], weight) for name, weight in weights.items())
+    for other in ({"rate_hz": 15.0}, {"action_unnorm": Affine((0.4, 0.02), (0.1, 0.05))}):
+        written = write_both(tmp_path / "other", replace(config, **other), weights, 0.25, ORIGIN, **SETTINGS)
+        assert written.keys() == {"model.safetensors"}
+
+
+@pytest.mark.parametrize(
+    "norms",
+    [{}, {"state_norm": Affine((2.0, 9.0), (-0.1, 0.4)), "action_unnorm": Affine((0.4, 0.02), (0.1, 0.05))}],
+    ids=["raw actions", "normalised"],
+)
+def test_lerobots_folder(config, weights, tmp_path, norms):
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    config = replace(config, **norms)
+    write_lerobot(tmp_path / "pretrained_model", config, weights, ORIGIN)
+    read = load_checkpoint(tmp_path / "pretrained_model")
+    (sample,) = memory_samples(1)
+    expected = predictions(ACT(config, weights), [inputs_of(sample, config)])[0]
+    ours = predictions(ACT(read.config, read.weights), [inputs_of(sample, config)])[0]
+    assert (ours - expected).abs().max() < 1e-5
+    policy = ACTPolicy.from_pretrained(tmp_path / "pretrained_model")
+    check_is(read, policy, *make_pre_post_processors(policy.config, str(tmp_path / "pretrained_model")))
+
+
+def test_a_full_disk_is_one_sentence(config, weights, tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        with pytest.raises(RoverError, match="disk full"):
+            save_torch(tmp_path / "policy", weights)
+        with pytest.raises(RoverError, match="disk full"):
+            write_lerobot(tmp_path / "folder", config, weights, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):
+    """Driven at 30 steps a second, a student of 15 would drive twice as fast; the trainer's file cannot hold a rate."""
+    slow = replace(config, rate_hz=15.0)
+    write_lerobot(tmp_path, slow, weights, ORIGIN)
+    read = load_checkpoint(tmp_path)
+    assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
+    assert read.recorded_as(Layout(("cam_front",), rate_hz=15.0)) is read
+    with pytest.raises(CheckpointError, match="15 steps"):
+        read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
+    assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
+    (tmp_path / "origin.json").write_text('{"rate_hz": NaN}')
+    with pytest.raises(CheckpointError, match="rate_hz must be a number from 5 to 120, found nan"):
+        load_checkpoint(tmp_path)
