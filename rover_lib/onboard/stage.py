@@ -89,11 +89,11 @@ def open_plain(path: Path | str, refusal: RoverError | OSError) -> BufferedReade
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.
     """
-    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
         raise refusal
-    return file
+    return os.fdopen(file, "rb")
 
 
 def read_plain(path: Path | str, most_bytes: int = FILE_BYTES) -> bytes:

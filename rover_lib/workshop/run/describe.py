@@ -10,7 +10,7 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.cli import describe_artifact
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import check_kind, kinds_of
+from rover_lib.onboard.kinds import check_kind, kinds_of, read_head
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -41,13 +41,15 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
     if kind == "stage":
         return {"report": _report(path)}
-    if kind == "tub":
-        check_kind(path, "recordings")  # says what to do with it
+    if kind == "tub" or not path.exists():
+        check_kind(path, "recordings")  # says what to do
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         recordings = load_recordings(source, progress=progress)
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
+    if read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
+        raise RoverError(f"{path}: no file that this project reads or writes", remedy="docs/data.md names them")
     from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 
     checkpoint = load_checkpoint(path, said=source.facts)

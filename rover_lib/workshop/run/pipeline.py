@@ -84,13 +84,11 @@ def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
-    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all. Raises ArtifactError.
+    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all.
 
     Mixed is among them only if it leaves a block in float.
     """
     schemes = {"dynamic": replace(static, mode="dynamic"), "static": static, "mixed": mixed}
-    if unknown := [mode for mode in modes or () if mode not in schemes]:
-        raise ArtifactError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
     if not mixed.float_blocks:
         del schemes["mixed"]  # it is static
     return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
