@@ -25,6 +25,7 @@ def _delays(least: int) -> Rule:
 
 
 BLOCKS = _list_of('names, as in ["backbone.stem"], or None', lambda v: isinstance(v, str), 0)
+OBSERVED = _list_of("histogram, minmax or both, and frames", lambda v: v in OBSERVERS)
 RULES = {
     **dict.fromkeys(("run_dir", "checkpoint", "episodes", "rovers"), Rule(_is_path, "a path")),
     **dict.fromkeys(("action_names", "camera", "facts"), of_type(str)),
@@ -32,7 +33,7 @@ RULES = {
     **dict.fromkeys(("seed", "worlds", "pushes"), whole(0, MOST)),
     "threads": whole(0, 256),
     "smooth": number(0, 1),
-    "observers": _list_of(f"any of {', '.join(OBSERVERS)}", lambda v: v in OBSERVERS),
+    "observers": OBSERVED._replace(holds=lambda v: OBSERVED.holds(v) and any(name != "frames" for name in v)),
     "modes": _list_of(f"any of {', '.join(MODES)}", lambda v: v in MODES, 0),
     "float_blocks": BLOCKS._replace(holds=lambda v: v is None or BLOCKS.holds(v)),
     "latencies_ms": _delays(1),
