@@ -133,5 +133,5 @@ def familiarity(found: Mapping[str, Any] | None, samples: Sequence[Any]) -> Figu
     ax.set(xlabel="held-out drives", ylabel="largest score, of the threshold", xticks=[])
     pictures = {(sample.episode, sample.row): sample for sample in samples}
     for ax, least in zip(fields, found["least"], strict=True):
-        style.show_picture(ax, pictures[least["episode"], least["row"]], f"{least['strange']:.2f} of it")
+        style.show_picture(ax, pictures[least["episode"], least["row"]], f"{least['strange']:.2f} of the threshold")
     return fig
