@@ -75,7 +75,7 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     import yaml
 
     from rover_lib.workshop.run import run_folder
-    from rover_lib.workshop.run.run import execute, find_notebook
+    from rover_lib.workshop.run.run import execute
     from rover_lib.workshop.run.run import run as run_notebooks
 
     name, runs_dir = options.pop("name"), options.pop("runs_dir")
@@ -86,7 +86,7 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
         raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
     if only and not (checkpoint or episodes):
         folder = run_folder(runs_dir, name, RoverError)
-        return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
+        return click.echo(f"executed: {execute(only, folder, **given)}")
     if only or not (checkpoint and episodes):
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
     given = {"worlds": 0} | given

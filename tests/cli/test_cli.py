@@ -31,7 +31,7 @@ def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatc
     monkeypatch.setattr("rover_lib.workshop.run.run.execute", lambda *args, **given: asked.append((args, given)))
     result = rover("run", "--only", "03", "--name", "try1", "--runs-dir", tmp_path, "-p", "modes", "[static]")
     assert result.exit_code == 0, result.output
-    assert asked == [(("03_quantize", tmp_path / "try1"), {"modes": ["static"]})]
+    assert asked == [(("03", tmp_path / "try1"), {"modes": ["static"]})]
 
 
 def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch):

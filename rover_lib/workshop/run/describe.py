@@ -1,6 +1,5 @@
 """Describe a file or a folder of this project, or the runs in it, for `rover inspect`."""
 
-import json
 import shlex
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,6 @@ from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.recordings.turning import measure_sides
 
 FIRST = "make demo, or rover run, makes the first"
-BULK = 200  # characters; of a longer value in a report only the number of its items is shown
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -40,7 +38,8 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "flight log":
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
     if kind == "stage":
-        return {"report": _report(path)}
+        content = read_stage(path, None)
+        return {"report": {**content, "metrics": sorted(content["metrics"]), "inputs": len(content["inputs"])}}
     if kind == "tub" or not path.exists():
         check_kind(path, "recordings")  # says what to do
     # Here, as a dataset's tables are read within less memory than torch takes, which LeRobot imports.
@@ -62,18 +61,6 @@ def _run(folder: Path) -> dict[str, Any]:
     artifacts = {p.name: f"{p.stat().st_size / 1e6:.1f} MB" for p in files}
     stages = sorted(p.stem for p in folder.glob("*.json") if p.name != "run.json")
     return {"verdict": verdict_of(folder), "stages": stages, "artifacts": artifacts}
-
-
-def _report(path: Path) -> dict[str, Any]:
-    content = read_stage(path, None)
-    metrics = {key: _counted(value) for key, value in content["metrics"].items()}
-    return {"stage": content["stage"], "env": content["env"], "params": content["params"], "metrics": metrics}
-
-
-def _counted(value: Any) -> Any:
-    if isinstance(value, (dict, list)) and len(json.dumps(value)) > BULK:
-        return f"{len(value)} values, see the file"
-    return value
 
 
 def runs(folder: Path | str) -> list[dict[str, str]]:

@@ -15,16 +15,13 @@ def _is_path(value: Any) -> bool:
     return isinstance(value, str | Path) and str(value).strip() != ""
 
 
-def _list_of(words: str, holds: Callable[[Any], bool], least: int = 1) -> Rule:
-    """The rule of a list of at least so many values, each of which holds."""
-    return Rule(lambda v: isinstance(v, list | tuple) and len(v) >= least and all(map(holds, v)), f"a list of {words}")
+def _list_of(words: str, holds: Callable[[Any], bool]) -> Rule:
+    """The rule of a list of values each of which holds."""
+    return Rule(lambda v: isinstance(v, list | tuple) and all(map(holds, v)), f"a list of {words}")
 
 
-def _delays(least: int) -> Rule:
-    return _list_of("milliseconds, as in [0, 150]", lambda v: is_number(v, 0, MOST), least)
-
-
-BLOCKS = _list_of('names, as in ["backbone.stem"], or None', lambda v: isinstance(v, str), 0)
+BLOCKS = _list_of('names, as in ["backbone.stem"], or None', lambda v: isinstance(v, str))
+DELAYS = _list_of("milliseconds, as in [0, 150]", lambda v: is_number(v, 0, MOST))
 OBSERVED = _list_of("histogram, minmax or both, and frames", lambda v: v in OBSERVERS)
 RULES = {
     **dict.fromkeys(("run_dir", "checkpoint", "episodes", "rovers"), Rule(_is_path, "a path")),
@@ -34,10 +31,9 @@ RULES = {
     "threads": whole(0, 256),
     "smooth": number(0, 1),
     "observers": OBSERVED._replace(holds=lambda v: OBSERVED.holds(v) and any(name != "frames" for name in v)),
-    "modes": _list_of(f"any of {', '.join(MODES)}", lambda v: v in MODES, 0),
+    "modes": _list_of(f"any of {', '.join(MODES)}", lambda v: v in MODES),
     "float_blocks": BLOCKS._replace(holds=lambda v: v is None or BLOCKS.holds(v)),
-    "latencies_ms": _delays(1),
-    "pushed_latencies_ms": _delays(0),
+    **dict.fromkeys(("latencies_ms", "pushed_latencies_ms"), DELAYS),
     "students": _list_of("paths", _is_path),
 }
 

@@ -134,24 +134,20 @@ def files_of_a_run(folder: Path) -> list[Path]:
     return [path for path in own if path.exists()]
 
 
-def find_notebook(asked: str) -> str:
-    """The name of the notebook that begins like `asked`, such as 04. Raises RoverError."""
-    found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
-    if len(found) != 1:
-        raise RoverError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
-    return found[0]
-
-
 def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises RoverError for an unknown parameter, or with the cell and its error; an earlier executed one then stays.
+    name: it, or its beginning, such as 04. Raises RoverError for an unknown notebook or parameter, or with the cell and
+    its error; an earlier executed one then stays.
     """
-    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{name}.ipynb"
+    found = [each for each in NAMES + AFTERWARDS if each.startswith(name.removesuffix(".ipynb"))]
+    if len(found) != 1:
+        raise RoverError(f"no notebook {name}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
+    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{found[0]}.ipynb"
     if not folder.is_dir():
         raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
     _refuse_senseless([source], overrides)
-    if name == NAMES[0] and (folder / "load.json").is_file():  # again what the run was made of, unless said otherwise
+    if found == [NAMES[0]] and (folder / "load.json").is_file():  # what the run was made of, unless said otherwise
         overrides = read_stage(folder / "load.json", "load")["params"] | overrides
     _execute(source, folder, overrides, False)
     return folder / source.name
