@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rover_lib.onboard.car.host import usable_cores
 from rover_lib.onboard.checked import Rule, broken_rule, is_number, number, of_type, whole
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.workshop.int8.scheme import MODES, OBSERVERS
@@ -28,7 +29,7 @@ RULES = {
     **dict.fromkeys(("action_names", "camera", "facts"), of_type(str)),
     **dict.fromkeys(("samples", "choosing_frames", "held_out_frames", "iterations"), whole(1, MOST)),
     **dict.fromkeys(("seed", "worlds", "pushes"), whole(0, MOST)),
-    "threads": whole(0, 256),
+    "threads": whole(0, usable_cores()),
     "smooth": number(0, 1),
     "observers": OBSERVED._replace(holds=lambda v: OBSERVED.holds(v) and any(name != "frames" for name in v)),
     "modes": _list_of(f"any of {', '.join(MODES)}", lambda v: v in MODES),
