@@ -34,7 +34,6 @@ from rover_lib.workshop.judge.compare import gate
 from rover_lib.workshop.judge.pairs import sign_test
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
 
@@ -190,7 +189,7 @@ class _Lab:
             how: dict[str, Any] = {"runs_dir": runs_dir, "recipe": recipe, "progress": self.progress}
             finetune(self.run_dir / CHECKPOINT, episodes, _name(arm, number), machine=Machine.of("cpu"), **how)
         learned = load(target.parent / CHECKPOINT, self.run_dir / EPISODES, self.progress)
-        make_artifact(learned, target, pipeline.Recipe.of(params()), progress=self.progress)
+        make_artifact(learned, target, params(), progress=self.progress)
 
     def _drive(self, artifact: Path, number: int) -> list[dict[str, Any]]:
         """Record a round's missing drives with a human beside the track, and return the rows of all."""

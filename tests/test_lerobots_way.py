@@ -12,7 +12,7 @@ from recorded import record_drives
 
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
-from rover_lib.workshop.run.pipeline import Recipe, make_artifact
+from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
 
 TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_model=64", "--policy.n_heads=4",
@@ -35,7 +35,8 @@ def test_from_recordings_to_an_artifact(tmp_path, monkeypatch):
     words = json.loads(rover("inspect", tmp_path / "train", "--json").output)["checkpoint"]
     assert words["format"] == "lerobot" and words["normalisation"]["action"].startswith("output * (")
     artifact = tmp_path / "policy_static.pt"
-    make_artifact(load(tmp_path / "train/checkpoints/last", dataset), artifact, Recipe.of(params(), samples=6))
+    few = params() | {"calibration": {"samples": 6, "seed": 0}}
+    make_artifact(load(tmp_path / "train/checkpoints/last", dataset), artifact, few)
     manifest = load_policy(artifact).manifest
     assert (manifest["mode"], manifest["rate_hz"], manifest["chunk"]) == ("static", 30, 32)
     assert manifest["cameras"] == [{"name": "cam_front", "height": 36, "width": 64}]

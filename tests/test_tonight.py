@@ -90,9 +90,9 @@ class Evening:
         self.patch.chdir(self.machines[machine])
         words = shlex.split(line, comments=True)
         if words[0] == "scp":
-            source, target = Path(words[-2].partition(":")[2]), Path(words[-1])
+            source = Path(words[-2].partition(":")[2])
             copy = shutil.copytree if "-r" in words else shutil.copy
-            copy(self.machines["P"] / str(source).lstrip("/"), target)
+            copy(self.machines["P"] / str(source).lstrip("/"), Path(words[-1], source.name))
         elif words[0] == "ansible-playbook":
             given = dict(word.split("=") for word in words if "=" in word)
             self.deployed = given.get("rover_artifact", self.deployed)
@@ -151,6 +151,6 @@ def test_the_page_leads_to_a_first_drive(demo_run, tmp_path, monkeypatch):
         with CameraFeed(evening.camera, *pictures(PLAIN, (180, 320))):
             for machine, line in lines():
                 evening.type(machine, line)
-    assert evening.typed == ["calibrate", "doctor", "record", "train", "run", "log"]
+    assert evening.typed == ["calibrate", "doctor", "doctor", "record", "train", "run", "log"]
     measured = read_car(evening.installed)
     assert measured.name == "mycar" and measured.numbers == pytest.approx(CRAWLER.numbers, abs=30)

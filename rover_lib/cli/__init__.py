@@ -8,6 +8,7 @@ from importlib.metadata import entry_points
 from typing import Any, cast
 
 import click
+from click.core import ParameterSource
 
 from rover_lib.cli import prepare
 from rover_lib.onboard import cli as onboard
@@ -22,8 +23,10 @@ from rover_lib.onboard.kinds import Number
 @click.option("--seed", type=FROM_0, default=10_000, show_default=True, help="With --world: seed of the first world.")
 @click.pass_context
 def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **options: Any) -> None:
-    if latency_ms and not in_world:
-        raise click.UsageError("--latency-ms belongs to --world")
+    for name in ("camera", "port", "dry_run") if in_world else ("latency_ms", "seed"):
+        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            owner = "a car, not --world" if in_world else "--world"
+            raise click.UsageError(f"--{name.replace('_', '-')} belongs to {owner}")
     car = None
     if in_world:
         (simulated,) = entry_points(group="rover.cars", name="world")

@@ -57,7 +57,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")
-@click.option("--worlds", type=FROM_0, default=0, show_default=True, help="Balloon worlds to drive in.")
+@click.option("--worlds", type=FROM_0, help="Balloon worlds to drive in [default: 0].")
 @click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].")
 @click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
 @click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
@@ -68,27 +68,29 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     Executes five notebooks in the run's folder. Ends with a verdict, also in run.json: which artifact to deploy,
     what failed, and what to do about it.
 
-    -p turns any of the notebooks' parameters; a value is YAML: 0.5, minmax, [static, mixed].
+    -p turns any of the notebooks' parameters; a value is YAML: 0.5, [minmax], [static, mixed].
 
     --only 03 --name try1: execute one notebook on that run again, whose results are replaced; `rover report` judges it.
     """
     import yaml
 
     from rover_lib.workshop.run import run_folder
-    from rover_lib.workshop.run.run import execute, find_notebook
+    from rover_lib.workshop.run.run import execute
     from rover_lib.workshop.run.run import run as run_notebooks
 
+    name, runs_dir = options.pop("name"), options.pop("runs_dir")
+    given = {key: value for key, value in options.items() if value not in (None, "")}
     try:
-        given = {key: yaml.safe_load(value) for key, value in turned}
+        given |= {key: yaml.safe_load(value) for key, value in turned}
     except yaml.YAMLError as error:
         raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
     if only and not (checkpoint or episodes):
-        folder = run_folder(options["runs_dir"], options["name"], RoverError)
-        return click.echo(f"executed: {execute(find_notebook(only), folder, **given)}")
+        folder = run_folder(runs_dir, name, RoverError)
+        return click.echo(f"executed: {execute(only, folder, **given)}")
     if only or not (checkpoint and episodes):
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
-    given = {k: v for k, v in options.items() if v is not None} | given
-    _judge(run_notebooks(checkpoint, episodes, progress=terminal_bar(), **given))
+    given = {"worlds": 0} | given
+    _judge(run_notebooks(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **given))
 
 
 @click.command(short_help="Judge an existing run again.")

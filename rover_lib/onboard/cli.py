@@ -206,6 +206,8 @@ def record_human(ctx: click.Context, out_dir: Path, hz: float, finish: bool, **o
     from rover_lib.onboard.recording.recorder import record_episodes
 
     if finish:
+        if not out_dir.is_dir():
+            raise RoverError(f"{out_dir}: no such folder", remedy="name the one that was recorded to")
         failed = False
         for part in (parts := find_killed(out_dir)):
             try:
@@ -255,8 +257,8 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: An
 @PORT
 @click.option("--output", type=FILE, help="The file [default: where the other commands look for car.yml].")
 @click.option("--name", default="my car", show_default=True, help="What to call the car.")
-@click.option("--field-of-view-deg", type=float, help="The camera's, horizontally [default: the balloon world's].")
-@click.option("--wheelbase-m", type=float, help="Distance between the axles [default: the balloon world's].")
+@click.option("--field-of-view-deg", type=Number(20, 160), help="The camera's, across [default: the balloon world's].")
+@click.option("--wheelbase-m", type=Number(0.03, 3), help="Between the axles [default: the balloon world's].")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def calibrate(port: str, output: Path | None, field_of_view_deg: float | None, force: bool, **more: Any) -> None:
     """Guide a human through steering and throttle, measure the pulses, and write them as car.yml.
@@ -311,7 +313,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.option("--warmup", type=FROM_0, default=10, show_default=True)
 @click.option("--iterations", type=FROM_1, default=100, show_default=True)
 @click.option("--threads", type=click.IntRange(0, MOST_THREADS), default=0, show_default=True, help="0: all cores.")
-@click.option("--output", type=Output("stage"), help="Write the benchmark to this JSON file, for notebook 05.")
+@click.option("--output", type=Output("benchmark"), help="Write the benchmark to this JSON file, for notebook 05.")
 @AS_JSON
 def benchmark(artifacts: tuple[Path, ...], threads: int, output: Path | None, as_json: bool, **options: Any) -> None:
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""

@@ -29,6 +29,7 @@ CALLED = {
     "run": "a run's folder",
     "flight log": "a flight log",
     "stage": "the report of a run's stage",
+    "benchmark": "a benchmark",
 }
 WANTED = {  # what a command takes: the kinds, and how to get one
     "artifact": (("artifact",), "rover run CHECKPOINT EPISODES makes policy_<mode>.pt"),
@@ -55,9 +56,11 @@ def kinds_of(path: Path | str) -> tuple[str, ...]:
 
 
 def check_kind(path: Path | str, wanted: str) -> None:
-    """Raise RoverError for a path of a known kind that is not the wanted one. wanted: a key of WANTED."""
+    """Raise RoverError for no path, and for one of a known kind that is not the wanted one, a key of WANTED."""
     found = kinds_of(path)
     takes, remedy = WANTED[wanted]
+    if not Path(path).exists():
+        raise RoverError(f"{path}: not found", remedy=remedy)
     if not found or set(found) & set(takes):
         return
     if found[0] == "tub":
@@ -81,8 +84,8 @@ def check_output(path: Path, kind: str | None, *, appended: bool = False) -> Non
     """Raise RoverError for a file that a command must not write, see `Output`."""
     if path.is_dir():
         raise RoverError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
-    if found := set(kinds_of(path)) - {kind}:
-        raise RoverError(f"{path}: this is {CALLED[found.pop()]}, and would be lost", remedy="give another name")
+    if (found := kinds_of(path)) and kind not in found:
+        raise RoverError(f"{path}: this is {CALLED[found[0]]}, and would be lost", remedy="give another name")
     folder = next(p for p in path.absolute().parents if p.exists())
     if not (path.exists() and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise RoverError(f"{folder}: cannot be written to", remedy="name a file elsewhere")
@@ -152,8 +155,8 @@ def _of_file(file: Path) -> tuple[str, ...]:
         return _of_archive(file)
     if head.startswith(b"{") and b'"kind":"header"' in head.partition(b"\n")[0]:  # without spaces, as FlightLog writes
         return ("flight log",)
-    if re.match(rb'\{\s*"schema": *\d+,\s*"stage": *"', head):  # the head is enough for a report of any size
-        return ("stage",)
+    if stage := re.match(rb'\{\s*"schema": *\d+,\s*"stage": *"(benchmark)?', head):  # enough for a report of any size
+        return ("stage", "benchmark") if stage[1] else ("stage",)
     return ("recordings",) if file.name in EPISODE_FILES else ()
 
 

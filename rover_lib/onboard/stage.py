@@ -89,11 +89,11 @@ def open_plain(path: Path | str, refusal: RoverError | OSError) -> BufferedReade
 
     Path.open() would wait for a writer of a FIFO, and reading a device might never end.
     """
-    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
         raise refusal
-    return file
+    return os.fdopen(file, "rb")
 
 
 def read_plain(path: Path | str, most_bytes: int = FILE_BYTES) -> bytes:
@@ -187,15 +187,16 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
     Raises RoverError if the file is missing, damaged, incomplete or of another stage.
     """
     path = Path(path)
+    made_by = f"the notebook or command '{stage or path.stem}' makes it"
     try:
         content = json.loads(read_plain(path))
     except FileNotFoundError:
-        raise RoverError(f"{path}: not found", remedy=f"run the stage '{stage}'") from None
+        raise RoverError(f"{path}: not found", remedy=f"is this the run's folder? {made_by}") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
-        raise RoverError(f"{path}: not readable as JSON ({e})", remedy=f"run the stage '{stage}' (again)") from None
+        raise RoverError(f"{path}: not readable as JSON ({e})", remedy=made_by) from None
     found = content if isinstance(content, dict) else {}
     whole = all(isinstance(found.get(part), dict) for part in PARTS)
     if not whole or (found.get("schema"), found.get("stage")) != (SCHEMA, stage or found.get("stage")):
         what = f"{path}: not schema {SCHEMA} of stage '{stage or 'any'}' with {', '.join(PARTS)}"
-        raise RoverError(what, found=sorted(found), remedy="run the stage again")
+        raise RoverError(what, found=f"'{found.get('stage')}' with {', '.join(sorted(found))}", remedy=made_by)
     return found

@@ -4,15 +4,14 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 RARELY: dict[str, Any] = {"delay": 20.0, "mininterval": 20.0}  # seconds: how a bar moves in a log
 
-T = TypeVar("T")
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 
 
-def silent(items: Iterable[T], **_: object) -> Iterable[T]:
+def silent(items: Iterable, **_: object) -> Iterable:
     """Show no bar: the default of every function that takes a `progress`."""
     return items
 

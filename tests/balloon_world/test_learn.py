@@ -20,7 +20,6 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.recording.episode import HUMAN, POLICY
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
 
@@ -103,7 +102,7 @@ def run_dir(set_params, recorded, tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     (folder / "episodes").symlink_to(recorded)
     checkpoint = of_a_cars_size(folder / "best_model.pth")
-    make_artifact(load(checkpoint, recorded), folder / "policy_static.pt", pipeline.Recipe.of(params()))
+    make_artifact(load(checkpoint, recorded), folder / "policy_static.pt", params())
     return folder
 
 

@@ -31,20 +31,27 @@ WRONG = [
     ("run noise.bin episodes", "noise.bin: not a checkpoint"),
     ("run noise.bin", "EPISODES"),
     ("run --only 04 --name nothing", "nothing"),
+    ("run nothing.pth episodes", "nothing.pth: not found"),
+    ("run noise.bin episodes -p worlds many", "worlds must be a whole number"),
+    ("run --only 04 --name mine --samples 5", "no parameter samples"),
     ("inspect nothing.pt", "nothing.pt: not found"),
+    ("inspect notes.txt", "notes.txt: no file that"),
     ("report runs/mine", "runs/mine: no verdict without"),
     ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),
     ("export-dataset empty out", "empty: no episode folders in it"),
-    ("finetune nothing.pth none --name better", "no"),
     ("distill nothing.pth none --size 320 --name fast", "320x180"),
     # no device
     ("drive policy_static.pt --dry-run --camera 99", "policy_static.pt: unknown record"),
     ("doctor --receiver --port ttyNONE", "ttyNONE"),
     # an output that would cost something else
-    ("benchmark policy_static.pt --output policy_static.pt", "policy_static.pt: this is an artifact"),
+    ("benchmark policy_static.pt --output runs/mine/load.json", "load.json: this is the report of"),
     ("benchmark policy_static.pt --output notes.txt/o.json", "notes.txt: cannot be written to"),
     # not meant, or no number
     ("drive policy_static.pt --max-seconds nan", "--max-seconds"),
+    ("drive policy_static.pt --seed 3", "--seed belongs to --world"),
+    ("drive policy_static.pt --world --port ttyUSB0", "--port belongs to a car"),
+    ("calibrate --wheelbase-m -1", "--wheelbase-m"),
+    ("record nothing --finish", "no such folder"),
 ]
 
 

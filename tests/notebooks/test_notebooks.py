@@ -8,6 +8,7 @@ import nbformat
 import pytest
 from executed import run_cells
 
+from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.run import run as runs
@@ -151,6 +152,13 @@ def test_each_parameter_of_a_notebook_is_read_there_and_says_what_params_yml_say
         assert parameter in read
         if place := runs.IN_PARAMS.get(parameter):
             assert ast.literal_eval(literal) == params()[place[0]][place[1]]
+
+
+@pytest.mark.parametrize("name", runs.NAMES + runs.AFTERWARDS)
+def test_what_a_parameter_must_not_be_is_refused_by_its_name(name):
+    for parameter in parameters_of(NOTEBOOKS / f"{name}.ipynb") - {"run_dir"}:
+        with pytest.raises(ParamsError, match=f"parameter {parameter} must be .*, found -0.5"):
+            run_cells(name, ".", **{parameter: -0.5})
 
 
 TURNED = {

@@ -39,7 +39,7 @@ def test_what_cannot_be_told_is_left_to_the_command(tmp_path):
     (tmp_path / "zip").write_bytes(b"PK\x03\x04 damaged")
     archive(tmp_path / "tensors", "data.pkl", b"somebody's tensors")
     os.mkfifo(tmp_path / "fifo")  # reading from it would wait for ever
-    for name in ("json", "zip", "tensors", "fifo", "nothing"):
+    for name in ("json", "zip", "tensors", "fifo"):
         assert kinds_of(tmp_path / name) == ()
         check_kind(tmp_path / name, "artifact")
 
@@ -50,9 +50,12 @@ def test_an_output_takes_the_place_of_its_own_kind_only(tmp_path):
     (tmp_path / "notes").write_text("unknown: as with any other program, what was asked for is written")
     for name in ("policy_static.pt", "link.pt", "notes", "new.pt", "new/folders/new.pt"):
         check_output(tmp_path / name, "artifact")
-    for path in (artifact, tmp_path / "link.pt", tmp_path, tmp_path / "notes" / "new.pt"):
+    for stage in ("load", "benchmark"):
+        write_stage(tmp_path / stage, stage, params={}, metrics={})
+    check_output(tmp_path / "benchmark", "benchmark")
+    for path in (artifact, tmp_path / "link.pt", tmp_path, tmp_path / "notes" / "new.pt", tmp_path / "load"):
         with pytest.raises(RoverError):
-            check_output(path, "checkpoint")
+            check_output(path, "benchmark")
 
 
 def test_another_kind_is_refused_with_how_to_get_the_wanted_one(tmp_path):
@@ -60,5 +63,7 @@ def test_another_kind_is_refused_with_how_to_get_the_wanted_one(tmp_path):
         check_kind(archive(tmp_path / "policy_static.pt", "code/net.py"), "checkpoint")
     assert refused.value.remedy == WANTED["checkpoint"][1]
     (tmp_path / "model.safetensors").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\n")
+    with pytest.raises(RoverError, match="nothing: not found; rover run"):
+        check_kind(tmp_path / "nothing", "artifact")
     with pytest.raises(CheckpointError, match="git lfs pull"):
         refuse_pointer(tmp_path / "model.safetensors", CheckpointError)

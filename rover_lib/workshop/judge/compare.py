@@ -9,7 +9,6 @@ sample has fewer recorded actions than a chunk is long: `mae` counts all steps, 
 """
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +35,6 @@ GATED_WORLDS = 40  # in which params.yml counts balloons
 GATED = "static"  # the mode that a Pi is meant to run, and that the gates judge
 
 WORLDS_LOST = "worlds lost at most, %"
-RELATIONS = {"<=": operator.le, ">=": operator.ge}
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +246,7 @@ def metrics(
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
     """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
     found = None if isinstance(found, float) and math.isnan(found) else found
-    passed = None if found is None else bool(RELATIONS[relation](found, limit))
+    passed = None if found is None else bool(found <= limit if relation == "<=" else found >= limit)
     return {"gate": name, "relation": relation, "limit": limit, "found": found, "passed": passed}
 
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rover_lib.workshop.judge.compare import Fidelity
@@ -52,7 +51,11 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
     """
     fig, axes = new_figure(1, height_in=1.2 + 0.26 * len(table))
     ax = axes[0, 0]
-    keys = _judged_keys(ax, next(iter(table.values())))
+    first = next(iter(table.values()))
+    every = [key for key in first if key.endswith("_mae_pct")]
+    keys = [key for key in every if first[key] is not None]
+    for key in (key for key in every if key not in keys):
+        ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
     bars = {key.removesuffix("_mae_pct"): [row[key] for row in table.values()] for key in keys}
     if len(keys) > MOST_ACTIONS:
         bars = {f"the worst of {len(keys)} actions": [worst(row[key] for key in keys) for row in table.values()]}
@@ -65,15 +68,6 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
     ax.set_xlabel("mean error with this block alone in INT8 (% of the recorded range)")
     ax.legend(frameon=False, fontsize=9)
     return fig
-
-
-def _judged_keys(ax: Axes, errors: Mapping[str, float | None]) -> list[str]:
-    """Return the keys <action>_mae_pct of the judged actions. The others are named in the legend of `ax`."""
-    keys = [k for k in errors if k.endswith("_mae_pct")]
-    for key in keys:
-        if errors[key] is None:
-            ax.plot([], [], " ", label=f"{key.removesuffix('_mae_pct')}: not judged")
-    return [k for k in keys if errors[k] is not None]
 
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
@@ -139,5 +133,5 @@ def familiarity(found: Mapping[str, Any] | None, samples: Sequence[Any]) -> Figu
     ax.set(xlabel="held-out drives", ylabel="largest score, of the threshold", xticks=[])
     pictures = {(sample.episode, sample.row): sample for sample in samples}
     for ax, least in zip(fields, found["least"], strict=True):
-        style.show_picture(ax, pictures[least["episode"], least["row"]], f"{least['strange']:.2f} of it")
+        style.show_picture(ax, pictures[least["episode"], least["row"]], f"{least['strange']:.2f} of the threshold")
     return fig

@@ -22,9 +22,6 @@ from matplotlib.figure import Figure
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
 BLACK = "#333333"
-ORANGE = "#E69F00"
-GREEN = "#009E73"
-BLUE = "#0072B2"
 RED = "#D55E00"  # a limit, a floor, a fault, a stopped car; and the balloon
 SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
 MIST = "#AAB7C4"  # what is compared with a slate figure: before, without, the rest
@@ -32,9 +29,9 @@ GREY = "#B0B0B0"
 OTHERS = (SLATE, "#8C6D31", "#AA4499", "#117733", "#6699CC", "#994455", "#997700")  # hosts, students, more actions
 COLOURS = {
     "fp32": BLACK,
-    "dynamic": ORANGE,
-    "static": BLUE,
-    "mixed": GREEN,
+    "dynamic": "#E69F00",
+    "static": "#0072B2",
+    "mixed": "#009E73",
     "steering": "#332288",
     "throttle": "#CC79A7",
 }

@@ -1,6 +1,5 @@
 """Describe a file or a folder of this project, or the runs in it, for `rover inspect`."""
 
-import json
 import shlex
 from contextlib import suppress
 from pathlib import Path
@@ -10,7 +9,7 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.cli import describe_artifact
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import check_kind, kinds_of
+from rover_lib.onboard.kinds import check_kind, kinds_of, read_head
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -18,7 +17,6 @@ from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.recordings.turning import measure_sides
 
 FIRST = "make demo, or rover run, makes the first"
-BULK = 200  # characters; of a longer value in a report only the number of its items is shown
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -40,16 +38,20 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "flight log":
         return {"flight log": {k: v for k, v in read_log(path).summary().items() if k != "events"}}
     if kind == "stage":
-        return {"report": _report(path)}
-    if kind == "tub":
-        check_kind(path, "recordings")  # says what to do with it
+        content = read_stage(path, None)
+        return {"report": {**content, "metrics": sorted(content["metrics"]), "inputs": len(content["inputs"])}}
+    if kind == "tub" or not path.exists():
+        check_kind(path, "recordings")  # says what to do
+    # Here, as a dataset's tables are read within less memory than torch takes, which LeRobot imports.
+    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         recordings = load_recordings(source, progress=progress)
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
-    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-
+    if read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
+        raise RoverError(f"{path}: no file that this project reads or writes", remedy="docs/data.md names them")
     checkpoint = load_checkpoint(path, said=source.facts)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}
 
@@ -59,18 +61,6 @@ def _run(folder: Path) -> dict[str, Any]:
     artifacts = {p.name: f"{p.stat().st_size / 1e6:.1f} MB" for p in files}
     stages = sorted(p.stem for p in folder.glob("*.json") if p.name != "run.json")
     return {"verdict": verdict_of(folder), "stages": stages, "artifacts": artifacts}
-
-
-def _report(path: Path) -> dict[str, Any]:
-    content = read_stage(path, None)
-    metrics = {key: _counted(value) for key, value in content["metrics"].items()}
-    return {"stage": content["stage"], "env": content["env"], "params": content["params"], "metrics": metrics}
-
-
-def _counted(value: Any) -> Any:
-    if isinstance(value, (dict, list)) and len(json.dumps(value)) > BULK:
-        return f"{len(value)} values, see the file"
-    return value
 
 
 def runs(folder: Path | str) -> list[dict[str, str]]:

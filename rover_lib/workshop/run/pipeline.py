@@ -1,23 +1,21 @@
 """From a checkpoint and recordings to artifacts, as params.yml says: calibrate -> quantize -> export.
 
-    recipe = Recipe.of(params())
     loaded = session.load("best_model.pth", "episodes")
-    chosen, note = recipe.choose(loaded.parts.calibration)
-    calibration = calibrate(loaded.checkpoint, chosen, smooth=recipe.scheme.smooth)
-    policy = quantize(loaded.checkpoint, recipe.scheme, calibration)
+    chosen, note = choose_calibration(loaded.parts.calibration)
+    calibration = calibrate(loaded.checkpoint, chosen, smooth=0.5)
+    policy = quantize(loaded.checkpoint, Scheme(), calibration)
     export_policies("runs/mine", loaded.checkpoint, {"static": policy}, calibration, samples)
 
 The steps are in `observe`, `quantize`, `choose` and `export`; here, which frames, which options, which files.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, content_hash
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
@@ -40,31 +38,6 @@ CHOOSING_FRAMES = 64
 EXPORT_FRAMES = 16  # of these check an export
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """What params.yml says of making artifacts."""
-
-    samples: int  # at most this many frames calibrate
-    seed: int  # of their choice
-    scheme: Scheme  # static INT8, before its observer is chosen
-    observers: tuple[str, ...]  # to choose from
-
-    @classmethod
-    def of(cls, p: Mapping[str, Any], samples: int | None = None) -> "Recipe":
-        """The recipe of params.yml. p: its content. samples: how many calibrate, None for what it says."""
-        said = p["quantization"]
-        return cls(
-            samples=samples or p["calibration"]["samples"],
-            seed=p["calibration"]["seed"],
-            scheme=Scheme(smooth=said["smooth"]),
-            observers=tuple(said["observers"]),
-        )
-
-    def choose(self, samples: tuple[Sample, ...]) -> tuple[tuple[Sample, ...], str | None]:
-        """Those of the samples that calibrate, and a note if they are fewer than asked for."""
-        return choose_calibration(samples, self.samples, self.seed)
-
-
 def prepare_chooser(
     checkpoint: Checkpoint, loaded: Opened, calibration: Calibration, frames: int = CHOOSING_FRAMES
 ) -> Chooser:
@@ -75,42 +48,32 @@ def prepare_chooser(
     return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
 
 
-def turn_params(**sections: Mapping[str, Any]) -> dict[str, Any]:
-    """params.yml's content with a notebook's parameters in it: turn_params(calibration={"samples": 50})."""
-    p = params()
-    for section, turned in sections.items():
-        p[section] |= {key: value for key, value in turned.items() if value is not None}
-    return p
-
-
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
-    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all. Raises ArtifactError.
+    """The schemes of a run's artifacts beside FP32, by name: static, and `modes` or all.
 
     Mixed is among them only if it leaves a block in float.
     """
     schemes = {"dynamic": replace(static, mode="dynamic"), "static": static, "mixed": mixed}
-    if unknown := [mode for mode in modes or () if mode not in schemes]:
-        raise ArtifactError(f"there is no mode {', '.join(unknown)}", remedy=f"known are {', '.join(schemes)}")
     if not mixed.float_blocks:
         del schemes["mixed"]  # it is static
     return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
 
 
 def make_artifact(
-    loaded: Opened, path: Path | str, recipe: Recipe, *, progress: Progress = silent
+    loaded: Opened, path: Path | str, p: Mapping[str, Any], *, progress: Progress = silent
 ) -> tuple[str, list[str]]:
-    """One artifact at `path`: calibrated on the recordings, quantized by the recipe's scheme, exported.
+    """One artifact at `path`: calibrated on the recordings, quantized as `p`, params.yml's content, says, exported.
 
     Where there are odd frames, which one scale may not serve, the ranges are chosen first. Returns its content hash,
     and warnings. Raises ArtifactError.
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
     samples = pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES)
-    chosen, note = recipe.choose(parts.calibration)
-    calibration = calibrate(checkpoint, chosen, smooth=recipe.scheme.smooth, progress=progress)
-    scheme = recipe.scheme
+    said, scheme = p["quantization"], Scheme(smooth=p["quantization"]["smooth"])
+    chosen, note = choose_calibration(parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"])
+    calibration = calibrate(checkpoint, chosen, smooth=scheme.smooth, progress=progress)
     if odd_share(calibration.frames):
-        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, recipe.observers, progress)
+        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, said["observers"], progress)
     policy = quantize(checkpoint, scheme, calibration)
     drives = Drives.of(parts)
     digest, _ = Exporter(checkpoint, samples).export(policy, path, calibration, drives)

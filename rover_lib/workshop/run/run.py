@@ -31,6 +31,7 @@ from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path, read_stage
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import run_folder
+from rover_lib.workshop.run.parameters import check_parameters
 
 NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
@@ -104,7 +105,7 @@ def run(
     refuse_root()
     folder = run_folder(runs_dir, name, RoverError)
     sources = [NOTEBOOKS / f"{n}.ipynb" for n in NAMES]
-    _refuse_unknown(sources, overrides)
+    _refuse_senseless(sources, overrides)
     given = {"checkpoint": str(Path(checkpoint).resolve()), "episodes": str(Path(episodes).resolve()), **overrides}
     texts = [s.read_text() for s in sources]
     asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
@@ -133,36 +134,33 @@ def files_of_a_run(folder: Path) -> list[Path]:
     return [path for path in own if path.exists()]
 
 
-def find_notebook(asked: str) -> str:
-    """The name of the notebook that begins like `asked`, such as 04. Raises RoverError."""
-    found = [name for name in NAMES + AFTERWARDS if name.startswith(asked.removesuffix(".ipynb"))]
-    if len(found) != 1:
-        raise RoverError(f"no notebook {asked}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
-    return found[0]
-
-
 def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
     """Execute one notebook on an existing run, and return the path of the executed notebook in the run's folder.
 
-    Raises RoverError for an unknown parameter, or with the cell and its error; an earlier executed one then stays.
+    name: it, or its beginning, such as 04. Raises RoverError for an unknown notebook or parameter, or with the cell and
+    its error; an earlier executed one then stays.
     """
-    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{name}.ipynb"
+    found = [each for each in NAMES + AFTERWARDS if each.startswith(name.removesuffix(".ipynb"))]
+    if len(found) != 1:
+        raise RoverError(f"no notebook {name}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
+    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{found[0]}.ipynb"
     if not folder.is_dir():
         raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
-    _refuse_unknown([source], overrides)
-    if name == NAMES[0] and (folder / "load.json").is_file():  # again what the run was made of, unless said otherwise
+    _refuse_senseless([source], overrides)
+    if found == [NAMES[0]] and (folder / "load.json").is_file():  # what the run was made of, unless said otherwise
         overrides = read_stage(folder / "load.json", "load")["params"] | overrides
     _execute(source, folder, overrides, False)
     return folder / source.name
 
 
-def _refuse_unknown(notebooks: list[Path], given: Mapping[str, Any]) -> None:
-    """Raise RoverError for parameters that none of the notebooks has, and for notebooks that are not there."""
+def _refuse_senseless(notebooks: list[Path], given: Mapping[str, Any]) -> None:
+    """Raise RoverError for parameters that none of the notebooks has, impossible values, and missing notebooks."""
     if missing := [path for path in notebooks if not path.is_file()]:
         raise RoverError(f"{missing[0]}: not found", remedy="run from a checkout of the project")
     known = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
     if unknown := sorted(given.keys() - known):
         raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(known)}")
+    check_parameters(**given)
 
 
 def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -> None:

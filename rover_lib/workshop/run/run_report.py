@@ -19,13 +19,12 @@ from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
-from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
 from rover_lib.workshop.judge.advice import CALLED, Names, against
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import headline, verdict
 
 STAGES = ("load", "quantize", "compare")  # without which there is nothing to judge, nor without a benchmark
-LATER = ("arm", "students")  # that `make count` and `rover world students` add to a run
 CARD = "rover-policy"  # this project's name, by which a card that we wrote is known
 AGAIN = "'rover run' of its checkpoint makes it again"
 
@@ -61,7 +60,7 @@ def write(run_dir: Path | str) -> dict[str, Any]:
 
 def _files(folder: Path) -> dict[str, Path]:
     """The JSON of each stage but the benchmark. Raises RoverError for one that is missing."""
-    files = {stage: folder / f"{stage}.json" for stage in (*STAGES, *LATER)}
+    files = {stage: folder / f"{stage}.json" for stage in (*STAGES, "arm", "students")}
     if missing := [files[stage].name for stage in STAGES if not files[stage].is_file()]:
         raise RoverError(f"{folder}: no verdict without {', '.join(missing)}", remedy=AGAIN)
     return {stage: path for stage, path in files.items() if path.is_file()}
@@ -142,5 +141,6 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
     hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
     values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
-    path.write_text(Template(Path(__file__).with_name("card.md").read_text()).render(values))
+    with atomic_path(path) as temporary:
+        temporary.write_text(Template(Path(__file__).with_name("card.md").read_text()).render(values))
     return path

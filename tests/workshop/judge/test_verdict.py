@@ -176,6 +176,8 @@ def test_what_weakens_a_verdict_is_said(demo):
     demo["quantize"]["warnings"] = [f"layer{i}: dead" for i in range(9)]
     cautions = judge(demo)["cautions"]
     assert len(cautions) == 5 and "1 episode, which were also used to calibrate" in cautions[1]
+    demo["load"]["checkpoint"] |= {"guesses": ["its size: squeezed"], "notes": ["squeezed"]}
+    assert "".join(judge(demo)["cautions"]).count("squeezed") == 1
 
 
 def test_a_size_that_misses_its_gate_wants_a_smaller_policy(demo):

@@ -25,7 +25,7 @@ def test_a_run_its_report_and_a_flight_log(demo, tmp_path):
     described = describe(Source(demo))["run"]
     assert described["artifacts"] == {"policy_static.pt": "1.2 MB"} and "compare" in described["stages"]
     described = describe(Source(demo / "compare.json"))["report"]
-    assert described["stage"] == "compare" and described["metrics"]["modes"].endswith("values, see the file")
+    assert described["stage"] == "compare" and "modes" in described["metrics"]
     with FlightLog(tmp_path / "flight.log", header={"hz": 30}, max_bytes=1_000_000, keep=1):
         pass
     assert "drives" in describe(Source(tmp_path / "flight.log"))["flight log"]

@@ -8,20 +8,12 @@ from policies import memory_samples
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import sha256_of, write_stage
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
-from rover_lib.workshop.run.pipeline import Recipe, export_onnx
+from rover_lib.workshop.run.pipeline import export_onnx
 from rover_lib.workshop.run.session import Opened
-
-
-def test_the_schemes_of_a_run():
-    recipe = Recipe.of(params())
-    schemes = pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed", float_blocks=("head",)))
-    assert {name: scheme.mode for name, scheme in schemes.items()} == {m: m for m in ("dynamic", "static", "mixed")}
-    assert "mixed" not in pipeline.schemes_of(recipe.scheme, replace(recipe.scheme, mode="mixed"))  # it is static
 
 
 def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibration):
