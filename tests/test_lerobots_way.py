@@ -25,6 +25,7 @@ def test_from_recordings_to_an_artifact(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     done = rover("export-dataset", record_drives(tmp_path / "mine", drives=3, frames=40), dataset, "--size", "64x36")
     assert done.exit_code == 0, done.output
+    subprocess.run([Path(sys.executable).with_name("rover"), "inspect", dataset], check=True)  # torch is loaded late
     words = ["--policy.type=act", "--policy.pretrained_backbone_weights=null", *TINY, "--policy.device=cpu"]
     words += ["--policy.push_to_hub=false", "--wandb.enable=false", "--num_workers=0", "--dataset.repo_id=local/mine"]
     words += [f"--dataset.root={dataset}", "--dataset.video_backend=pyav", f"--output_dir={tmp_path / 'train'}"]

@@ -50,7 +50,6 @@ WRONG = [
     ("drive policy_static.pt --max-seconds nan", "--max-seconds"),
     ("drive policy_static.pt --seed 3", "--seed belongs to --world"),
     ("drive policy_static.pt --world --port ttyUSB0", "--port belongs to a car"),
-    ("calibrate --wheelbase-m -1", "--wheelbase-m"),
     ("record nothing --finish", "no such folder"),
 ]
 

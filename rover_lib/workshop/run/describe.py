@@ -50,7 +50,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
-    if read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
+    if path.is_file() and read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
         raise RoverError(f"{path}: no file that this project reads or writes", remedy="docs/data.md names them")
     checkpoint = load_checkpoint(path, said=source.facts)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}

@@ -25,9 +25,11 @@ BLOCKS = _list_of('names, as in ["backbone.stem"], or None', lambda v: isinstanc
 DELAYS = _list_of("milliseconds, as in [0, 150]", lambda v: is_number(v, 0, MOST))
 OBSERVED = _list_of("histogram, minmax or both, and frames", lambda v: v in OBSERVERS)
 RULES = {
-    **dict.fromkeys(("run_dir", "checkpoint", "episodes", "rovers"), Rule(_is_path, "a path")),
+    **dict.fromkeys(("checkpoint", "episodes", "rovers"), Rule(_is_path, "a path")),
+    "run_dir": Rule(lambda v: _is_path(v) and not Path(v).is_file(), "a folder's path"),
     **dict.fromkeys(("action_names", "camera", "facts"), of_type(str)),
-    **dict.fromkeys(("samples", "choosing_frames", "held_out_frames", "iterations"), whole(1, MOST)),
+    **dict.fromkeys(("samples", "choosing_frames", "iterations"), whole(1, MOST)),
+    "held_out_frames": whole(2, MOST),  # whose pictures are swapped
     **dict.fromkeys(("seed", "worlds", "pushes"), whole(0, MOST)),
     "threads": whole(0, usable_cores()),
     "smooth": number(0, 1),
