@@ -194,3 +194,11 @@ def lerobot_train(dataset: Path | str) -> str:
         f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
         "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
     )
+
+
+def lerobot_video(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that makes videos of a LeRobotDataset's pictures, in <dataset>-video."""
+    return (
+        f"lerobot-edit-dataset --repo_id=local/drives --root={dataset} "
+        f"--operation.type=convert_image_to_video --operation.output_dir={dataset}-video"
+    )

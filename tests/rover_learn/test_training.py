@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torchvision
 from policies import normalise
 from torch import nn
 
 from rover_learn import training
-from rover_learn.training import Best, Machine, Phase, Resumable, RowFile, normalised
+from rover_learn.training import Best, Machine, Phase, RepeatablePool, Resumable, RowFile, normalised
 from rover_lib.onboard.errors import TrainingError
 
 STEPS, CPU = 6, Machine(torch.device("cpu"))
@@ -67,6 +68,37 @@ def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, ev
         losses, weights, after = train(tmp_path / str(kill_at), **options)
         assert torch.equal(weights, whole[1])
         assert (losses, after) == (whole[0], whole[2])
+
+
+def test_what_two_gpus_saved_goes_on_without_one(tmp_path, whole, monkeypatch):
+    """Their random numbers and their fused optimiser are in what was saved."""
+
+    def save(file, content):
+        if "optimizer" in content["parts"]:
+            content["parts"]["optimizer"]["param_groups"][0]["fused"] = True
+        torch.save(content | {"cuda": [torch.get_rng_state()] * 2}, file)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(training, "save_torch", save)
+        patch.setattr("torch.serialization.location_tag", lambda _: "cuda:1")
+        train(tmp_path, kill_at=2 * STEPS)
+    losses, weights, _ = train(tmp_path)
+    assert np.allclose(losses, whole[0], rtol=1e-4) and torch.allclose(weights, whole[1], rtol=1e-4)
+
+
+def test_a_repeatable_pool_is_resnets(monkeypatch):
+    pool, images = RepeatablePool(), torch.randn(2, 3, 9, 14)
+    ours, theirs = (images.clone().requires_grad_() for _ in range(2))
+    pooled, expected = pool(ours), nn.MaxPool2d(3, 2, 1)(theirs)
+    assert torch.equal(pooled, expected)
+    weights = torch.randn(expected.shape)
+    for each in (pooled, expected):
+        (each * weights).sum().backward()
+    assert torch.allclose(ours.grad, theirs.grad, atol=1e-6)
+    resnet = torchvision.models.resnet18()
+    monkeypatch.setattr(nn.Module, "to", lambda self, _: self)
+    assert isinstance(Machine(torch.device("cuda:0")).taking(resnet).maxpool, RepeatablePool)
+    assert isinstance(CPU.taking(torchvision.models.resnet18()).maxpool, nn.MaxPool2d)
 
 
 def test_two_processes_do_not_train_the_same(tmp_path):
