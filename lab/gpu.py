@@ -22,12 +22,11 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act_config import lerobot_act
 
-MOST_S, MOST_BEFORE_S, MOST_DATA_SHARE = 130.0, 6.0, 0.25  # of all, before the first step, of it waiting for data
+MOST = {"all_s": 130.0, "before_s": 6.0, "data_share": 0.25}  # in all, before the first step, of it waiting for data
 DRIVES = 128  # 16,500 frames
 REPEATED_STEPS, STOPPED_AFTER = 120, 3  # of the trainings that should give the same weights; steps of a phase
 STOPPED_IN = "backbone", "transformer", "all together", "at full size"
-FULL = {"steps": 8, "batch": 64}  # a training that needs more than FULL_SHARE of a GPU's memory
-FULL_SHARE = 0.01
+FULL_SHARE = 0.01  # of a GPU's memory, which eight steps of 64 pictures do not fit into
 Run = Callable[..., dict[str, torch.Tensor]]  # trains in a folder of this name, with such options; returns the weights
 
 
@@ -42,44 +41,37 @@ class Bars:
         self.stop_in, self.first_s, self.resumed = stop_in, 0.0, dict[str, int]()
 
     def __call__(self, items: Iterable[Any], desc: str = "", initial: int = 0, **_: Any) -> Iterator[Any]:
-        began_s, phase = time.monotonic(), desc.removeprefix("training, ")
-        if phase == desc:
-            yield from items
-            return
-        self.first_s = self.first_s or began_s
-        self.resumed |= {phase: initial} if initial else {}
-        row = self.rows.setdefault(phase, {"steps": 0, "s": 0.0, "data_s": 0.0})
+        kind, _comma, phase = desc.partition(", ")
+        row = self.rows.setdefault(phase, {"steps": 0, "s": 0.0, "data_s": 0.0}) if kind == "training" else {}
+        began_s = time.monotonic()
+        if row:
+            self.first_s = self.first_s or began_s
+            self.resumed |= {phase: initial} if initial else {}
         for each in items:
             waited_s = time.monotonic() - began_s
             yield each
-            row["steps"] += 1
-            row["s"] += time.monotonic() - began_s
-            row["data_s"] += waited_s
-            if phase == self.stop_in and row["steps"] == STOPPED_AFTER:
-                raise SystemExit
+            if row:
+                row["steps"] += 1
+                row["s"] += time.monotonic() - began_s
+                row["data_s"] += waited_s
+                if phase == self.stop_in and row["steps"] == STOPPED_AFTER:
+                    raise SystemExit
             began_s = time.monotonic()
 
 
-def time_phases(run: Run, machine: Machine, row: dict[str, Any]) -> dict[str, bool]:
+def time_phases(run: Run, machine: Machine, row: dict[str, Any]) -> list[str]:
     """Train once by the recipe. LeRobot, and the GPU, are there before the clock starts."""
-    began_s = time.monotonic()
     lerobot_act(SIZES["small"]).to(machine.device)
-    row["imports_s"] = time.monotonic() - began_s
     bars, began_s = Bars(), time.monotonic()
     row["phases"] = bars.rows
     run("whole", progress=bars)
-    all_s, before_s = time.monotonic() - began_s, bars.first_s - began_s
-    data_share = sum(each["data_s"] for each in bars.rows.values()) / all_s
-    memory_mb = torch.cuda.max_memory_allocated(machine.device) / 1e6 if machine.device.type == "cuda" else None
-    row |= {"all_s": all_s, "before_s": before_s, "data_share": data_share, "memory_mb": memory_mb}
-    return {
-        f"{all_s:.0f} s in all, of at most {MOST_S:.0f}": all_s > MOST_S,
-        f"{before_s:.1f} s before the first step, of at most {MOST_BEFORE_S:.0f}": before_s > MOST_BEFORE_S,
-        f"{data_share:.0%} of the time waits for data, of at most {MOST_DATA_SHARE:.0%}": data_share > MOST_DATA_SHARE,
-    }
+    row["all_s"], row["before_s"] = time.monotonic() - began_s, bars.first_s - began_s
+    row["data_share"] = sum(each["data_s"] for each in bars.rows.values()) / row["all_s"]
+    row["memory_mb"] = torch.cuda.max_memory_allocated(machine.device) / 1e6 if machine.device.type == "cuda" else None
+    return [f"{name} is {row[name]:.2f}, of at most {most:g}" for name, most in MOST.items() if row[name] > most]
 
 
-def compare_weights(run: Run, machine: Machine, row: dict[str, Any]) -> dict[str, bool]:
+def compare_weights(run: Run, _machine: Machine, row: dict[str, Any]) -> list[str]:
     """Train REPEATED_STEPS twice, the second time interrupted inside each phase, after it was saved."""
     once, resumed = run("once", steps=REPEATED_STEPS), dict[str, int]()
     with patch.object(training, "Resumable", partial(Resumable, every_s=0.0)):
@@ -90,32 +82,26 @@ def compare_weights(run: Run, machine: Machine, row: dict[str, Any]) -> dict[str
             resumed |= bars.resumed
     differ = sum(not torch.equal(value, twice[name]) for name, value in once.items())
     row |= {"tensors": len(once), "differ": differ, "resumed_at": resumed}
-    return {
-        f"{differ} of {len(once)} tensors differ after interruptions": differ > 0,
-        "not every phase was resumed inside": not {"backbone", "transformer"} <= set(resumed),
-    }
+    wrong = [f"{differ} of {len(once)} tensors differ after interruptions"] if differ else []
+    return wrong if {"backbone", "transformer"} <= set(resumed) else [*wrong, "not every phase was resumed inside"]
 
 
-def fill_memory(run: Run, machine: Machine, row: dict[str, Any]) -> dict[str, bool]:
+def fill_memory(run: Run, machine: Machine, row: dict[str, Any]) -> list[str]:
     """Train with hardly any of a GPU's memory, which must end in a sentence."""
     if machine.device.type != "cuda":
-        return {}
+        return []
     torch.cuda.empty_cache()
     torch.cuda.set_per_process_memory_fraction(FULL_SHARE, machine.device)
     try:
-        run("full", **FULL)
+        run("full", steps=8, batch=64)
     except TrainingError as error:
         row["says"] = str(error)
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0, machine.device)
-    return {"full memory is not said": "its memory is full" not in row.get("says", "")}
+    return [] if "its memory is full" in row.get("says", "") else ["full memory is not said"]
 
 
-ROWS: dict[str, tuple[int, Callable[[Run, Machine, dict[str, Any]], dict[str, bool]]]] = {  # seconds at most
-    "phases": (300, time_phases),
-    "weights": (180, compare_weights),
-    "memory": (60, fill_memory),
-}
+ROWS = {"phases": (300, time_phases), "weights": (180, compare_weights), "memory": (60, fill_memory)}  # seconds at most
 
 
 def measure(output: Path, device: str, size: str, episodes: Path) -> list[str]:
@@ -128,26 +114,23 @@ def measure(output: Path, device: str, size: str, episodes: Path) -> list[str]:
     made |= {"size": size, "rows": {}, "wrong": wrong}
     if not episodes.exists():
         record_episodes(episodes, DRIVES)
-    handler = signal.signal(signal.SIGALRM, signal.default_int_handler)  # as Ctrl-C: no `except` on the way takes it
+    signal.signal(signal.SIGALRM, signal.default_int_handler)  # as Ctrl-C does: no `except` on the way takes it
     with tempfile.TemporaryDirectory() as folder:
         run = partial(_train, episodes, Path(folder), size=size, machine=machine)
         for name, (most_s, fill) in ROWS.items():
             row, began_s = made["rows"].setdefault(name, {}), time.monotonic()
             signal.alarm(most_s)
             try:
-                wrong += [f"{name}: {sentence}" for sentence, is_so in fill(run, machine, row).items() if is_so]
-            except KeyboardInterrupt:
-                if time.monotonic() - began_s < most_s:
+                wrong += [f"{name}: {sentence}" for sentence in fill(run, machine, row)]
+            except (KeyboardInterrupt, Exception) as error:  # the other rows are still of use
+                if isinstance(error, KeyboardInterrupt) and time.monotonic() - began_s < most_s:
                     raise
-                wrong.append(f"{name}: not done within {most_s} s")
-            except Exception as error:  # the other rows are still of use
-                wrong.append(f"{name}: {type(error).__name__}: {error}")
+                wrong.append(f"{name}: ended after {time.monotonic() - began_s:.0f} of {most_s} s: {error!r}")
             finally:
                 signal.alarm(0)
             row["took_s"] = time.monotonic() - began_s
             with atomic_path(output) as temporary:
                 temporary.write_text(json.dumps(made, indent=2) + "\n")
-    signal.signal(signal.SIGALRM, handler)
     return wrong
 
 
