@@ -5,6 +5,7 @@ If a policy drove in one of the recordings, `intervention` says where a human ha
 """
 
 import json
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -127,6 +128,7 @@ def _write(
         root=root,
         robot_type="rover",
         use_videos=False,
+        image_writer_threads=min(4, os.cpu_count() or 1),  # half of the time goes into compressing PNG
     )
     left_out: Counter[str] = Counter(too_short=0, nobody_drove=0)
     written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
@@ -145,6 +147,8 @@ def _write(
                     dataset.save_episode()
                     written.append((episode, rows[0][0].row, len(rows)))
         finally:  # else it would be done at some later time, in a folder that is gone
+            if hasattr(dataset, "stop_image_writer"):  # else finalize() does it
+                dataset.stop_image_writer()
             dataset.finalize()
     if not written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")

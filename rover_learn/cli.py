@@ -76,10 +76,9 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
     from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
 
-    height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     recipe = DistillRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
-    options |= {"shape": StudentShape(height, width, **parts), "recipe": recipe}
+    options |= {"shape": StudentShape(*(size or (None, None)), **parts), "recipe": recipe}
     folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary)
 
