@@ -84,7 +84,7 @@ class Machine:
         if self.device.type == "cuda":
             os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it starts
             torch.use_deterministic_algorithms(True, warn_only=True)
-            torch.utils.deterministic.fill_uninitialized_memory = False  # it would cost a kernel for each new tensor
+            torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined] # slow
         try:
             yield
         except RuntimeError as error:
