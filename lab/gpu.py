@@ -33,20 +33,20 @@ Run = Callable[..., dict[str, torch.Tensor]]  # trains in a folder of this name,
 class Bars:
     """A bar that times a training's phases, and their waiting for data. stop_in: exits early in this phase.
 
-    first_s: when the first phase began. resumed: at which step a phase went on.
+    first_s: when the first phase began. resumed: at which step a phase that was not done went on.
     """
 
     def __init__(self, stop_in: str = ""):
         self.rows: dict[str, dict[str, float]] = {}
         self.stop_in, self.first_s, self.resumed = stop_in, 0.0, dict[str, int]()
 
-    def __call__(self, items: Iterable[Any], desc: str = "", initial: int = 0, **_: Any) -> Iterator[Any]:
+    def __call__(self, items: Iterable[Any], desc: str, total: int = 0, initial: int = 0) -> Iterator[Any]:
         kind, _comma, phase = desc.partition(", ")
         row = self.rows.setdefault(phase, {"steps": 0, "s": 0.0, "data_s": 0.0}) if kind == "training" else {}
         began_s = time.monotonic()
         if row:
             self.first_s = self.first_s or began_s
-            self.resumed |= {phase: initial} if initial else {}
+            self.resumed |= {phase: initial} if 0 < initial < total else {}
         for each in items:
             waited_s = time.monotonic() - began_s
             yield each
