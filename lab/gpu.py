@@ -1,10 +1,13 @@
-"""Measure a training on a GPU: seconds by phase, of them waiting for data, and whether its weights repeat."""
+"""Measure trainings on a GPU, a row at a time: each has a limit, and is in the JSON as soon as it ends."""
 
+import json
 import os
+import signal
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -12,27 +15,38 @@ from unittest.mock import patch
 import torch
 
 from balloon_world.record import record_episodes
-from rover_learn.train import train
-from rover_learn.training import Machine
-from rover_lib.workshop.cache import cache_root
-from rover_lib.workshop.progress import Progress
+from rover_learn import train as training
+from rover_learn.train import SIZES, train
+from rover_learn.training import Machine, Resumable
+from rover_lib.onboard.errors import TrainingError
+from rover_lib.onboard.stage import atomic_path
+from rover_lib.workshop.act_config import lerobot_act
 
-MOST_S, MOST_BEFORE_S, MOST_DATA_SHARE = 130.0, 6.0, 0.25  # of all, before the first step, of it waiting for data
+MOST = {"all_s": 130.0, "before_s": 6.0, "data_share": 0.25}  # in all, before the first step, of it waiting for data
 DRIVES = 128  # 16,500 frames
-REPEATED_STEPS, INTERRUPTED_AT = 120, 60  # of the trainings that should give the same weights
+REPEATED_STEPS, STOPPED_AFTER = 120, 3  # of the trainings that should give the same weights; steps of a phase
+STOPPED_IN = "backbone", "transformer", "all together", "at full size"
+FULL_SHARE = 0.01  # of a GPU's memory, which eight steps of 64 pictures do not fit into
+Run = Callable[..., dict[str, torch.Tensor]]  # trains in a folder of this name, with such options; returns the weights
 
 
-class Phases:
-    """A bar that times a training's phases, and its waiting for data. stop_at: interrupts after so many steps."""
+class Bars:
+    """A bar that times a training's phases, and their waiting for data. stop_in: exits early in this phase.
 
-    def __init__(self, stop_at: int | None = None):
+    first_s: when the first phase began. resumed: at which step a phase that was not done went on.
+    """
+
+    def __init__(self, stop_in: str = ""):
         self.rows: dict[str, dict[str, float]] = {}
-        self.stop_at = stop_at
+        self.stop_in, self.first_s, self.resumed = stop_in, 0.0, dict[str, int]()
 
-    def __call__(self, items: Iterable[Any], desc: str = "", **_: Any) -> Iterator[Any]:
+    def __call__(self, items: Iterable[Any], desc: str, total: int = 0, initial: int = 0) -> Iterator[Any]:
         kind, _comma, phase = desc.partition(", ")
         row = self.rows.setdefault(phase, {"steps": 0, "s": 0.0, "data_s": 0.0}) if kind == "training" else {}
         began_s = time.monotonic()
+        if row:
+            self.first_s = self.first_s or began_s
+            self.resumed |= {phase: initial} if 0 < initial < total else {}
         for each in items:
             waited_s = time.monotonic() - began_s
             yield each
@@ -40,51 +54,88 @@ class Phases:
                 row["steps"] += 1
                 row["s"] += time.monotonic() - began_s
                 row["data_s"] += waited_s
-                if sum(every["steps"] for every in self.rows.values()) == self.stop_at:
-                    raise KeyboardInterrupt
+                if phase == self.stop_in and row["steps"] == STOPPED_AFTER:
+                    raise SystemExit
             began_s = time.monotonic()
 
 
-def record(device: str, progress: Progress) -> Path:
-    """Record, or find in the cache, drives to train on, for a device that is there. Raises TrainingError."""
-    Machine.of(device)
-    return record_episodes(cache_root() / "gpu-episodes", DRIVES, progress=progress)
+def time_phases(run: Run, machine: Machine, row: dict[str, Any]) -> list[str]:
+    """Train once by the recipe. LeRobot, and the GPU, are there before the clock starts."""
+    lerobot_act(SIZES["small"]).to(machine.device)
+    bars, began_s = Bars(), time.monotonic()
+    row["phases"] = bars.rows
+    run("whole", progress=bars)
+    row["all_s"], row["before_s"] = time.monotonic() - began_s, bars.first_s - began_s
+    row["data_share"] = sum(each["data_s"] for each in bars.rows.values()) / row["all_s"]
+    row["memory_mb"] = torch.cuda.max_memory_allocated(machine.device) / 1e6 if machine.device.type == "cuda" else None
+    return [f"{name} is {row[name]:.2f}, of at most {most:g}" for name, most in MOST.items() if row[name] > most]
 
 
-def measure(episodes: Path, device: str = "cuda", size: str = "full") -> dict[str, Any]:
-    """Train once by the recipe, then twice for REPEATED_STEPS, the second time with an interruption.
-
-    Returns what it took, and in `wrong` a sentence for each requirement that does not hold. Raises TrainingError
-    without such a device.
-    """
-    machine, phases = Machine.of(device), Phases()
-    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ):
-        began_s = time.monotonic()
-        _train(episodes, Path(folder) / "whole", size, device, progress=phases)
-        all_s = time.monotonic() - began_s
-        memory_mb = torch.cuda.max_memory_allocated(machine.device) / 1e6 if machine.device.type == "cuda" else None
-        once = _train(episodes, Path(folder) / "once", size, device, steps=REPEATED_STEPS)
-        again: dict[str, Any] = {"steps": REPEATED_STEPS, "size": size, "device": device}
-        with suppress(KeyboardInterrupt):
-            _train(episodes, Path(folder) / "twice", progress=Phases(INTERRUPTED_AT), **again)
-        twice = _train(episodes, Path(folder) / "twice", **again)
-    before_s = all_s - sum(row["s"] for row in phases.rows.values())
+def compare_weights(run: Run, _machine: Machine, row: dict[str, Any]) -> list[str]:
+    """Train REPEATED_STEPS twice, the second time interrupted inside each phase, after it was saved."""
+    once, resumed = run("once", steps=REPEATED_STEPS), dict[str, int]()
+    with patch.object(training, "Resumable", partial(Resumable, every_s=0.0)):
+        for phase in (*STOPPED_IN, ""):
+            bars = Bars(phase)
+            with suppress(SystemExit):
+                twice = run("twice", steps=REPEATED_STEPS, progress=bars)
+            resumed |= bars.resumed
     differ = sum(not torch.equal(value, twice[name]) for name, value in once.items())
-    data_share = sum(row["data_s"] for row in phases.rows.values()) / all_s
-    wrong = {
-        f"{all_s:.0f} s in all, of at most {MOST_S:.0f}": all_s > MOST_S,
-        f"{before_s:.1f} s before the first step, of at most {MOST_BEFORE_S:.0f}": before_s > MOST_BEFORE_S,
-        f"{data_share:.0%} of the time waits for data, of at most {MOST_DATA_SHARE:.0%}": data_share > MOST_DATA_SHARE,
-        f"{differ} of {len(once)} tensors differ after an interruption": differ > 0,
-    }
-    made = {"device": machine.words(), "workers": machine.workers, "torch": torch.__version__, "size": size}
-    made |= {"all_s": all_s, "before_s": before_s, "data_share": data_share, "memory_mb": memory_mb}
-    made |= {"phases": phases.rows, "tensors_that_differ": differ}
-    return made | {"wrong": [sentence for sentence, is_so in wrong.items() if is_so]}
+    row |= {"tensors": len(once), "differ": differ, "resumed_at": resumed}
+    wrong = [f"{differ} of {len(once)} tensors differ after interruptions"] if differ else []
+    return wrong if {"backbone", "transformer"} <= set(resumed) else [*wrong, "not every phase was resumed inside"]
 
 
-def _train(episodes: Path, folder: Path, size: str, device: str, **options: Any) -> dict[str, torch.Tensor]:
-    """Train with a cache of its own in this folder, and return the weights."""
-    os.environ["ROVER_CACHE"] = str(folder / "cache")
-    made = train(episodes, folder / "policy.pth", size, machine=Machine.of(device), **options)
+def fill_memory(run: Run, machine: Machine, row: dict[str, Any]) -> list[str]:
+    """Train with hardly any of a GPU's memory, which must end in a sentence."""
+    if machine.device.type != "cuda":
+        return []
+    torch.cuda.empty_cache()
+    torch.cuda.set_per_process_memory_fraction(FULL_SHARE, machine.device)
+    try:
+        run("full", steps=8, batch=64)
+    except TrainingError as error:
+        row["says"] = str(error)
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0, machine.device)
+    return [] if "its memory is full" in row.get("says", "") else ["full memory is not said"]
+
+
+ROWS = {"phases": (300, time_phases), "weights": (180, compare_weights), "memory": (60, fill_memory)}  # seconds at most
+
+
+def measure(output: Path, device: str, size: str, episodes: Path) -> list[str]:
+    """Measure all ROWS, on episodes that are recorded if they are not there, and write each to `output` at its end.
+
+    Returns a sentence for each requirement that does not hold. Raises TrainingError without such a device.
+    """
+    machine, wrong = Machine.of(device), list[str]()
+    made: dict[str, Any] = {"device": machine.words(), "workers": machine.workers, "torch": torch.__version__}
+    made |= {"size": size, "rows": {}, "wrong": wrong}
+    if not episodes.exists():
+        record_episodes(episodes, DRIVES)
+    signal.signal(signal.SIGALRM, signal.default_int_handler)  # as Ctrl-C does: no `except` on the way takes it
+    with tempfile.TemporaryDirectory() as folder:
+        run = partial(_train, episodes, Path(folder), size=size, machine=machine)
+        for name, (most_s, fill) in ROWS.items():
+            row, began_s = made["rows"].setdefault(name, {}), time.monotonic()
+            signal.alarm(most_s)
+            try:
+                wrong += [f"{name}: {sentence}" for sentence in fill(run, machine, row)]
+            except (KeyboardInterrupt, Exception) as error:  # the other rows are still of use
+                if isinstance(error, KeyboardInterrupt) and time.monotonic() - began_s < most_s:
+                    raise
+                wrong.append(f"{name}: ended after {time.monotonic() - began_s:.0f} of {most_s} s: {error!r}")
+            finally:
+                signal.alarm(0)
+            row["took_s"] = time.monotonic() - began_s
+            with atomic_path(output) as temporary:
+                temporary.write_text(json.dumps(made, indent=2) + "\n")
+    return wrong
+
+
+def _train(episodes: Path, folder: Path, name: str, **options: Any) -> dict[str, torch.Tensor]:
+    """Train with a cache of its own, and return the weights."""
+    with patch.dict(os.environ, ROVER_CACHE=str(folder / name)):
+        made = train(episodes, folder / f"{name}.pth", **options)
     return torch.load(made, weights_only=False)["model_state_dict"]

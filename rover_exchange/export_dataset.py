@@ -5,6 +5,7 @@ If a policy drove in one of the recordings, `intervention` says where a human ha
 """
 
 import json
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -127,6 +128,7 @@ def _write(
         root=root,
         robot_type="rover",
         use_videos=False,
+        image_writer_threads=min(4, os.cpu_count() or 1),  # half of the time goes into compressing PNG
     )
     left_out: Counter[str] = Counter(too_short=0, nobody_drove=0)
     written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
@@ -145,6 +147,8 @@ def _write(
                     dataset.save_episode()
                     written.append((episode, rows[0][0].row, len(rows)))
         finally:  # else it would be done at some later time, in a folder that is gone
+            if hasattr(dataset, "stop_image_writer"):  # else finalize() does it
+                dataset.stop_image_writer()
             dataset.finalize()
     if not written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
@@ -193,4 +197,12 @@ def lerobot_train(dataset: Path | str) -> str:
     return (
         f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
         "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
+    )
+
+
+def lerobot_video(dataset: Path | str) -> str:
+    """Return the command of LeRobot's own that makes videos of a LeRobotDataset's pictures, in <dataset>-video."""
+    return (
+        f"lerobot-edit-dataset --repo_id=local/drives --root={dataset} "
+        f"--operation.type=convert_image_to_video --operation.output_dir={dataset}-video"
     )

@@ -47,11 +47,6 @@ def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def _recipes(options: dict[str, Any]) -> dict[str, Any]:
-    """Take a recipe's own numbers out of the options."""
-    return {name: options.pop(name) for name in ("steps", "batch")}
-
-
 def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
     from rover_lib.onboard.stage import read_stage
 
@@ -81,9 +76,9 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
     from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
 
-    height, width = size or (None, None)
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
-    options |= {"shape": StudentShape(height, width, **parts), "recipe": DistillRecipe.of(**_recipes(options))}
+    recipe = DistillRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
+    options |= {"shape": StudentShape(*(size or (None, None)), **parts), "recipe": recipe}
     folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary)
 
@@ -104,7 +99,8 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, **options
     from rover_learn.finetune import finetune as learn_on
     from rover_lib.workshop.recordings.samples import Source
 
-    recipe, sources = FinetuneRecipe.of(**_recipes(options)), [Source.of(each, facts=facts) for each in episodes]
+    recipe = FinetuneRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
+    sources = [Source.of(each, facts=facts) for each in episodes]
     folder = learn_on(checkpoint, sources, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
 
@@ -127,8 +123,8 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
 
     `small` takes minutes on two cores, `full`, the policy of the real car, about an hour, or minutes on a GPU: it is
     trained at a quarter of its pixels and then carried to 640x360. The rate of its plans is that of the recordings,
-    whose held-out part is left for `rover run`. Beside OUTPUT are its curves. Run it again to resume; for that it keeps
-    up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
+    whose held-out part is left for `rover run`. Beside OUTPUT are its curves, and pretrained_model/ for LeRobot. Run it
+    again to resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
     """
     from rover_learn.train import train as train_policy
 

@@ -5,7 +5,6 @@
 The student begins with its teacher's weights (see `student`) and learns in phases: its backbone to see what the teacher
 sees, its transformer on what that backbone sees, then all together at a tenth of the rate. It learns what the teacher
 plans, and a little what was recorded. Channels that it is to do without go after the first phase (see `channels`).
-The run's folder gets best_model.pth, pretrained_model/ and distill.json; `rover run` makes its artifacts.
 
 Letters: n samples, B batch, C chunk, A actions.
 """
@@ -114,7 +113,7 @@ class Distillation(Work):
             losses = dict(saved.losses)
         with Resumable(own, self.machine, self.progress) as saved:
             weights = self._start(lessons, backbone)
-            policy = BatchedPolicy(self.config, weights).to(self.machine.device)
+            policy = self.machine.taking(BatchedPolicy(self.config, weights))
             if self.share is not None:
                 lessons = lessons.apart(own)
                 lessons.see(saved, policy, self.rng("tokens"))
@@ -127,7 +126,7 @@ class Distillation(Work):
         it is to lose channels. Returns its weights; at the teacher's own size they are the teacher's.
         """
         teacher = self.origin.at_size(*self.config.image_sizes[0])
-        policy = BatchedPolicy(teacher.config, teacher.weights).to(self.machine.device)
+        policy = self.machine.taking(BatchedPolicy(teacher.config, teacher.weights))
         policy.thaw()
 
         def off(batch: Batch) -> Tensor:
@@ -161,7 +160,7 @@ class Distillation(Work):
         of_teacher = "teacher", teacher.config, teacher.weights, None
         every, students = [], []
         for named, config, weights, share in (of_teacher, (name, self.config, learned.weights, self.share)):
-            policy = BatchedPolicy(config, weights).to(self.machine.device)
+            policy = self.machine.taking(BatchedPolicy(config, weights))
             row = {"name": named, **dict(zip(("height", "width"), config.image_sizes[0], strict=True))}
             row |= {"decoder_layers": config.decoder_layers, "feedforward": config.feedforward}
             row |= {"backbone_channels": share, "gmac": gmac(config, weights)}

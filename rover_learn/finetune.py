@@ -7,7 +7,7 @@ corrections: they show what to do in places that only that policy reaches, so th
 policy or nobody drove are not imitated, and a plan ends where its human let go, as in HG-DAgger and Sirius.
 
 It learns in phases, as a student does (see `distill`): first the transformer on what its backbone sees, then everything
-together at a fiftieth of the rate. The run's folder gets best_model.pth, pretrained_model/ and finetune.json.
+together at a fiftieth of the rate.
 
 A fixed rule decides on held-out episodes whether the policy is *better*: its error fell significantly on the new ones,
 and did not rise significantly on the old ones. Whole episodes are compared, because the frames of one drive are alike,
@@ -227,7 +227,7 @@ class Finetuning(Work):
         weights = np.concatenate([_weights(recipe, kind, each, 1 / self.ranges) for kind, each in every])
         pool = Pool([(each, kind != DEMONSTRATIONS) for kind, each in every], weights)
         with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
-            policy = BatchedPolicy(parent.config, parent.weights).to(self.machine.device)
+            policy = self.machine.taking(BatchedPolicy(parent.config, parent.weights))
             policy.thaw()
             self.train_policy(saved, policy, pool, self.loss, seen="maps", slower=SLOWER)
         made = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
@@ -245,7 +245,7 @@ class Finetuning(Work):
         """Judge each held-out episode with the policy as it was before and after: finetune.json's rows."""
         held_out, rows = self.material.held_out, []
         policies = {"before": self.origin.weights, "after": weights}
-        asked = {when: BatchedPolicy(self.config, each).to(self.machine.device) for when, each in policies.items()}
+        asked = {when: self.machine.taking(BatchedPolicy(self.config, each)) for when, each in policies.items()}
         for name, kind, every in self.progress(held_out, desc="judging", total=len(held_out)):
             samples = pick_evenly(every, self.recipe.judged_frames)
             driven, actions = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
@@ -330,14 +330,14 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
-    few = [f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES]
-    if few:
-        return None, f"undecided: only {' and '.join(few)} held-out episodes, of at least {LEAST_EPISODES} each"
-    moved = {kind: kinds[kind]["change_points"] for kind in KINDS if kinds[kind]["chance"] < CHANCE}
+    few = {k: f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES}
+    moved = {k: kinds[k]["change_points"] for k in KINDS if k not in few and kinds[k]["chance"] < CHANCE}
     if moved.get(OLD, 0) > 0:
         return False, f"not better: on the old episodes it is {moved[OLD]:.2f} points further from the human"
     if moved.get(NEW, 0) > 0:
         return False, f"worse: on the new episodes it is {moved[NEW]:.2f} points further from the human"
+    if few:
+        return None, f"undecided: {' and '.join(few.values())} held-out episodes, of at least {LEAST_EPISODES} each"
     if NEW not in moved:
         return None, "undecided: on the new episodes the difference may be chance"
     why = f"better: on the new episodes it is {-moved[NEW]:.2f} points nearer to the human, and no worse on the old"

@@ -20,20 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from rover_learn.training import (
-    ACTION,
-    GAIN,
-    IMAGE,
-    IS_PAD,
-    STATE,
-    Batch,
-    Frames,
-    Given,
-    Resumable,
-    RowFile,
-    on_device,
-    swap_states,
-)  # fmt: skip
+from rover_learn import training
+from rover_learn.training import ACTION, GAIN, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine
@@ -145,7 +133,7 @@ class Lessons:
         data = Frames.of(samples, size)
         seen = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
         rows = np.arange(len(data))
-        asked = np.stack([swap_states(data, rows, rng) for _ in VIEWS], 1)
+        asked = np.stack([training.swap_states(data, rows, rng) for _ in VIEWS], 1)
         asked[:, MIRRORED] *= MIRROR
         return cls(
             data,
@@ -204,7 +192,7 @@ class Lessons:
             return [np.stack([prepare_frame(p, *at) for p in pictures]) for at in (self.data.size, size)]
 
         for block, (own, teachers) in saved.steps("teacher", len(blocks), rng, read, **parts):
-            policy = policy or BatchedPolicy(teacher.config, teacher.weights).to(device)
+            policy = policy or saved.machine.taking(BatchedPolicy(teacher.config, teacher.weights))
             rows = blocks[block]
             self.frames.append(own)
             seen = policy.features(_in_both_views(teachers, device))
@@ -259,7 +247,9 @@ class Pool:
             own = self._places[chosen] == place
             if own.any():
                 parts.append(lessons.show(self._rows[chosen][own], views[own], new, rng, *shown))
-        return on_device(arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device)
+        return training.on_device(
+            arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device
+        )
 
 
 def lit(batch: Batch) -> Tensor:

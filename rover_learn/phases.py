@@ -170,7 +170,7 @@ class Work(ABC):
             "policy": self.origin.identity,
             "pictures": [(s.episode, s.frame_name, s.row, s.frame_path.stat().st_size) for s in samples],
             "recorded": [zlib.crc32(np.stack([getattr(s, name) for s in samples]).tobytes()) for name in recorded],
-            "at": [self.machine.device.type, self.recipe.seed],
+            "seed": self.recipe.seed,
             "versions": [version(package) for package in VERSIONS],
         }
 

@@ -30,6 +30,7 @@ from rover_learn import training as loop
 from rover_learn.curves import leave_curves
 from rover_learn.phases import VERSIONS, Recipe
 from rover_learn.training import ACTION, GAIN, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Machine, Phase, Resumable
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
@@ -39,7 +40,7 @@ from rover_lib.workshop import act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
+from rover_lib.workshop.checkpoint.files import save_torch, trainer_config, write_lerobot
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module
@@ -88,11 +89,13 @@ class TrainingRecipe(Recipe):
     carry_steps: int = 0
 
     @classmethod
-    def of(cls, size: str, device: str) -> Self:
-        """Return the recipe of params.yml for that size; with cuda's own values, if it has some."""
+    def of(cls, size: str, device: str, steps: int | None = None, batch: int | None = None) -> Self:
+        """Return the recipe of params.yml for that size; with cuda's own values, if it has some. steps: in all."""
         recipes = params()["train"]
         values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
-        return cls.read(f"train: {size}", values | {"at": tuple(values["at"]) if values.get("at") else None})
+        recipe = cls.read(f"train: {size}", values | {"at": tuple(values["at"]) if values.get("at") else None})
+        recipe = recipe if steps is None else recipe.of_few(steps)
+        return replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch) if batch else recipe
 
     def of_few(self, steps: int) -> Self:
         """Return the same recipe with `steps` steps in all, and with fewer frames: they only show that it works."""
@@ -125,9 +128,9 @@ def train(
     size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
     None: the recipe's. machine: None takes the best that there is. say: is told what it trains on, and how that went.
 
-    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/. On one machine's processor
-    the same input gives the same weights, even if training was ended at any moment and started again; a GPU may add in
-    another order. A checkpoint that was made before is taken from the cache.
+    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/, and the same policy as
+    LeRobot's folder, <name>_pretrained_model/. On one machine the same input gives the same weights, even if training
+    was ended at any moment and started again. A checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     out_path = Path(out_path)
@@ -138,19 +141,21 @@ def train(
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if seed < 0:
         raise TrainingError("training needs a seed from 0", found=seed)
-    recipe = TrainingRecipe.of(size, kind)
-    recipe = recipe if steps is None else recipe.of_few(steps)
-    if batch is not None:
-        recipe = replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch)
+    recipes = {each: TrainingRecipe.of(size, each, steps, batch) for each in ("cpu", "cuda")}
+    recipe = recipes[kind]
     p = params()["calibration"]
     recordings = load_recordings(episodes, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
-    made_of = {"size": asdict(SIZES[size]), "recipe": asdict(recipe), "seed": seed, "split": p}
+    made_of = {"size": asdict(SIZES[size]), "seed": seed, "split": p}
     made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
     made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})
     learners = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
     sources = () if size == "full" and steps is None else learners
-    unfinished = cache_root() / f"training-{key_of(made_of, *sources)}"  # another device goes on, if its recipe is this
+    keys = {each: made_of | {"recipe": asdict(made_by)} for each, made_by in recipes.items()}
+    begun = {each: cache_root() / f"training-{key_of(key, *sources)}" for each, key in keys.items()}
+    unfinished = begun.pop(kind)  # which another device goes on with if its recipe is the same, else:
+    if not unfinished.exists() and any(folder.exists() for folder in begun.values()):
+        say(f"begins anew: what {', '.join(begun)} has begun is of another recipe (params.yml)")
 
     def make(folder: Path) -> None:
         known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": kind, "seed": seed}
@@ -161,18 +166,17 @@ def train(
             trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, saved)
             say(f"in {time.monotonic() - began_s:.0f} s, held-out error {trained['best_val_loss']:.4f}")
             leave_curves(folder / "curves", saved.losses, saved.judged)
+            weights = {name.removeprefix("model."): v for name, v in trained["model_state_dict"].items()}
+            config, origin = replace(SIZES[size], rate_hz=rate_hz), {"trained_by": asdict(recipe), "device": kind}
+            write_lerobot(folder / "pretrained_model", config, weights, origin)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
 
-    made = cache_folder("checkpoint", key_of({**made_of, "device": kind}, *sources), make)
+    made = cache_folder("checkpoint", key_of({**keys[kind], "device": kind}, *sources), make)
     shutil.rmtree(unfinished, ignore_errors=True)
-    return _leave(made, out_path)
-
-
-def _leave(made: Path, out_path: Path) -> Path:
-    """Copy a policy out of the cache, after its curves. Those of older programs have none."""
-    if (curves := made / "curves").is_dir():
-        shutil.copytree(curves, out_path.with_name(f"{out_path.stem}_curves"), dirs_exist_ok=True)
+    for folder in (each for each in made.iterdir() if each.is_dir()):  # those of older programs have none
+        with build_folder(out_path.with_name(f"{out_path.stem}_{folder.name}")) as new:
+            shutil.copytree(folder, new, dirs_exist_ok=True)
     with atomic_path(out_path) as temporary:
         shutil.copyfile(made / "best_model.pth", temporary)
     return out_path
@@ -216,14 +220,10 @@ class _Training:
     rng: np.random.Generator
     saved: Resumable
 
-    @property
-    def device(self) -> torch.device:
-        return self.weights.device
-
     def batch(self, count: int) -> Batch:
         """Draw the next batch of `count` frames, each at most once."""
         rows = self.rng.choice(len(self.data), min(count, len(self.data)), replace=False)
-        return loop.batch_of(self.data, rows, self.rng, self.device)
+        return loop.batch_of(self.data, rows, self.rng, self.weights.device)
 
     def loss(self, batch: Batch) -> Tensor:
         """Return the policy's loss; pictures in their light become its input, feature maps are that already."""
@@ -257,18 +257,17 @@ def _train(
         with torch.no_grad():
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
             policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
-        policy.to(device)
+        saved.machine.taking(policy)
         weights, rng = torch.from_numpy(1 / spread).to(device), np.random.default_rng([seed, 77])
         judged = Frames.of(judging, first.image_sizes[0], workers) if recipe.at else judges
         training = _Training(first, policy, data, judged, recipe, weights, rng, saved)
         _train_backbone(training)
         _train_transformer(training)
+        before = min((error for _, error in saved.judged.get("transformer", ())), default=None)
+        optimizer, scheduler = _train_together_or_not(training, "all together", recipe.together_steps, before)
         if recipe.at:
-            _train_together_or_not(training, "all together", recipe.together_steps)
             training = replace(training, data=Frames.of(samples, size.image_sizes[0], workers), judges=judges)
             optimizer, scheduler = _train_together_or_not(training, "at full size", recipe.carry_steps)
-        else:
-            optimizer, scheduler = _train_together_or_not(training, "all together", recipe.together_steps)
     firsts = range(0, len(judges), recipe.batch)
     errors = [loop.driving_error(policy, judges, np.arange(len(judges))[a : a + recipe.batch]) for a in firsts]
     return {
@@ -303,7 +302,7 @@ def _train_backbone(training: _Training) -> None:
     recipe = training.recipe
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = _ChunkFromFeatures(live, training.size).to(training.device).train()
+    model = training.saved.machine.taking(_ChunkFromFeatures(live, training.size)).train()
     training.saved.train(
         Phase("backbone", recipe.backbone_steps, recipe.backbone_rate),
         model,
@@ -342,7 +341,7 @@ def _train_transformer(training: _Training) -> None:
             states[:, 0] *= -1
             chunks[:, :, 0] *= -1
         arrays = {IMAGE: views[step % 2][kept], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
-        return loop.on_device(arrays, training.device)
+        return loop.on_device(arrays, training.weights.device)
 
     policy.model.backbone = loop.Given()
     policy.train()
@@ -355,7 +354,7 @@ def _train_transformer(training: _Training) -> None:
 
 def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> loop.RowFile:
     """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file. chosen: (n,) row numbers."""
-    batch, (size,) = training.recipe.batch, training.size.image_sizes
+    batch, (size,), device = training.recipe.batch, training.size.image_sizes, training.weights.device
     maps = loop.RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
 
     def read(step: int) -> np.ndarray:
@@ -364,14 +363,18 @@ def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, 
 
     for _, images in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, read, maps=maps):
         with torch.no_grad():
-            maps.append(backbone(loop.normalised(torch.from_numpy(images).to(training.device)))["feature_map"].cpu())
+            maps.append(backbone(loop.normalised(torch.from_numpy(images).to(device)))["feature_map"].cpu())
     return maps
 
 
-def _train_together_or_not(training: _Training, name: str, steps: int) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: all parameters at a tenth of the rate; the result stays only if it is no worse than what was."""
+def _train_together_or_not(
+    training: _Training, name: str, steps: int, before: float | None = None
+) -> tuple[torch.optim.Optimizer, Any]:
+    """Phase three: all parameters at a tenth of the rate; stays if it is no worse than what was, `before` if known."""
     policy, saved = training.policy, training.saved
-    apart, before = {k: v.clone() for k, v in policy.state_dict().items()}, training.judge()
+    apart = {k: v.clone() for k, v in policy.state_dict().items()}
+    before = training.judge() if before is None else before
+    policy.train()
     made = saved.train(
         Phase(name, steps, training.recipe.transformer_rate / 10),
         policy,

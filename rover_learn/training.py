@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from filelock import Timeout
 from torch import Tensor, nn
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
 T = TypeVar("T")
+M = TypeVar("M", bound=nn.Module)
 Batch = dict[str, Tensor]
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
 GAIN = "gain"  # what a batch's pictures are multiplied by
@@ -68,13 +70,21 @@ class Machine:
             return f"{self.device}, {torch.cuda.get_device_name(self.device)}"
         return f"{self.device}, {torch.get_num_threads()} threads" + ("" if torch.cuda.is_available() else ", no GPU")
 
+    def taking(self, module: M) -> M:
+        """Move a module to the device. On a GPU its pooling becomes a RepeatablePool."""
+        for part in module.modules() if self.device.type == "cuda" else ():
+            if isinstance(getattr(part, "maxpool", None), nn.MaxPool2d):
+                part.maxpool = RepeatablePool()
+        return module.to(self.device)
+
     @contextmanager
     def computing(self) -> Iterator[None]:
         """Compute as repeatably as a GPU can. Raises TrainingError if its memory is full, or if it is lost."""
         repeatable = torch.are_deterministic_algorithms_enabled()
         if self.device.type == "cuda":
             os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it starts
-            torch.use_deterministic_algorithms(True, warn_only=True)  # pooling has no repeatable gradient
+            torch.use_deterministic_algorithms(True, warn_only=True)
+            torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined] # slow
         try:
             yield
         except RuntimeError as error:
@@ -211,6 +221,7 @@ class Best:
         vars(self).update(state)
 
 
+@dataclass
 class Resumable:
     """A training in phases, in a folder, that resumes to the last bit after a power cut at any moment.
 
@@ -218,17 +229,13 @@ class Resumable:
     each judgement, by phase.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        machine: Machine,
-        progress: Progress = silent,
-        every_s: float = SAVE_EVERY_S,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self.folder, self.machine, self.progress, self.every_s, self.clock = folder, machine, progress, every_s, clock
-        self.losses: dict[str, list[float]] = defaultdict(list)
-        self.judged: dict[str, list[list[float]]] = {}
+    folder: Path
+    machine: Machine
+    progress: Progress = silent
+    every_s: float = SAVE_EVERY_S
+    clock: Callable[[], float] = time.monotonic
+    losses: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    judged: dict[str, list[list[float]]] = field(default_factory=dict)
 
     def __enter__(self) -> "Resumable":
         """Make the folder and lock it. Raises TrainingError if another process trains in it."""
@@ -294,14 +301,11 @@ class Resumable:
         batch: as of `steps`. loss: of such a batch. best: if given, the module ends with the weights that it judged
         best, and learns no longer once they are not beaten.
         """
-        optimizer, scheduler = optimiser(phase, module.parameters())
+        optimizer, scheduler = optimiser(phase, list(module.parameters()))
         parts: dict[str, Any] = {"module": module, "optimizer": optimizer, "scheduler": scheduler}
         parts |= {"best": best} if best else {}
         patience = max(PATIENCE, PATIENT_SHARE * phase.steps / JUDGE_EVERY)
-
-        def by_heart() -> bool:
-            return best is not None and best.stale >= patience
-
+        by_heart = (lambda: best.stale >= patience) if best else (lambda: False)
         for step, given in self.steps(phase.name, phase.steps, rng, batch, by_heart, **parts):
             with torch.autocast(self.machine.device.type, torch.bfloat16, enabled=self.machine.amp):
                 value = loss(given)
@@ -420,10 +424,11 @@ def policy_loss(policy: "ACTPolicy", batch: Batch, loss_weights: Tensor) -> Tens
 
 
 def optimiser(
-    phase: Phase, parameters: Iterable[nn.Parameter]
+    phase: Phase, parameters: list[nn.Parameter]
 ) -> tuple[torch.optim.AdamW, torch.optim.lr_scheduler.LRScheduler]:
     """Make AdamW with a rate that warms up and then falls to 1/100 along a cosine."""
-    optimizer = torch.optim.AdamW(parameters, lr=phase.rate, betas=BETAS, weight_decay=WEIGHT_DECAY)
+    fused = parameters[0].is_cuda or None  # else a GPU waits for hundreds of small kernels
+    optimizer = torch.optim.AdamW(parameters, lr=phase.rate, betas=BETAS, weight_decay=WEIGHT_DECAY, fused=fused)
     steps = max(phase.steps, 1)
     warmup = phase.warmup or max(1, steps // 20)
 
@@ -444,6 +449,13 @@ def descend(loss: Tensor, module: nn.Module, optimizer: torch.optim.Optimizer, s
     if not math.isfinite(value):
         raise TrainingError("training went wrong: the loss is not finite", found=value, remedy="try another seed")
     return value
+
+
+class RepeatablePool(nn.Module):
+    """ResNet's pooling, 3x3 at every second place. CUDA's own adds its gradient up in any order, which changes bits."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.pad(x, (1, 1, 1, 1), value=-math.inf).unfold(2, 3, 2).amax(-1).unfold(3, 3, 2).amax(-1)
 
 
 class Given(nn.Module):

@@ -1,6 +1,7 @@
 """`python -m lab gpu` measures a training by phase; tried on the CPU, by a tiny recipe, through the same code."""
 
 import json
+import time
 
 import pytest
 from click.testing import CliRunner
@@ -17,15 +18,25 @@ TINY += "together_batch: 2, samples: 40, feature_samples: 12, judged: 8}}"
 def test_each_phase_says_what_it_takes_and_the_weights_repeat(tmp_path, set_params, monkeypatch):
     set_params(TINY)
     monkeypatch.setattr(gpu, "REPEATED_STEPS", 6)
-    monkeypatch.setattr(gpu, "INTERRUPTED_AT", 3)
+    monkeypatch.setattr(gpu, "STOPPED_AFTER", 1)
     out, episodes = tmp_path / "gpu.json", record_drives(tmp_path / "episodes")
     result = CliRunner().invoke(main, ["gpu", str(out), str(episodes), "--device", "cpu", "--size", "small"])
     made = json.loads(out.read_text())
     assert result.exit_code == (1 if made["wrong"] else 0), result.output
-    assert made["tensors_that_differ"] == 0 and made["device"].startswith("cpu")
-    phases = made["phases"]
+    weights, took = made["rows"]["weights"], made["rows"]["phases"]
+    phases = took["phases"]
+    assert weights["differ"] == 0 and {"backbone", "transformer"} <= set(weights["resumed_at"])
     assert [phases[name]["steps"] for name in ("backbone", "transformer", "all together")] == [2, 3, 2]
-    assert all(0 <= row["data_s"] <= row["s"] <= made["all_s"] for row in phases.values())
+    assert all(0 <= row["data_s"] <= row["s"] <= took["all_s"] for row in phases.values())
+    assert 0 < took["before_s"] < took["all_s"] and made["device"].startswith("cpu")
+
+
+def test_a_row_that_takes_too_long_loses_no_other(tmp_path, monkeypatch):
+    rows = {"endless": (1, lambda *_: time.sleep(60)), "last": (60, lambda _run, _machine, row: row.update(x=1) or [])}
+    monkeypatch.setattr(gpu, "ROWS", rows)
+    (wrong,) = gpu.measure(tmp_path / "gpu.json", "cpu", "small", tmp_path)
+    assert wrong.startswith("endless: ended after 1 of 1 s")
+    assert json.loads((tmp_path / "gpu.json").read_text())["rows"]["last"]["x"] == 1
 
 
 def test_without_a_gpu_it_is_one_sentence(tmp_path, monkeypatch):

@@ -1,7 +1,10 @@
 """Our recordings, exported as a LeRobotDataset, are read back equal by LeRobot and by us."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +13,7 @@ from command import rover
 from recorded import record_there_and_back
 from test_episodes import burst, edit, load, record, redrawn
 
-from rover_exchange.export_dataset import export_dataset
+from rover_exchange.export_dataset import export_dataset, lerobot_video
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -62,6 +65,15 @@ def test_lerobot_reads_it_back_edits_it_and_so_do_we(recorded, tmp_path):
     assert {s.driver for s in again.samples} == {"human"} and again.layout.rate_hz == 30
     delete_episodes(theirs, [1], tmp_path / "less", "local/less")
     check_equal(load(tmp_path / "less").samples, [s for s in original.samples if s.episode != original.episodes[1].id])
+
+
+def test_the_command_for_videos_that_is_printed_makes_them(recorded, tmp_path):
+    export_dataset(recorded, tmp_path / "out")
+    program, *words = lerobot_video(tmp_path / "out").split()
+    offline = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf")}
+    subprocess.run([Path(sys.executable).with_name(program), *words], check=True, capture_output=True, env=offline)
+    made = theirs_of(tmp_path / "out-video")
+    assert made.num_frames == 60 and made.meta.video_keys == ["observation.images.cam_front"]
 
 
 def test_repairs_and_omissions_are_reported(recorded, tmp_path):

@@ -184,6 +184,7 @@ def test_chance_is_the_share_of_all_signs():
     [
         ([0.1, -0.1] * 4, [-1.0] * 8, True),
         ([0.1, -0.1] * 4, [-1.0] * 5, None),  # too few
+        ([0.5] * 6, [-1.0], False),  # enough that became worse
         ([0.1, -0.1] * 4, [-1.0, 1.0] * 4, None),  # may be chance
         ([0.5] * 8, [-1.0] * 8, False),
         ([0.1, -0.1] * 4, [1.0] * 8, False),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from interrupted import interrupt
+from lerobot.policies.act.modeling_act import ACTPolicy
 from recorded import record_drives
 
 from rover_learn import train as train_module
@@ -86,12 +87,33 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     curves = json.loads((tmp_path / "killed_curves/curves.json").read_text())
     assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [2, 3, 2]
     assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
+    lerobots = ACTPolicy.from_pretrained(tmp_path / "killed_pretrained_model").state_dict()
+    assert all(torch.equal(v, lerobots[k]) for k, v in whole["model_state_dict"].items())
     with monkeypatch.context() as patch:  # now it is taken from the cache
         patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
         assert train(drives, tmp_path / "again.pth", machine=CPU).read_bytes() == out.read_bytes()
     other = torch.load(train(drives, tmp_path / "other.pth", seed=1, machine=CPU), weights_only=False)
     name = "model.action_head.weight"
     assert not torch.equal(other["model_state_dict"][name], whole["model_state_dict"][name])
+
+
+@pytest.mark.parametrize(("differs", "anew"), [("", False), (", small_cuda: {backbone_steps: 3}", True)])
+def test_what_a_lost_gpu_began_goes_on_or_is_said_to_begin_anew(
+    drives, tmp_path, monkeypatch, set_params, differs, anew
+):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    set_params(CARRIED[:-1] + differs + "}")
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
+    monkeypatch.setattr(train_module, "_train", interrupted)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a GPU")
+    said = []
+    for kind in ("cuda", "cpu"):
+        with pytest.raises(KeyboardInterrupt):
+            train(drives, tmp_path / "policy.pth", machine=Machine(torch.device(kind)), say=said.append)
+    assert len(list(tmp_path.glob("training-*"))) == 1 + anew
+    assert ["begins anew" in words for words in said] == [False, False, True][: 2 + anew]
 
 
 @pytest.mark.parametrize("wrong", [{"size": "huge"}, {"device": "tpu"}, {"steps": 0}, {"seed": -1}, {"episodes": "."}])

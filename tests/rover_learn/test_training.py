@@ -10,7 +10,7 @@ from policies import normalise
 from torch import nn
 
 from rover_learn import training
-from rover_learn.training import Best, Machine, Phase, Resumable, RowFile, normalised
+from rover_learn.training import Best, Machine, Phase, RepeatablePool, Resumable, RowFile, normalised
 from rover_lib.onboard.errors import TrainingError
 
 STEPS, CPU = 6, Machine(torch.device("cpu"))
@@ -67,6 +67,32 @@ def test_ended_in_any_step_it_gives_the_same_to_the_last_bit(tmp_path, whole, ev
         losses, weights, after = train(tmp_path / str(kill_at), **options)
         assert torch.equal(weights, whole[1])
         assert (losses, after) == (whole[0], whole[2])
+
+
+def test_what_two_gpus_saved_goes_on_without_one(tmp_path, whole, monkeypatch):
+    """Their random numbers and their fused optimiser are in what was saved."""
+
+    def save(file, content):
+        if "optimizer" in content["parts"]:
+            content["parts"]["optimizer"]["param_groups"][0]["fused"] = True
+        torch.save(content | {"cuda": [torch.get_rng_state()] * 2}, file)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(training, "save_torch", save)
+        patch.setattr("torch.serialization.location_tag", lambda _: "cuda:1")
+        train(tmp_path, kill_at=2 * STEPS)
+    losses, weights, _ = train(tmp_path)
+    assert np.allclose(losses, whole[0], rtol=1e-4) and torch.allclose(weights, whole[1], rtol=1e-4)
+
+
+def test_a_repeatable_pool_is_resnets():
+    results = []
+    for pool in (RepeatablePool(), nn.MaxPool2d(3, 2, 1)):
+        pictures = torch.linspace(-1, 1, 252).sin().reshape(1, 2, 9, 14).requires_grad_()
+        pooled = pool(pictures)
+        pooled.square().sum().backward()
+        results.append((pooled, pictures.grad))
+    assert torch.equal(results[0][0], results[1][0]) and torch.allclose(results[0][1], results[1][1], atol=1e-6)
 
 
 def test_two_processes_do_not_train_the_same(tmp_path):

@@ -18,6 +18,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
@@ -263,14 +264,23 @@ def check_pictures(
     cache = cache_root() / f"pictures-{key_of({'in': home})}.json"
     with suppress(OSError, ValueError):  # none yet, or half of one
         known = dict(read_json(cache))
-    for name in names:
-        path, size = folder / inside / name.replace("\\", "/"), None
+
+    def check(name: str, path: Path) -> tuple[str, Sequence[int]] | None:
+        if not os.path.realpath(path).startswith(f"{home}{os.sep}"):
+            return None
+        there = path.stat()
+        # The time of any change: a copy may bring along the time of its content.
+        key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
+        return key, known.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
+
+    paths = [folder / inside / name.replace("\\", "/") for name in names]
+    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:  # decoding releases the interpreter's lock
+        checks = [pool.submit(check, *each) for each in zip(names, paths, strict=True)]
+    for name, path, checked in zip(names, paths, checks, strict=True):
+        size = None
         try:
-            if os.path.realpath(path).startswith(f"{home}{os.sep}"):
-                there = path.stat()
-                # The time of any change: a copy may bring along the time of its content.
-                key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
-                height, width = whole[key] = known.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
+            if given := checked.result():
+                height, width = whole[given[0]] = given[1]
                 size = height, width
             else:
                 faults.add(listing, "path_leaves_folder", f"{quote(name)} is outside of the episode")

@@ -104,7 +104,7 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
         return Sides(())
     episodes = pick_evenly(recordings.episodes, most or len(recordings.episodes))
     # OpenCV releases the interpreter's lock, so threads help.
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
         turnings = tuple(progress(pool.map(measure_turning, episodes), desc="which way it steers", total=len(episodes)))
     said = {s.car.positive for e in episodes for s in e.samples}
     # A LeRobotDataset, which states its rate, has no car's file.
