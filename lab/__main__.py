@@ -87,7 +87,7 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], car_f
 def measure_gpu(ctx: click.Context, output: Path, episodes: Path | None, device: str, size: str) -> None:
     """Train on a GPU, on EPISODES or on 128 drives recorded for it, and write what it takes to OUTPUT, as JSON.
 
-    Ten minutes at most. The exit code is 1 if it takes longer than it should, or an interruption changes the weights.
+    It takes some ten minutes. The exit code is 1 if it takes too long, or an interruption changes the weights.
     lab/gpu_proof.sh trains for longer, and judges what comes of that.
     """
     from lab.gpu import measure

@@ -40,7 +40,8 @@ from rover_lib.workshop import act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import save_torch, trainer_config, write_lerobot
+from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
+from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module

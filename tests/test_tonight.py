@@ -22,7 +22,7 @@ from executed import run_cells
 
 from balloon_world.car import CameraFeed
 from lab.arduino.emulator import EmulatedArduino
-from lab.driving.policy import PLAIN, pictures
+from lab.driving.policy import pictures
 from rover_lib.cli import main as rover
 from rover_lib.onboard import cli
 from rover_lib.onboard.car import car as car_module
@@ -148,7 +148,7 @@ def test_the_page_leads_to_a_first_drive(demo_run, tmp_path, monkeypatch):
     monkeypatch.delenv(car_module.FILE_VARIABLE, raising=False)
     with EmulatedArduino(every_pulse=False, car=CRAWLER) as board:
         evening = Evening(tmp_path, board, monkeypatch)
-        with CameraFeed(evening.camera, *pictures(PLAIN, (180, 320))):
+        with CameraFeed(evening.camera, *pictures((180, 320))):
             for machine, line in lines():
                 evening.type(machine, line)
     assert evening.typed == ["calibrate", "doctor", "doctor", "record", "train", "run", "log"]

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lab import PARAMS
 from lab.a76.core import A76, FOR_GUEST, Core, Emulation, emulate_artifact, fetch_wheels, prepare
 from lab.a76.pi5 import DRIVING, predict_ms
 from lab.a76.report import LABEL, alone_of, gates
 from lab.a76.symbols import GuestFunctions, by_kernel
-from lab.params import lab_params
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, ONNXRUNTIME, read_manifest
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.policy.load import load_policy
@@ -148,7 +148,7 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     judged = _judge(artifacts, chosen, counts, samples, again, progress)
     rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
-    metrics["gates"] = gates(metrics, lab_params()["arm"]["gates"])
+    metrics["gates"] = gates(metrics, PARAMS["arm"]["gates"])
     given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
     given["qemu"] = run("qemu-aarch64", "--version", error=RoverError).splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}

@@ -43,7 +43,8 @@ def run_faults(output: Path | None, only: Collection[str], car: Car, echo: Calla
     in_stories = (run_row(fault, car) for fault in rows if fault.name in chosen)
     for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in chosen])):
         done.append(row)
-        echo(row_text(row))
+        ms = row.get("takeover_ms", row["stopped_after_ms"])
+        echo(f"{row['fault']:<35} {row['expected']:<10} {row['found']:<16} {'' if ms is None else f'{ms:.0f} ms'}")
     summary = summary_of(done) | {"seconds": round(time.monotonic() - begin, 1)}
     wrong = [f"{row['fault']}: {sentence}" for row in done for sentence in row["wrong"]]
     metrics = {"faults": done, "summary": summary, "wrong": wrong}
@@ -64,12 +65,3 @@ def summary_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "takeover_ms": max(takeovers, default=None),
         "repeated": sum(r["attempts"] > 1 for r in rows),
     }
-
-
-def row_text(row: dict[str, Any]) -> str:
-    """Return a line for people: fault, expected, found, after how many milliseconds, log line."""
-    ms = row.get("takeover_ms", row["stopped_after_ms"])
-    ms = "" if ms is None else f"{ms:.0f} ms"
-    line = " ".join((row["log_line"] or "no line").split())
-    again = f" ({row['attempts']} attempts)" if row["attempts"] > 1 else ""
-    return f"{row['fault']:<35} {row['expected']:<10} {row['found']:<16} {ms:>8}  {line[-70:]}{again}"

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from balloon_world.simulated_arduino import REST_US, PinEvent
-from lab.params import lab_params
+from lab import PARAMS
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.params import params
@@ -22,7 +22,7 @@ STILL_VALID_S = 0.2  # the Arduino holds a command for 150 ms, and a steering pu
 BEFORE_S = 0.2  # how long the car must have been driving before a fault
 LAST_S = 0.2  # how long at the end there must be pulses
 DEFAULT = Car()
-GATES = lab_params()["faults"]
+GATES = PARAMS["faults"]
 
 
 class Command(NamedTuple):

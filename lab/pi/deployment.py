@@ -25,7 +25,7 @@ from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import most_throttle_us
-from lab.driving.policy import PLAIN, make_artifact, pictures
+from lab.driving.policy import make_artifact, pictures
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import USER, debian_image
 from lab.pi.emulation import emulation, interruptible, require
@@ -68,7 +68,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
                 debian_image()
             with (
                 Container(ROVER) as pi,
-                CameraFeed(pi.bench / "camera", *pictures(PLAIN, (180, 320)), rate_hz=2 * HZ),
+                CameraFeed(pi.bench / "camera", *pictures((180, 320)), rate_hz=2 * HZ),
                 EmulatedArduino(every_pulse=False, transmitter=REST_US, ready=True, nice=NICE) as board,
             ):
                 (pi.bench / "camera").chmod(0o666)

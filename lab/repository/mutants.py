@@ -4,8 +4,7 @@ The lines are in planted/*.yml, a file for each subject. A row has a `name`, a `
 once, the `bad` text that takes its place, and the `test` file whose tests that match `words` (pytest's -k) must fail;
 with `random: true`, random drives must notice it too. To add lines of another subject, add a file.
 
-A line that can be broken unnoticed is a line that no test holds. Where an invariant of the random drives is about the
-line, they must notice it too, within RANDOM_DRIVES.
+A line that can be broken unnoticed is a line that no test holds.
 """
 
 import os

@@ -104,7 +104,7 @@ def test_a_page_shows_the_flight_log_and_its_button_ends_the_drive(demo_run, tmp
 def test_a_fault_is_exit_code_3_and_leaves_its_report(artifact, tmp_path):
     """A camera that is unplugged, the car being another world's."""
     folder = fresh(tmp_path)
-    with VirtualCar() as car, CameraFeed(folder / "camera", *pictures(0)) as feed:
+    with VirtualCar() as car, CameraFeed(folder / "camera", *pictures()) as feed:
         options = ["--camera", folder / "camera", "--port", car.port, "--log", folder / "l", "--json", folder / "j"]
         with subprocess.Popen([*ROVER, artifact, *map(str, options)], stderr=subprocess.PIPE, text=True) as process:
             for line in process.stderr:

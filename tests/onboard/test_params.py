@@ -2,7 +2,7 @@
 
 import pytest
 
-from lab.params import lab_params
+from lab import PARAMS
 from rover_lib.onboard import params as p
 from rover_lib.onboard.errors import ParamsError
 
@@ -28,6 +28,6 @@ def test_what_is_no_params_file(tmp_path, monkeypatch, text):
 
 
 def test_each_parameter_stands_in_one_file():
-    user, rover, lab = (p.read_params(p.PLACES[0]), p.read_params(p.DEFAULTS), lab_params())
+    user, rover, lab = (p.read_params(p.PLACES[0]), p.read_params(p.DEFAULTS), PARAMS)
     assert set(user) & set(rover) == {"gates"} and not set(user["gates"]) & set(rover["gates"])
     assert not set(lab) & (set(user) | set(rover))

@@ -9,13 +9,13 @@ import pytest
 
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import StandIn
-from lab.driving.policy import PLAIN, make_artifact, pictures
+from lab.driving.policy import make_artifact, pictures
 
 
 @pytest.fixture(scope="session")
 def noise():
     """Pictures of a living camera."""
-    return pictures(PLAIN)
+    return pictures()
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,7 @@ from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
 from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import STOPPED, Observation, judge, most_throttle_us
-from lab.driving.policy import PLAIN, pictures
+from lab.driving.policy import pictures
 from lerobot_robot_rover.line import ENDING
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
@@ -145,7 +145,7 @@ def test_lerobots_own_parser_takes_what_the_pages_say(monkeypatch):
 def eyes(tmp_path_factory):
     """A folder with a camera in it."""
     folder = tmp_path_factory.mktemp("lerobot")
-    with CameraFeed(folder / "camera", *pictures(PLAIN)):
+    with CameraFeed(folder / "camera", *pictures()):
         yield folder
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from executed import shown
 
+from lab import PARAMS
 from lab.a76 import count as counting
 from lab.a76 import report
-from lab.params import lab_params
 from rover_lib.workshop.run import run as runs
 
 
@@ -26,7 +26,7 @@ def artifact(**changed):
 
 
 def gates(**artifacts):
-    rows = report.gates({"artifacts": artifacts}, lab_params()["arm"]["gates"])
+    rows = report.gates({"artifacts": artifacts}, PARAMS["arm"]["gates"])
     return {row["gate"]: row["passed"] for row in rows}
 
 
