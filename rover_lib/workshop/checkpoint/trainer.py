@@ -41,9 +41,13 @@ KNOWN_CONFIG = {*trainer_config(ActConfig()), "learning_rate", "batch_size", "da
 KNOWN_CONFIG |= {"rate_hz", "use_vae", "origin"}
 OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
 # Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
-BESIDE = re.compile(r"(.*_)?(config|cfg|hparams|args)\.(json|ya?ml)")
+BESIDE = re.compile(
+    r"([^.].*_)?(config|cfg|hparams|args|params|(hyper)?parameters|settings|metadata)\.(json|ya?ml)", re.I
+)
 STATISTICS = re.compile(
-    r"(.*_)?(stats|norm|normali[sz]er|normali[sz]ation|scaler)\.(pth?|json|ya?ml|pkl|np[yz]|safetensors)"
+    r"([^.].*_)?(stats|statistics|mean_std|norm|normali[sz]er|normali[sz]ation|scaler)"
+    r"\.(pth?|json|ya?ml|pkl|joblib|np[yz]|safetensors)",
+    re.I,
 )
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 
@@ -65,6 +69,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
     with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
     facts.default("size", (raw.get("image_height"), raw.get("image_width")), "config.image_height")
+    facts.default("chunk", raw.get("chunk_size"), "config.chunk_size")
     with as_checkpoint_error(path):
         facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
         facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
@@ -104,6 +109,9 @@ def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor], facts: 
         raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
     size = whole("image_height"), whole("image_width")
     whole("rate_hz", default=30)
+    actions = facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER)
+    if (states := facts.value("state")) not in (None, actions):
+        raise facts.refusal(facts.source("state"), states, f"and its actions are {quote_all(actions)}")
     return ActConfig(
         cameras=(TRAINER_CAMERA,),
         image_sizes=(facts.default("size", size, "config.image_height"),),
@@ -111,10 +119,10 @@ def _config(path: Path, raw: dict[str, Any], weights: dict[str, Tensor], facts: 
         rate_hz=facts.default("rate", RATE_HZ, OF_TRAINER),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
         state_names=name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
-        action_names=facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER),
+        action_names=actions,
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
-        chunk=facts.default("chunk", whole("chunk_size"), "config.chunk_size"),
+        chunk=whole("chunk_size"),
         dim=whole("hidden_size"),
         heads=whole("n_heads"),
         feedforward=whole("feedforward_dim"),

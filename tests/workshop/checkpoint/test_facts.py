@@ -18,7 +18,6 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.samples import Layout, Source
 from rover_lib.workshop.run.session import load
 
-ORDER = {"action_names": ["throttle", "steering"]}
 TURNED = {"mean": torch.tensor([0.25, 0.3]), "std": torch.tensor([0.05, 0.4])}
 
 
@@ -54,6 +53,14 @@ def says_more(policy, path, config=(), **more):
         ({"config": {"fps": 15, "control_hz": 20}}, "deny each other on its rate"),
         ({"config": {"rate_hz": 20, "fps": 30}}, "deny each other on its rate, found '20.0' and '30.0'"),
         ({"config": {"label_names": ["gas", "steer"]}}, "are they steering and throttle?"),
+        ({"mean": [0.0, 0.4]}, "units"),
+        ({"config": {"invert_steering": True}}, "nobody here knows what that does to its numbers"),
+        ({"config": {"camera_names": ["front", "rear"], "action_horizon": 64}}, "nobody here knows"),
+        ({"config": {"use_imagenet_stats": False}}, "always done"),
+        ({"config": {"output_activation": "tanh"}}, "what its network computes"),
+        ({"config": {"state_names": ["speed", "yaw_rate"]}}, "the state is the last action"),
+        ({"config": {"state_names": ["throttle", "steering"]}}, "its actions are steering, throttle"),
+        ({"ema_state_dict": {str(i): torch.zeros(1) for i in range(65)}}, "the weights that should drive"),
     ],
 )
 def test_what_may_change_actions_is_refused_and_the_option_decides(tiny_policy, tmp_path, more, says):
@@ -61,19 +68,22 @@ def test_what_may_change_actions_is_refused_and_the_option_decides(tiny_policy, 
 
 
 def test_files_beside_a_checkpoint_are_asked_about_or_read(tiny_policy, tmp_path):
-    path, stats = says_more(tiny_policy, tmp_path / "m.pth"), tmp_path / "dataset_stats.pt"
-    stats.touch()
-    assert "normalised" in remedied(path)
-    stats.unlink()
-    (tmp_path / "config.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
+    path = says_more(tiny_policy, tmp_path / "m.pth")
+    for name in ("dataset_stats.pt", "Statistics.json", "action_scaler.joblib"):
+        (tmp_path / name).touch()
+        assert "normalised" in remedied(path)
+        (tmp_path / name).rename(tmp_path / f"._{name}")  # as a Mac leaves it
+    (tmp_path / "._config.json").write_bytes(b"\0\5\26\7\xff")
+    (tmp_path / "Params.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
     found = load_checkpoint(path)
-    assert found.report["known"]["rate"] == "15 steps a second (config.yaml:fps)" and found.identity != found.sha256
+    assert found.report["known"]["rate"] == "15 steps a second (Params.yaml:fps)" and found.identity != found.sha256
 
 
 def test_a_rate_and_an_order_are_used_and_other_keys_are_named(tiny, tiny_policy, tmp_path):
     said = {"fps": 15, "input_size": [3, 72, 128], "crop_top": 0, "random_flip_prob": 0.5, "image_channels": 3}
+    said |= {"action_dim": 2, "use_state": True, "camera_names": ["front"], "output_order": "throttle, steering"}
     more = {"normalize_images": True, "image_mean": [0.485, 0.456, 0.406], "history": {"throttle_max": [1]}}
-    found = load_checkpoint(says_more(tiny_policy, tmp_path / "m.pth", config=said | ORDER, **more))
+    found = load_checkpoint(says_more(tiny_policy, tmp_path / "m.pth", config=said, **more))
     (note,) = found.report["notes"]
     assert found.config.rate_hz == 15 and "config.image_channels" in note and found.identity == found.sha256
     turned = found.recorded_as(Layout())
@@ -142,7 +152,8 @@ def test_a_forks_keys_are_asked_about(lerobots):
     say = remedied(lerobots, act=lambda path, said: load_checkpoint(path, said=said).recorded_as(Layout(rate_hz=20.0)))
     assert "nobody here knows" in say
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=[48, 64]))
-    assert "its pictures are 128x72" in remedied(lerobots)
+    assert "its pictures are 128x72: say --facts size=WxH" in remedied(lerobots)
+    assert load_checkpoint(lerobots, said="size=64x48").config.image_sizes == ((48, 64),)
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=None))
     weights, key = load_file(lerobots / "model.safetensors"), "model.backbone.conv1.weight"
     weights[key] = torch.cat([weights[key], weights[key][:, :2]], 1)
