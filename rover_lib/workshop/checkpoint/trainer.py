@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
+from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import plain, read_plain
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import imagenet
@@ -50,6 +51,14 @@ STATISTICS = re.compile(
     re.I,
 )
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
+
+UNPACK = "unpack it, or give the file that the training saved"
+OTHERS = (  # how other files begin, what they are, and what to do
+    (rb"$", "an empty file", COPY_AGAIN),
+    (rb"\s*<", "a web page", "download the file itself"),
+    (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
+    (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
+)
 
 
 def read_trainer(path: Path, facts: Facts) -> Contents:
@@ -140,8 +149,16 @@ def _numpy_scalars() -> list[Any]:
 
 
 def _read_pickle(path: Path) -> Any:
+    refuse_pointer(path, CheckpointError)
+    head = read_head(path)
+    for begins, kind, remedy in OTHERS:
+        if re.match(begins, head, re.S):
+            raise CheckpointError(f"{path}: {kind}, not a checkpoint of a training", remedy=remedy)
     try:
         with zipfile.ZipFile(path) as z:
+            if not any(name.endswith("data.pkl") for name in z.namelist()) or any("/code/" in n for n in z.namelist()):
+                what = f"{path}: an archive or a TorchScript program, not a checkpoint of a training"
+                raise CheckpointError(what, found=quote_all(z.namelist()[:3]), remedy=UNPACK)
             # torch.load accepts overwritten weight bytes; the zip's CRC does not. torch compresses nothing.
             stored = all(e.compress_type == zipfile.ZIP_STORED for e in z.infolist())
             damaged = z.testzip() if stored else "compressed entries"
@@ -159,5 +176,5 @@ def _read_pickle(path: Path) -> Any:
         # torch puts advice before it, to read it unsafely
         reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
         what = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
-        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if isinstance(e, zipfile.BadZipFile) else ""
+        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if head.startswith(b"\x80") else ""
         raise CheckpointError(what, remedy=COPY_AGAIN + older) from None
