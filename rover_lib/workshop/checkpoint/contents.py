@@ -1,5 +1,6 @@
 """What both formats of a checkpoint hold: named weights, checked against what LeRobot builds of the config."""
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,8 @@ MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
+# Names that torch.compile, DataParallel and trainers put around a policy's own, which change nothing.
+WRAPPERS = r"^(module\.|policy\.)+|_orig_mod\."
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 
 
@@ -34,6 +37,10 @@ def name_weights(path: Path, state: dict[Any, Any]) -> dict[str, Tensor]:
     """
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
     state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
+    if all(isinstance(k, str) for k in state):
+        state = {re.sub(WRAPPERS, "", k): v for k, v in state.items()}
+        if "action_head.weight" in state:  # those of the network, without the policy around it
+            state = {f"model.{k}": v for k, v in state.items()}
     if odd := [k for k, v in state.items() if not isinstance(k, str) or not _is_weight(v)]:
         what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
         raise CheckpointError(what, remedy="save policy.state_dict() as it was trained")
@@ -82,7 +89,8 @@ def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
     except CheckpointError:
         raise
     except Exception as e:  # each library raises types of its own
-        reason = printable(" ".join(f"{type(e).__name__}: {e}".split())[:200])
+        said = e.__cause__ or e  # draccus wraps what a config's own check says
+        reason = printable(" ".join(f"{type(said).__name__}: {said}".split())[:200])
         raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None
 
 

@@ -205,6 +205,9 @@ def in_step(change):
 def test_refuses_other_lerobot_policies(copied, change, says):
     edit(copied / "config.json", change)
     assert says in refused(copied)
+    if "write" in says:
+        edit(copied / "config.json", lambda c: c.update(type="act"))
+        load_checkpoint(copied)
 
 
 def test_refuses_damaged_and_divided_folders(copied):

@@ -162,6 +162,27 @@ def test_a_forks_keys_are_asked_about(lerobots):
         load_checkpoint(lerobots)
 
 
+def test_a_policy_in_other_programs_wrappers_is_the_same(lerobots):
+    right, file = load_checkpoint(lerobots).weights, lerobots / "model.safetensors"
+    for wrapped in ("module.model.", "model._orig_mod.", ""):
+        save_file({wrapped + name: weight for name, weight in right.items()}, file)
+        found = load_checkpoint(lerobots).weights
+        assert all(torch.equal(found[name], weight) for name, weight in right.items())
+
+
+def test_processors_and_adapters_that_change_actions_are_refused(lerobots):
+    unused = {"registry_name": "relative_actions_processor", "config": {"enabled": False}}
+    edit(lerobots / "policy_preprocessor.json", lambda c: c["steps"].append(unused))
+    file, adapter = next(lerobots.glob("policy_post*.safetensors")), lerobots / "adapter_config.json"
+    save_file(load_file(file) | {"action.std": torch.tensor([9.0, 9.0])}, file)
+    assert "deny each other on its normalisation of actions" in remedied(lerobots)
+    with pytest.raises(CheckpointError, match="of other units than a rover's"):
+        load_checkpoint(lerobots, said="ignore=policy_preprocessor.json").recorded_as(Layout(("it",), rate_hz=20.0))
+    adapter.touch()
+    with pytest.raises(CheckpointError, match=r"merge_and_unload.* and remove its files$"):
+        load_checkpoint(lerobots)
+
+
 @pytest.mark.parametrize("inside", [False, True])
 def test_a_config_of_2024_is_read(lerobots, inside):
     """With its statistics among the weights, or in LeRobot's processors."""
@@ -174,14 +195,16 @@ def test_a_config_of_2024_is_read(lerobots, inside):
             c |= {f"{part}_shapes": shapes, f"{part}_normalization_modes": dict.fromkeys(shapes, "mean_std")}
 
     edit(lerobots / "config.json", in_2024)
-    if inside:
+    if inside:  # beside processors they are refused
         weights = load_file(lerobots / "model.safetensors")
         for name, value in load_file(next(lerobots.glob("policy_pre*.safetensors"))).items():
             key, _, stat = name.rpartition(".")
             part = "unnormalize_outputs" if key == "action" else "normalize_inputs"
             weights[f"{part}.buffer_{key.replace('.', '_')}.{stat}"] = value.clone()
         save_file(weights, lerobots / "model.safetensors")
-        for file in lerobots.glob("policy_p*"):
+        with pytest.raises(CheckpointError, match=r"remove policy_p\*processor.json$"):
+            load_checkpoint(lerobots)
+        for file in lerobots.glob("policy_p*processor.json"):
             file.unlink()
     assert load_checkpoint(lerobots).config == expected
 
