@@ -22,9 +22,9 @@ ACTION_NAMES = CHANNELS
 HANDLED = ("repaired", "recomputed from the pulses", "taken as recorded", "left out")  # what is done about a fault
 REPAIRED = (
     *("serial_burst", "unsorted_control_times", "unsorted_frame_times"),
-    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index"),
+    *("reverse_on_a_car_without", "stood_unrecorded", "scrambled_index", "other_units"),
 )
-TAKEN = ("another_export", "another_total", "one_sided_steering")
+TAKEN = ("another_export", "another_total", "one_sided_steering", "no_times")
 CAMERA = "observation.images."  # what LeRobot puts before a camera's name
 
 
