@@ -53,6 +53,7 @@ from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_
 
 # What DATA has under these names, and where it is again with which columns.
 TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
+FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
@@ -111,8 +112,8 @@ def load_recordings(
             others = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
             folders = [p for p in others if any((p / name).exists() for name in EPISODE_FILES)]
     except OSError as e:
-        remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
-        raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
+        words, remedy = (name_stranger(root) if root.is_file() else None) or ("no folder of episodes", FOLDER)
+        raise EpisodeError(f"{root}: {words} ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = find_killed(root)
     if not folders:
