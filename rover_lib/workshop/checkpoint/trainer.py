@@ -42,9 +42,7 @@ KNOWN_CONFIG = {*trainer_config(ActConfig()), "learning_rate", "batch_size", "da
 KNOWN_CONFIG |= {"rate_hz", "use_vae", "origin"}
 OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
 # Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
-BESIDE = re.compile(
-    r"([^.].*_)?(config|cfg|hparams|args|params|(hyper)?parameters|settings|metadata)\.(json|ya?ml)", re.I
-)
+BESIDE = re.compile(r"([^.].*_)?(config|cfg|hparams|args|hyperparameters|settings|metadata)\.(json|ya?ml)", re.I)
 STATISTICS = re.compile(
     r"([^.].*_)?(stats|statistics|mean_std|norm|normali[sz]er|normali[sz]ation|scaler)"
     r"\.(pth?|json|ya?ml|pkl|joblib|np[yz]|safetensors)",

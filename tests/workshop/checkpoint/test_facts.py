@@ -74,9 +74,9 @@ def test_files_beside_a_checkpoint_are_asked_about_or_read(tiny_policy, tmp_path
         assert "normalised" in remedied(path)
         (tmp_path / name).rename(tmp_path / f"._{name}")  # as a Mac leaves it
     (tmp_path / "._config.json").write_bytes(b"\0\5\26\7\xff")
-    (tmp_path / "Params.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
+    (tmp_path / "Settings.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
     found = load_checkpoint(path)
-    assert found.report["known"]["rate"] == "15 steps a second (Params.yaml:fps)" and found.identity != found.sha256
+    assert found.report["known"]["rate"] == "15 steps a second (Settings.yaml:fps)" and found.identity != found.sha256
 
 
 def test_a_rate_and_an_order_are_used_and_other_keys_are_named(tiny, tiny_policy, tmp_path):
