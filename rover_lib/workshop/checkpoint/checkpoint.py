@@ -119,13 +119,13 @@ class Checkpoint:
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
-        found = self._reordered(layout, samples, guessed)
-        norm = found.config.action_unnorm
-        if norm and set(found.config.action_names) == set(TWO_ACTIONS) and max(map(abs, norm.scale + norm.shift)) > FAR:
+        ordered = self._reordered(layout, samples, guessed)
+        of_car, norm = set(ordered.config.action_names) == set(TWO_ACTIONS), ordered.config.action_unnorm
+        if of_car and norm and max(map(abs, norm.scale + norm.shift)) > FAR:
             what = f"{self.path}: the statistics of its actions are of other units than a rover's, from -1 to 1"
             remedy = "train on such actions; a throttle forward is from 0 to 1"
-            raise CheckpointError(what, found=found.report["normalisation"]["action"], remedy=remedy)
-        return found._at_trained_size(layout, samples)
+            raise CheckpointError(what, found=ordered.report["normalisation"]["action"], remedy=remedy)
+        return ordered._at_trained_size(layout, samples)
 
     def _reordered(self, layout: Layout, samples: Sequence[Sample], guessed: Sequence[str]) -> "Checkpoint":
         """Return the policy with the order of numbers, and LeRobot's with the cameras and the rate of the dataset."""
