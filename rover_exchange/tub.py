@@ -39,6 +39,7 @@ RATE_HZ = 20.0  # of records without a time: donkeycar's own
 MOST_BYTES = 10_000_000  # of a manifest or a catalog; JSON takes 25 times its size, and a thousand records 200 kB
 MOST_LINES, MOST_CATALOGS = 50_000, 10_000  # donkeycar's catalogs have a thousand lines
 MOST_INDEX, MOST_MS = 10**9, 10**14
+LEAST_S = 0.002  # between two records; no camera of a car is faster
 LEAST_STANDING = 5  # gaps; fewer may be a camera's
 WHOLE_PERIODS, MOST_WHOLE = 0.3, 0.8  # a gap differs by less from whole periods; the share of such gaps
 OLDER = "copy it again; donkeycar's convert_to_tub_v2.py converts a tub of record_<number>.json"
@@ -56,6 +57,7 @@ class _Record:
     angle: float
     throttle: float
     driver: Any
+    timed: bool
 
 
 def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: str | None = None) -> Recordings:
@@ -69,6 +71,9 @@ def read_tub(tub: Path | str, car: Car, progress: Progress = silent, throttle: s
     records = _in_order(_read_records(tub, faults), throttle, tub, faults)
     steps_s = np.diff([r.time_s for r in records])
     usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
+    if usual_s < LEAST_S:
+        found, remedy = f"{usual_s * 1000:.3g} ms between two records", "are they seconds? write milliseconds"
+        raise EpisodeError(f"{tub}: its _timestamp_ms are not of a drive", found=found, remedy=remedy)
     stands = _standing_parts(records, usual_s, tub, faults)
     runs: list[list[_Record]] = []
     for record in records:
@@ -197,6 +202,7 @@ def _read_records(tub: Path, faults: Faults) -> Iterator[_Record]:
             elif record.driver != "user":
                 faults.add(tub, "a_pilot_drove", f"{where}: {quote(record.driver)}")
             else:
+                faults.add(tub, "no_times", f"records without a time: taken as {RATE_HZ:g} a second", not record.timed)
                 yield record
 
 
@@ -210,7 +216,7 @@ def _read(path: Path) -> str:
 def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
     """Return the names of the catalogs and the numbers of the deleted records, from the manifest's last line."""
     try:
-        last = json.loads(_read(path).splitlines()[-1])
+        last = json.loads(_read(path).rstrip().splitlines()[-1])
         if len(last["paths"]) > MOST_CATALOGS:
             raise ValueError
         return list(map(str, last["paths"])), set(map(int, last.get("deleted_indexes") or []))
@@ -227,4 +233,5 @@ def _parse(text: str) -> _Record:
     if not is_whole(number, 0, MOST_INDEX) or not (ms is None or is_number(ms, 0, MOST_MS)):
         raise ValueError(f"number {quote(number)}, time {quote(ms)}")
     time_s = number / RATE_HZ if ms is None else ms / 1000
-    return _Record(number, str(row.get("_session_id", "")), time_s, row[PICTURE], *values, row.get(MODE, "user"))
+    session, driver = str(row.get("_session_id", "")), row.get(MODE, "user")
+    return _Record(number, session, time_s, row[PICTURE], *values, driver, timed=ms is not None)

@@ -97,7 +97,7 @@ def test_a_tub_that_drives_by_negative_throttle_is_asked_about(tmp_path):
     assert all(s.chunk[0, 1] == 0 for s in read_tub(root, Car(), throttle="as-recorded").samples[:35])
 
 
-def test_runs_of_a_few_records_have_no_rate(tmp_path):
+def test_runs_of_a_few_records_and_odd_times_have_no_rate(tmp_path):
     """A car's loop begins with two records at once, and holes leave runs of a few: their steps say nothing."""
     rows = records(40)
     rows[0]["_timestamp_ms"] += 40
@@ -109,6 +109,11 @@ def test_runs_of_a_few_records_have_no_rate(tmp_path):
     recordings = read_tub(tub(tmp_path / "tub", [*rows, *slower]), LEFT)
     assert kinds(recordings) == {"hole_in_time": 1, "another_rate": 20}
     assert [len(e.samples) for e in recordings.episodes] == [4, 35] and usual_rate_hz(recordings) == 20
+    timeless = [row | {"_timestamp_ms": None} for row in records(20)]
+    assert kinds(read_tub(tub(tmp_path / "timeless", timeless), LEFT)) == {"no_times": 20}
+    seconds = [row | {"_timestamp_ms": row["_timestamp_ms"] / 1000} for row in records(20)]
+    with pytest.raises(EpisodeError, match="are they seconds"):
+        read_tub(tub(tmp_path / "seconds", seconds), LEFT)
 
 
 GAPS = {"hole_in_time", "gaps_unrecorded"}

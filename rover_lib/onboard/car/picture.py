@@ -49,6 +49,8 @@ def check_jpeg(data: bytes) -> tuple[int, int]:
 def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
     if len(data) > MOST_BYTES:
         raise CameraError("a JPEG is too large", found=f"{len(data) / 1e6:.1f} MB", remedy="is it a camera's?")
+    if data[:2] != b"\xff\xd8":
+        raise CameraError("not a JPEG", found=data[:12], remedy="is it whole? write other formats anew as JPEG")
     try:
         height, width = simplejpeg.decode_jpeg_header(data, strict=False)[:2]
         scans = data.count(b"\xff\xda")

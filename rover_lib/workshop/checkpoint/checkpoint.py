@@ -30,6 +30,7 @@ FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
 FRAMES = 8  # on which two sizes of pictures are tried, in FP32
 BETTER = 0.5  # the share of the error that the less likely size must leave at most
 SAME, CLEARLY = 0.05, 1.0  # apart: statistics of the same actions; how much nearer those of another order are
+FAR = 2.0  # no mean, deviation or half range of actions from -1 to 1 is as large
 INFO, TRAINED_ON = "the recordings' meta/info.json", "give the dataset that it was trained on"
 
 
@@ -113,7 +114,13 @@ class Checkpoint:
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
                 found = f"recordings whose {what} is {quote_all(theirs)}"
                 raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
-        return self._reordered(layout, samples, guessed)._at_trained_size(layout, samples)
+        ordered = self._reordered(layout, samples, guessed)
+        of_car, norm = set(ordered.config.action_names) == set(ACTION_NAMES), ordered.config.action_unnorm
+        if of_car and norm and max(map(abs, norm.scale + norm.shift)) > FAR:
+            what = f"{self.path}: the statistics of its actions are of other units than a rover's, from -1 to 1"
+            remedy = "train on such actions; a throttle forward is from 0 to 1"
+            raise CheckpointError(what, found=ordered.report["normalisation"]["action"], remedy=remedy)
+        return ordered._at_trained_size(layout, samples)
 
     def _reordered(self, layout: Layout, samples: Sequence[Sample], guessed: Sequence[str]) -> "Checkpoint":
         """Return the policy with the order of numbers, and LeRobot's with the cameras and the rate of the dataset."""
@@ -136,6 +143,9 @@ class Checkpoint:
             cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
             if c.cameras != cameras:
                 notes.append(f"its cameras are {quote_all(c.cameras)}, and the recordings' are {quote_all(cameras)}")
+            if len(actions) == 2 and set(layout.action_names) != set(ACTION_NAMES):
+                option = "if they are steering and throttle, name them so in their order: --action-names"
+                notes.append(f"its actions are {quote_all(layout.action_names)}, which no rover has; {option}")
             rate_hz = (layout.rate_hz if "rate" in guessed else None) or c.rate_hz
             config = replace(config, cameras=cameras, rate_hz=rate_hz)
             given: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}

@@ -18,6 +18,7 @@ from torch import Tensor
 from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
+from rover_lib.onboard.recording.episode import CHANNELS
 from rover_lib.workshop.recordings.samples import flat_names, read_as_car
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -25,7 +26,7 @@ USER, GUESS = "--facts", "a guess"
 WORDS = yaml.safe_load(Path(__file__).with_name("keys.yml").read_text())
 SMALL = 64  # numbers or keys; more are weights
 # Values that change nothing, unlike True.
-NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", [], (), {})
+NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", "relu", "sine", "jpg", "png", [], (), {})
 
 
 class Facts:
@@ -74,19 +75,31 @@ class Facts:
         refused = dict[str, tuple[Any, str]]()
         for key, value in _flatten(content, where):
             words, last = words_of(key), words_of(re.split("[.:]", key)[-1])
-            words |= {value.lower()} if isinstance(value, str) else set()  # action_type: delta
+            of_image = bool(last & {*WORDS["image"]})
+            done = (of_image and "normali" in key) or any(last >= {*these} for these in WORDS["done"])
+            several = isinstance(value, (list, tuple)) and len(value) > 1
+            about = of_image or bool(last & {*WORDS["numbers"]} or (several and last & {"camera", "cameras"}))
+            words |= words_of(value) if isinstance(value, str) else set()  # action_type: delta
             harmless = is_nothing(value) or bool(last & {*WORDS["training"]} or words & {*WORDS["augments"]})
-            # Pictures are normalised, by ImageNet's statistics.
-            harmless |= value is True and bool(words & {*WORDS["image"]}) and "normali" in key
+            harmless = (harmless and not (done and value is False)) or (done and value is True)
             harmless |= any(_same(value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
             if key in self.ignored or (not harmless and self._read_key(key, value, words, last)):
                 continue
+            if last & {*WORDS["labels"]} and not several:
+                about, words = False, words_of(key)  # the name of a run may have any words
             meaning = next((meaning for meaning, these in WORDS["changes"].items() if words & {*these}), "")
-            of_numbers = value is True or words & {*WORDS["numbers"]} or not {"units", "actions"} & words_of(meaning)
-            if meaning and not harmless and of_numbers:
+            both = several and len(value) == 2  # one for each action
+            of_numbers = value is True or both or words & {*WORDS["numbers"]}
+            if meaning and not harmless and (of_numbers or not {"units", "actions"} & words_of(meaning)):
                 refused[key] = value, f"which may mean {meaning}"
+            elif noted and done and value is False:
+                refused[key] = value, "and here that is always done"
+            elif isinstance(value, Mapping) and not harmless and any(isinstance(v, Tensor) for v in value.values()):
+                refused[key] = f"{len(value)} values", "which may be the weights that should drive"
+            elif noted and about and not harmless and value not in (2, 3, self.value("chunk")):  # counts that it has
+                refused[key] = value, "and nobody here knows what that does to its numbers or pictures"
             elif noted:
-                self.unknown[key] = value
+                self.unknown[key] = None if harmless else value
         if refused:
             key, (value, why) = next(iter(refused.items()))
             raise self.refusal(key, value, why, ",".join(refused))
@@ -99,8 +112,15 @@ class Facts:
 
     def _read_key(self, key: str, value: Any, words: set[str], last: set[str]) -> bool:
         """Read a key whose name and value plainly say a fact; False for others."""
-        names, meant = flat_names(value), read_as_car(flat_names(value))
-        if len(names) > 1 and (meant or words & {"action", "actions"}):
+        named = value
+        if isinstance(value, str) and last & {*WORDS["order"]}:
+            named = [word for word in re.findall("[a-z]+", value.lower()) if word in CHANNELS]
+        names, meant = flat_names(named), read_as_car(flat_names(named))
+        if len(names) > 1 and last & {*WORDS["states"]}:
+            if meant != names:
+                raise self.refusal(key, value, f"{quote_all(names)}, and here the state is the last action")
+            self.say("state", names, key)
+        elif len(names) > 1 and (meant or words & {"action", "actions"}):
             if meant and meant != names and self.value("actions") is None:
                 what = f"{self.path}: '{key}' is {quote_all(names)}: are they steering and throttle?"
                 raise CheckpointError(what, remedy=f"if they are, say {USER} actions={','.join(meant)}")
@@ -111,7 +131,7 @@ class Facts:
             self.say("rate", round(float(1 / np.diff(value).mean()), 3), key)
         elif self.value("size") and words & {*WORDS["image"]} and last & {*WORDS["size"]}:
             height, width = self.value("size")
-            if not {*np.ravel(value).tolist()} <= {1, 3, height, width}:
+            if not {*map(int, re.findall("[0-9]+", str(value)))} <= {1, 3, height, width}:
                 raise self.refusal(key, value, f"and its pictures are {width}x{height}: say {USER} size=WxH")
         else:
             return False

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
+from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import atomic_path, plain, read_plain
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import imagenet
@@ -32,6 +33,8 @@ MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
+# Names that torch.compile, DataParallel and trainers put around a policy's own, which change nothing.
+WRAPPERS = r"^(module\.|policy\.)+|_orig_mod\."
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # settings take some kB
 TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
@@ -43,15 +46,24 @@ GRAD_CLIP = 1.0
 KNOWN = {"epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config"}
 OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
 # Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
-BESIDE = re.compile(r"(.*_)?(config|cfg|hparams|args)\.(json|ya?ml)")
+BESIDE = re.compile(r"([^.].*_)?(config|cfg|hparams|args|hyperparameters|settings|metadata)\.(json|ya?ml)", re.I)
 STATISTICS = re.compile(
-    r"(.*_)?(stats|norm|normali[sz]er|normali[sz]ation|scaler)\.(pth?|json|ya?ml|pkl|np[yz]|safetensors)"
+    r"([^.].*_)?(stats|statistics|mean_std|norm|normali[sz]er|normali[sz]ation|scaler)"
+    r"\.(pth?|json|ya?ml|pkl|joblib|np[yz]|safetensors)",
+    re.I,
 )
 # best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core.
 SCALAR = np.float64(0).__reduce__()[0]
 NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
 NUMPY += [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32))]
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
+UNPACK = "unpack it, or give the file that the training saved"
+OTHERS = (  # how other files begin, what they are, and what to do
+    (rb"$", "an empty file", COPY_AGAIN),
+    (rb"\s*<", "a web page", "download the file itself"),
+    (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
+    (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
+)
 
 
 def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
@@ -61,6 +73,10 @@ def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
     """
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
     state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
+    if all(isinstance(k, str) for k in state):
+        state = {re.sub(WRAPPERS, "", k): v for k, v in state.items()}
+        if "action_head.weight" in state:  # those of the network, without the policy around it
+            state = {f"model.{k}": v for k, v in state.items()}
     odd = []
     for key, weight in state.items():
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
@@ -87,7 +103,8 @@ def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
     except CheckpointError:
         raise
     except Exception as e:  # each library raises types of its own
-        reason = printable(" ".join(f"{type(e).__name__}: {e}".split())[:200])
+        said = e.__cause__ or e  # draccus wraps what a config's own check says
+        reason = printable(" ".join(f"{type(said).__name__}: {said}".split())[:200])
         raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None
 
 
@@ -117,6 +134,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
     with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
     facts.default("size", (raw.get("image_height"), raw.get("image_width")), "config.image_height")
+    facts.default("chunk", raw.get("chunk_size"), "config.chunk_size")
     with as_checkpoint_error(path):
         facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
         facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
@@ -155,6 +173,9 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
         raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
     size = whole("image_height"), whole("image_width")
     whole("rate_hz", default=30)
+    actions = facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER)
+    if (states := facts.value("state")) not in (None, actions):
+        raise facts.refusal(facts.source("state"), states, f"and its actions are {quote_all(actions)}")
     return ActConfig(
         cameras=(TRAINER_CAMERA,),
         image_sizes=(facts.default("size", size, "config.image_height"),),
@@ -162,10 +183,10 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
         rate_hz=facts.default("rate", RATE_HZ, OF_TRAINER),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
         state_names=name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
-        action_names=facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER),
+        action_names=actions,
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
-        chunk=facts.default("chunk", whole("chunk_size"), "config.chunk_size"),
+        chunk=whole("chunk_size"),
         dim=whole("hidden_size"),
         heads=whole("n_heads"),
         feedforward=whole("feedforward_dim"),
@@ -175,8 +196,16 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
 
 
 def _read_pickle(path: Path) -> Any:
+    refuse_pointer(path, CheckpointError)
+    head = read_head(path)
+    for begins, kind, remedy in OTHERS:
+        if re.match(begins, head, re.S):
+            raise CheckpointError(f"{path}: {kind}, not a checkpoint of a training", remedy=remedy)
     try:
         with zipfile.ZipFile(path) as z:
+            if not any(name.endswith("data.pkl") for name in z.namelist()) or any("/code/" in n for n in z.namelist()):
+                what = f"{path}: an archive or a TorchScript program, not a checkpoint of a training"
+                raise CheckpointError(what, found=quote_all(z.namelist()[:3]), remedy=UNPACK)
             # torch.load accepts overwritten weight bytes; the zip's CRC does not. torch compresses nothing.
             stored = all(e.compress_type == zipfile.ZIP_STORED for e in z.infolist())
             damaged = z.testzip() if stored else "compressed entries"
@@ -194,7 +223,7 @@ def _read_pickle(path: Path) -> Any:
         # torch puts advice before it, to read it unsafely
         reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
         what = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
-        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if isinstance(e, zipfile.BadZipFile) else ""
+        older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if head.startswith(b"\x80") else ""
         raise CheckpointError(what, remedy=COPY_AGAIN + older) from None
 
 

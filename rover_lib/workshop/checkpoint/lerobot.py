@@ -29,13 +29,13 @@ from rover_lib.workshop.untrusted import quote, quote_all, read_json
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
 
-PRETRAINED, CONFIG = "pretrained_model", "config.json"
+PRETRAINED, CONFIG, ADAPTER = "pretrained_model", "config.json", "adapter_config.json"
 WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
 SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
 IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
 Sizes = tuple[tuple[int, int], ...]
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
-SAME = {"chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
+SAME = {"type", "chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
 NOT_OF_POLICY = {"policy", "optimizer", "scheduler", "eval", "wandb", "env"}  # sections of train_config.json
 ORIGIN = "origin.json"  # our own notes in such a folder, because LeRobot refuses a config.json with unknown keys
 # Each processor's file, and its step that normalises.
@@ -52,7 +52,8 @@ def lerobot_folder(path: Path) -> Path:
     for inner in ("", PRETRAINED, f"last/{PRETRAINED}", f"checkpoints/last/{PRETRAINED}"):
         if (path / inner / "config.json").exists():
             return path / inner
-    found = sorted(p.parent.name for steps in (path, path / "checkpoints") for p in steps.glob(f"*/{PRETRAINED}"))
+    places = (f"*/{PRETRAINED}", f"checkpoints/*/{PRETRAINED}", "snapshots/*", "*.pth")
+    found = sorted(p.relative_to(path).as_posix() for place in places for p in path.glob(place))
     what = f"{path}: no config.json, nor a link to the last checkpoint"
     remedy = "give best_model.pth, or one pretrained_model folder with config.json; merge an adapter before"
     raise CheckpointError(what, found=quote_all(found) or "none", remedy=remedy)
@@ -60,6 +61,9 @@ def lerobot_folder(path: Path) -> Path:
 
 def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
     """facts: what its files say is added. Raises CheckpointError for missing, damaged or other policies' files."""
+    if (folder / ADAPTER).exists():
+        what = f"{folder}: {ADAPTER} is beside the weights, so that an adapter changes what they compute"
+        raise CheckpointError(what, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     said = _act_config(folder, raw, facts)
     tensors, inside = _read_safetensors(folder / WEIGHTS), dict[str, Tensor]()
@@ -76,6 +80,11 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         by = ORIGIN if origin else GUESS
         if origin:
             facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
+        if any(name.startswith("action.") for name in inner.step.state_dict()):  # as in training
+            for source, each in ((INNER[0], inner), (OUTER[0], outer)):
+                norm = each.affine("action", "ACTION", actions.shape, inverse=True)
+                facts.say("normalisation of actions", norm and (norm.scale, norm.shift), source)
+            facts.known.pop("normalisation of actions", None)
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
         pictures = tuple(inner.affine(k, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for k in images)
@@ -158,7 +167,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
     if raw.get("type") != "act":
         what = f"{path}: policy type is {quote(raw.get('type'))}"
         raise CheckpointError(what, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
-    with files.as_checkpoint_error(path):
+    with files.as_checkpoint_error(path, files.CORRECT_IT):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
 
@@ -204,7 +213,9 @@ class Normaliser:
         content, read = _read_json(self.where), []
         with files.as_checkpoint_error(self.where):
             for step in content["steps"]:
-                name, config = step["registry_name"], step.get("config") or {}
+                name, config = step.get("registry_name") or step["class"], step.get("config") or {}
+                if config.get("enabled") is False:
+                    continue  # as LeRobot writes steps that others of its policies use
                 if name == normalises:
                     read.append(NormalizerProcessorStep(**config))
                     if file := step.get("state_file"):

@@ -15,13 +15,12 @@ import csv
 import json
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
-from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
+from rover_lib.onboard.kinds import EPISODE_FILES
 from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
@@ -40,6 +39,7 @@ from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
@@ -47,9 +47,7 @@ TABLES = {
     "control_samples": ("control_data.csv", written.CONTROL_FIELDS),
     "frame_samples": ("frame_data.csv", written.FRAME_FIELDS),
 }
-READ = "only folders of episodes, LeRobotDatasets and donkeycar tubs are read: write a LeRobotDataset of it"
-# what a file's path looks like, what its folder then is, and what to do
-STRANGERS, MOST_FILES = Path(__file__).with_name("strangers.txt"), 2000
+FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
@@ -108,13 +106,15 @@ def load_recordings(
             others = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
             folders = [p for p in others if any((p / name).exists() for name in EPISODE_FILES)]
     except OSError as e:
-        remedy = "give the folder that holds episode_*, or a LeRobotDataset's"
-        raise EpisodeError(f"{root}: no folder of episodes ({e.strerror})", remedy=remedy) from None
+        words, remedy = (name_stranger(root) if root.is_file() else None) or ("no folder of episodes", FOLDER)
+        raise EpisodeError(f"{root}: {words} ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {root} --finish` makes an episode of it"
     killed = written.find_killed(root)
     if not folders:
         inside = quote_all(sorted(p.name for p in root.iterdir())) or None
-        what, remedy = ("no episode folders in it", finish) if killed else _name_stranger(root)
+        what, remedy = "no episode folders in it", finish if killed else READ
+        if not killed and (stranger := name_stranger(root)):
+            what, remedy = f"{stranger[0]}, not our recordings", stranger[1]
         raise EpisodeError(f"{root}: {what}", found=inside, remedy=remedy)
     faults = Faults(root)
     for part in killed:
@@ -127,24 +127,6 @@ def load_recordings(
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
     return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
-
-
-def _name_stranger(root: Path) -> tuple[str, str]:
-    """Return what a folder without episodes holds, as owners of other cars and robots have it, and what to do."""
-    inside = [p for p in sorted(root.iterdir()) if p.is_dir() and not p.name.startswith(".")]
-    for kind, words, remedy in (
-        ("tub", "donkeycar tubs", "rover export-dataset {} OUT, and so for each"),
-        ("dataset", "LeRobotDatasets", "give one of them, such as {}"),
-        ("recordings", "folders of recordings", "give one of them, such as {}"),
-    ):
-        if found := [folder for folder in inside if kind in kinds_of(folder)]:
-            return f"a folder of {len(found)} {words}, not our recordings", remedy.format(found[0])
-    paths = [f"/{path.relative_to(root).as_posix()}" for path in islice(root.rglob("*"), MOST_FILES)]
-    for line in STRANGERS.read_text().splitlines():
-        pattern, words, *own = line.split("\t")
-        if any(re.search(pattern, path) for path in paths):
-            return f"{words}, not our recordings", own[0] if own else READ
-    return "no episode folders in it", READ
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:

@@ -178,7 +178,7 @@ class _Dataset:
 
     def read_meta(self) -> list[Path]:
         """Read what meta/ says of the episodes, and return the tables of frames, in the order of their rows."""
-        if self.info["codebase_version"].startswith("v2"):
+        if self.info["codebase_version"].removeprefix("v").startswith("2"):
             _check_file(self.root, lines := self.root / "meta/episodes.jsonl")
             rows = [json.loads(line) for line in read_plain(lines, untrusted.JSON_BYTES).splitlines() if line.strip()]
         else:
@@ -251,6 +251,11 @@ class _Dataset:
     def _check_times(self) -> None:
         """Let episodes begin with 0 s. Raises EpisodeError for frames that do not come `fps` times a second."""
         times_s, first = self.columns["timestamp"].astype(np.float64), self.columns["frame_index"] == 0
+        usual = float(np.median(np.diff(times_s, prepend=0)[~first])) * self.fps if not first.all() else 1.0
+        for unit, word in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
+            if abs(usual / unit - 1) <= UNEVEN:
+                times_s /= unit
+                self.faults.add(self.root / "data", "other_units", f"its timestamps are in {word}")
         begin_s = times_s[np.flatnonzero(first)[np.cumsum(first) - 1]]
         times_s = self.columns["timestamp"] = np.where(np.abs(begin_s) * self.fps > 1, times_s - begin_s, times_s)
         steps = np.diff(times_s, prepend=0)[~first] * self.fps
@@ -356,7 +361,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     with _as_episode_error(f"{path}: not readable as JSON"):
         info = untrusted.read_json(path, INFO_BYTES)
     version = str(info.get("codebase_version")) if isinstance(info, dict) else "without a version"
-    if not version.startswith(("v2", "v3")):
+    if not version.removeprefix("v").startswith(("2", "3")):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
         raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v2 and v3 are read", remedy=remedy)
     features, fps = info.get("features"), info.get("fps")
@@ -382,7 +387,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     features = info["features"]
     keys = recorded.camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
-        raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy="record one that sees")
+        remedy = f"if one of these is a camera's, call its dtype 'image' or 'video' in {INFO}, else record with one"
+        raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy=remedy)
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names or len(set(names)) < len(names):
@@ -411,7 +417,7 @@ def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int
     shape, kind = list(feature["shape"]), feature.get("info")
     depth = isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map"))
     if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
-        remedy = "choose another: --camera NAME"
+        remedy = "choose another: --camera NAME, or record with one in colours"
         raise EpisodeError(f"{root}: '{key}' is not a colour camera", found=shape, remedy=remedy)
     # The colours come last or first.
     height, width = shape[1:] if shape[0] <= 4 < shape[2] else shape[:2]

@@ -25,9 +25,9 @@ LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = {  # what is done about a fault, by its kind
-    "repaired": "serial_burst|unsorted_.*_times|reverse_on_a_car_without|stood_unrecorded|scrambled_index",
+    "repaired": "serial_burst|unsorted_.*_times|reverse_on_a_car_without|stood_unrecorded|scrambled_index|other_units",
     "recomputed from the pulses": ".*_recomputed",
-    "taken as recorded": "another_export|another_total|one_sided_steering|.*_disagrees_with_pulse",
+    "taken as recorded": "another_export|another_total|one_sided_steering|no_times|.*_disagrees_with_pulse",
     "left out": ".*",
 }
 STATE, ACTION = "observation.state", "action"
@@ -273,6 +273,8 @@ def flat_names(names: Any, depth: int = 4) -> tuple[str, ...]:
     """Return the names in a list, in lists of lists, under words, or with each one's number; () if there are none."""
     if isinstance(names, Mapping) and sorted(map(repr, names.values())) == sorted(map(repr, range(len(names)))):
         return tuple(sorted(names, key=names.__getitem__))  # {"throttle": 0, "steering": 1}
+    if isinstance(names, Mapping) and names and all(str(key).isdecimal() for key in names):
+        names = [names[key] for key in sorted(names, key=int)]  # {"0": "throttle", "1": "steering"}
     parts = list(names.values()) if isinstance(names, Mapping) else names
     if not isinstance(parts, (list, tuple)) or not depth:
         return ()
@@ -337,7 +339,8 @@ def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the names of a feature's numbers; () if there are none."""
-    names = flat_names(feature.get("names"))
+    names = feature.get("names")
+    names = flat_names([name.strip() for name in names.split(",")] if isinstance(names, str) else names)
     bare = tuple(name.removesuffix(".vel") for name in names)  # as our plugin's are in LeRobot 0.6
     return bare if set(bare) == set(CHANNELS) else names
 

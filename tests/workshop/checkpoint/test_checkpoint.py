@@ -136,6 +136,11 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
         whole.writestr("archive/more", bytes(1000))
     assert "compressed entries" in refused(path)
     refused(rewritten(tiny_file, path, {"data.pkl": lambda _: b"\x80\x02" + b"]" * 10**5}))
+    others = (b"version https://git-lfs", "git lfs pull"), (b"<html>", "web page"), (b"PK\5\6" + bytes(18), "unpack it")
+    folders = [(start + b'{"a"}', "whole folder") for start in (b"", bytes(8))]
+    for other, says in (*others, *folders, (b"\x1f\x8b\x08", "unpack it")):
+        path.write_bytes(other)
+        assert says in refused(path)
     path.unlink()
     refused(path)
 
@@ -228,6 +233,9 @@ def test_refuses_damaged_and_divided_folders(copied):
 def test_refuses_other_lerobot_policies(copied, file, change, says):
     edit(copied / file, change)
     assert says in refused(copied)
+    if "write" in says:
+        edit(copied / CONFIG, lambda c: c.update(type="act"))
+        load_checkpoint(copied)
 
 
 @pytest.mark.parametrize(

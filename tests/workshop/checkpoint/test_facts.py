@@ -18,7 +18,6 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.samples import Layout, Source
 from rover_lib.workshop.run.session import load
 
-ORDER = {"action_names": ["throttle", "steering"]}
 TURNED = {"mean": torch.tensor([0.25, 0.3]), "std": torch.tensor([0.05, 0.4])}
 
 
@@ -54,6 +53,14 @@ def says_more(policy, path, config=(), **more):
         ({"config": {"fps": 15, "control_hz": 20}}, "deny each other on its rate"),
         ({"config": {"rate_hz": 20, "fps": 30}}, "deny each other on its rate, found '20.0' and '30.0'"),
         ({"config": {"label_names": ["gas", "steer"]}}, "are they steering and throttle?"),
+        ({"mean": [0.0, 0.4]}, "units"),
+        ({"config": {"invert_steering": True}}, "nobody here knows what that does to its numbers"),
+        ({"config": {"camera_names": ["front", "rear"], "action_horizon": 64}}, "nobody here knows"),
+        ({"config": {"use_imagenet_stats": False}}, "always done"),
+        ({"config": {"output_activation": "tanh"}}, "what its network computes"),
+        ({"config": {"state_names": ["speed", "yaw_rate"]}}, "the state is the last action"),
+        ({"config": {"state_names": ["throttle", "steering"]}}, "its actions are steering, throttle"),
+        ({"ema_state_dict": {str(i): torch.zeros(1) for i in range(65)}}, "the weights that should drive"),
     ],
 )
 def test_what_may_change_actions_is_refused_and_the_option_decides(tiny_policy, tmp_path, more, says):
@@ -61,19 +68,22 @@ def test_what_may_change_actions_is_refused_and_the_option_decides(tiny_policy, 
 
 
 def test_files_beside_a_checkpoint_are_asked_about_or_read(tiny_policy, tmp_path):
-    path, stats = says_more(tiny_policy, tmp_path / "m.pth"), tmp_path / "dataset_stats.pt"
-    stats.touch()
-    assert "normalised" in remedied(path)
-    stats.unlink()
-    (tmp_path / "config.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
+    path = says_more(tiny_policy, tmp_path / "m.pth")
+    for name in ("dataset_stats.pt", "Statistics.json", "action_scaler.joblib"):
+        (tmp_path / name).touch()
+        assert "normalised" in remedied(path)
+        (tmp_path / name).rename(tmp_path / f"._{name}")  # as a Mac leaves it
+    (tmp_path / "._config.json").write_bytes(b"\0\5\26\7\xff")
+    (tmp_path / "Settings.yaml").write_text("fps: 15\nimage_width: 128\nlearning_rate: 1")
     found = load_checkpoint(path)
-    assert found.report["known"]["rate"] == "15 steps a second (config.yaml:fps)" and found.identity != found.sha256
+    assert found.report["known"]["rate"] == "15 steps a second (Settings.yaml:fps)" and found.identity != found.sha256
 
 
 def test_a_rate_and_an_order_are_used_and_other_keys_are_named(tiny, tiny_policy, tmp_path):
     said = {"fps": 15, "input_size": [3, 72, 128], "crop_top": 0, "random_flip_prob": 0.5, "image_channels": 3}
+    said |= {"action_dim": 2, "use_state": True, "camera_names": ["front"], "output_order": "throttle, steering"}
     more = {"normalize_images": True, "image_mean": [0.485, 0.456, 0.406], "history": {"throttle_max": [1]}}
-    found = load_checkpoint(says_more(tiny_policy, tmp_path / "m.pth", config=said | ORDER, **more))
+    found = load_checkpoint(says_more(tiny_policy, tmp_path / "m.pth", config=said, **more))
     (note,) = found.report["notes"]
     assert found.config.rate_hz == 15 and "config.image_channels" in note and found.identity == found.sha256
     turned = found.recorded_as(Layout())
@@ -142,12 +152,34 @@ def test_a_forks_keys_are_asked_about(lerobots):
     say = remedied(lerobots, act=lambda path, said: load_checkpoint(path, said=said).recorded_as(Layout(rate_hz=20.0)))
     assert "nobody here knows" in say
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=[48, 64]))
-    assert "its pictures are 128x72" in remedied(lerobots)
+    assert "its pictures are 128x72: say --facts size=WxH" in remedied(lerobots)
+    assert load_checkpoint(lerobots, said="size=64x48").config.image_sizes == ((48, 64),)
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=None))
     weights, key = load_file(lerobots / "model.safetensors"), "model.backbone.conv1.weight"
     weights[key] = torch.cat([weights[key], weights[key][:, :2]], 1)
     save_file(weights, lerobots / "model.safetensors")
     with pytest.raises(CheckpointError, match="nobody here knows use_coord_conv"):
+        load_checkpoint(lerobots)
+
+
+def test_a_policy_in_other_programs_wrappers_is_the_same(lerobots):
+    right, file = load_checkpoint(lerobots).weights, lerobots / "model.safetensors"
+    for wrapped in ("module.model.", "model._orig_mod.", ""):
+        save_file({wrapped + name: weight for name, weight in right.items()}, file)
+        found = load_checkpoint(lerobots).weights
+        assert all(torch.equal(found[name], weight) for name, weight in right.items())
+
+
+def test_processors_and_adapters_that_change_actions_are_refused(lerobots):
+    unused = {"registry_name": "relative_actions_processor", "config": {"enabled": False}}
+    edit(lerobots / "policy_preprocessor.json", lambda c: c["steps"].append(unused))
+    file, adapter = next(lerobots.glob("policy_post*.safetensors")), lerobots / "adapter_config.json"
+    save_file(load_file(file) | {"action.std": torch.tensor([9.0, 9.0])}, file)
+    assert "deny each other on its normalisation of actions" in remedied(lerobots)
+    with pytest.raises(CheckpointError, match="of other units than a rover's"):
+        load_checkpoint(lerobots, said="ignore=policy_preprocessor.json").recorded_as(Layout(("it",), rate_hz=20.0))
+    adapter.touch()
+    with pytest.raises(CheckpointError, match=r"merge_and_unload.* and remove its files$"):
         load_checkpoint(lerobots)
 
 
@@ -163,14 +195,16 @@ def test_a_config_of_2024_is_read(lerobots, inside):
             c |= {f"{part}_shapes": shapes, f"{part}_normalization_modes": dict.fromkeys(shapes, "mean_std")}
 
     edit(lerobots / "config.json", in_2024)
-    if inside:
+    if inside:  # beside processors they are refused
         weights = load_file(lerobots / "model.safetensors")
         for name, value in load_file(next(lerobots.glob("policy_pre*.safetensors"))).items():
             key, _, stat = name.rpartition(".")
             part = "unnormalize_outputs" if key == "action" else "normalize_inputs"
             weights[f"{part}.buffer_{key.replace('.', '_')}.{stat}"] = value.clone()
         save_file(weights, lerobots / "model.safetensors")
-        for file in lerobots.glob("policy_p*"):
+        with pytest.raises(CheckpointError, match=r"remove policy_p\*processor.json$"):
+            load_checkpoint(lerobots)
+        for file in lerobots.glob("policy_p*processor.json"):
             file.unlink()
     assert load_checkpoint(lerobots).config == expected
 
