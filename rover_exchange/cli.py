@@ -59,7 +59,7 @@ def _print_export(report: dict[str, Any], out: Path, as_json: bool) -> None:
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
         click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
-        click.echo(f"and before that, so that a GPU does not wait for pictures: {lerobot_video(out)}")
+        click.echo(f"on a GPU before that, which then trains on {out}-video: {lerobot_video(out)}")
 
 
 @click.command(short_help="Show a drive in the browser, with a stop button.")

@@ -86,18 +86,10 @@ def _flickering() -> list[np.ndarray]:
     return shown
 
 
-def _strips() -> list[np.ndarray]:
-    return [np.vstack([scenery()[0][:-4], picture[-4:]]) for picture in scenery()]
-
-
-def _grey() -> list[np.ndarray]:
-    return list(np.random.default_rng(0).integers(120, 137, (40, *scenery()[0].shape), np.uint8))
-
-
 FILMS: dict[str, Callable[[], Sequence[np.ndarray]]] = {
     "one pixel flickers": _flickering,
-    "all but a strip is frozen": _strips,
-    "camera sees grey": _grey,
+    "all but a strip is frozen": lambda: [np.vstack([scenery()[0][:-4], picture[-4:]]) for picture in scenery()],
+    "camera sees grey": lambda: [*np.random.default_rng(0).integers(120, 137, (40, *scenery()[0].shape), np.uint8)],
     "camera changes its picture's size": lambda: [picture[::2, ::2] for picture in scenery()],
     "camera of another shape": lambda: [np.vstack([picture, picture[:24]]) for picture in scenery()],
 }

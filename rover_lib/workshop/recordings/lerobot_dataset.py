@@ -146,6 +146,8 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     and a policy in all others, unless our own export says otherwise. Raises EpisodeError for another version, damaged
     or missing files, numbers that no rover can have, and if nothing says which camera and which numbers are the car's.
     """
+    import lerobot.utils.utils  # noqa: F401  # torch, which it imports, takes more memory than a table may
+
     dataset = _Dataset(source)
     faults, layout = dataset.faults, dataset.layout
     with _as_episode_error(f"{dataset.root}: cannot be read"):

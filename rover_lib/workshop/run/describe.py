@@ -42,9 +42,6 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"report": {**content, "metrics": sorted(content["metrics"]), "inputs": len(content["inputs"])}}
     if kind == "tub" or not path.exists():
         check_kind(path, "recordings")  # says what to do
-    # Here, as a dataset's tables are read within less memory than torch takes, which LeRobot imports.
-    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-
     if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
         recordings = load_recordings(source, progress=progress)
         sides = measure_sides(recordings, progress)
@@ -52,6 +49,8 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
     if path.is_file() and read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
         raise RoverError(f"{path}: no file that this project reads or writes", remedy="docs/data.md names them")
+    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+
     checkpoint = load_checkpoint(path, said=source.facts)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}
 

@@ -31,8 +31,8 @@ def throttle_at(t_s):
     return 0.04 + 0.03 * math.cos(2 * t_s)
 
 
-def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
-    """Record a faultless drive, with controls every 33 ms from 0.1 s before the frames to 0.1 s after them.
+def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0, first_s=0.1):
+    """Record a faultless drive, with controls every 33 ms. first_s: from the first of them to the first frame.
 
     Its name's last two digits choose the drive: the same drive twice is left out.
     """
@@ -44,7 +44,7 @@ def record(root, name="episode_20260101_120000", frames=40, start_s=1000.0):
             pulses = PWM.pulses(steering_at(t_s + later_s), throttle_at(t_s + later_s))
             writer.control(start_s + t_s, 500 + 33 * i, pulses.steering_us, pulses.throttle_us, 21316, 1016)
         for i in range(frames):
-            writer.frame(start_s + 0.1 + i / 30, FRAME)
+            writer.frame(start_s + first_s + i / 30, FRAME)
     return folder
 
 
@@ -71,8 +71,9 @@ def changed(tmp_path, change):
 # ---- a faultless recording -------------------------------------------------------------------------------
 
 
-def test_pairs_of_a_faultless_recording(tmp_path):
-    record(tmp_path)
+@pytest.mark.parametrize("first_s", [0.1, 0.12])  # soon after a control, and soon before one
+def test_pairs_of_a_faultless_recording(tmp_path, first_s):
+    record(tmp_path, first_s=first_s)
     recordings = load(tmp_path)
     assert recordings.faults == ()
     (episode,) = recordings.episodes
@@ -85,7 +86,7 @@ def test_pairs_of_a_faultless_recording(tmp_path):
         assert sample.time_s == pytest.approx(k / 30, abs=1e-6)
         # The chunk is this frame's action and the next ones, each within half a control interval of the drive's.
         for step in range(CHUNK):
-            t_s = 0.1 + min(k + step, 39) / 30
+            t_s = first_s + min(k + step, 39) / 30
             assert sample.chunk[step, 0] == pytest.approx(steering_at(t_s), abs=0.9 * 0.017 + 0.001)
             assert sample.chunk[step, 1] == pytest.approx(throttle_at(t_s), abs=0.06 * 0.017 + 0.001)
         assert sample.is_pad.tolist() == [k + step >= 40 for step in range(CHUNK)]
