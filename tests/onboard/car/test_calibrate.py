@@ -118,8 +118,8 @@ def test_the_command_writes_what_it_measured_and_replaces_nothing_without_force(
     assert "unplug the motor" in desk.asked[0] and len(desk.asked) == 6
     assert desk.board.hello.car == car.id  # and not one of the cars that were tried before
     path.write_text(yaml_of(Car()))
-    for options, word in (((), "--force replaces it"), (("--wheelbase-m", "30", "--force"), "wheelbase_m")):
+    for options, word in (((), "--force replaces it"), (("--wheelbase-m", "30", "--force"), "--wheelbase-m")):
         result, _ = run(desk := Desk(CRAWLER), *options)
-        assert result.exit_code == 1 and word in result.output and not desk.asked
+        assert result.exit_code and word in result.output and not desk.asked
     assert read_car(path) == Car()
     assert run(Desk(CRAWLER), "--force")[0].exit_code == 0 and read_car(path) != Car()
