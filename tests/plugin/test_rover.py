@@ -31,10 +31,7 @@ def jpegs(blue=0):
 
 
 def turn(rover, action=GO, seconds=0.0):
-    """LeRobot's loop: an observation, an action, and the rest of its thirtieth. Gives the last observation.
-
-    Raises Late where this loop itself was late: the car was rightly stopped, and the test would judge this machine.
-    """
+    """LeRobot's loop. Gives the last observation. Raises Late if it was itself late, for which a car rightly stops."""
     end = time.monotonic() + seconds
     sent = math.inf
     while True:

@@ -8,6 +8,7 @@ facts.read(content, "config.")         # keys that nobody here knows, by the wor
 import re
 import shlex
 from collections.abc import Iterator, Mapping
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -72,37 +73,19 @@ class Facts:
 
         Raises CheckpointError for a key that may change the actions, where it is not plain how.
         """
-        refused = dict[str, tuple[Any, str]]()
-        for key, value in _flatten(content, where):
-            words, last = words_of(key), words_of(re.split("[.:]", key)[-1])
-            of_image = bool(last & {*WORDS["image"]})
-            done = (of_image and "normali" in key) or any(last >= {*these} for these in WORDS["done"])
-            several = isinstance(value, (list, tuple)) and len(value) > 1
-            about = of_image or bool(last & {*WORDS["numbers"]} or (several and last & {"camera", "cameras"}))
-            words |= words_of(value) if isinstance(value, str) else set()  # action_type: delta
-            harmless = is_nothing(value) or bool(last & {*WORDS["training"]} or words & {*WORDS["augments"]})
-            harmless = (harmless and not (done and value is False)) or (done and value is True)
-            harmless |= any(_same(value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
-            if key in self.ignored or (not harmless and self._read_key(key, value, words, last)):
+        refused = dict[_Key, str]()
+        for key in starmap(_Key, _flatten(content, where)):
+            if key.name in self.ignored or (not key.harmless and self._read_key(key)):
                 continue
-            if last & {*WORDS["labels"]} and not several:
-                about, words = False, words_of(key)  # the name of a run may have any words
-            meaning = next((meaning for meaning, these in WORDS["changes"].items() if words & {*these}), "")
-            both = several and len(value) == 2  # one for each action
-            of_numbers = value is True or both or words & {*WORDS["numbers"]}
-            if meaning and not harmless and (of_numbers or not {"units", "actions"} & words_of(meaning)):
-                refused[key] = value, f"which may mean {meaning}"
-            elif noted and done and value is False:
-                refused[key] = value, "and here that is always done"
-            elif isinstance(value, Mapping) and not harmless and any(isinstance(v, Tensor) for v in value.values()):
-                refused[key] = f"{len(value)} values", "which may be the weights that should drive"
-            elif noted and about and not harmless and value not in (2, 3, self.value("chunk")):  # counts that it has
-                refused[key] = value, "and nobody here knows what that does to its numbers or pictures"
+            why = "" if key.harmless else key.changes() or (key.unclear(self.value("chunk")) if noted else "")
+            if why:
+                refused[key] = why
             elif noted:
-                self.unknown[key] = None if harmless else value
+                self.unknown[key.name] = None if key.harmless else key.value
         if refused:
-            key, (value, why) = next(iter(refused.items()))
-            raise self.refusal(key, value, why, ",".join(refused))
+            key, why = next(iter(refused.items()))
+            shown = f"{len(key.value)} values" if isinstance(key.value, Mapping) else key.value
+            raise self.refusal(key.name, shown, why, ",".join(each.name for each in refused))
 
     def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:
         """Return the error of a key that cannot be used, for the caller to raise. ignored: all such keys."""
@@ -110,32 +93,79 @@ class Facts:
         remedy = f"save the policy without it, or if it changes no action, say {USER} {option}"
         return CheckpointError(f"{self.path}: '{key}' is {quote(str(value))}, {why}", remedy=remedy)
 
-    def _read_key(self, key: str, value: Any, words: set[str], last: set[str]) -> bool:
+    def _read_key(self, key: "_Key") -> bool:
         """Read a key whose name and value plainly say a fact; False for others."""
+        name, value = key.name, key.value
         named = value
-        if isinstance(value, str) and last & {*WORDS["order"]}:
+        if isinstance(value, str) and key.has("order"):
             named = [word for word in re.findall("[a-z]+", value.lower()) if word in CHANNELS]
         names, meant = flat_names(named), read_as_car(flat_names(named))
-        if len(names) > 1 and last & {*WORDS["states"]}:
+        if len(names) > 1 and key.has("states"):
             if meant != names:
-                raise self.refusal(key, value, f"{quote_all(names)}, and here the state is the last action")
-            self.say("state", names, key)
-        elif len(names) > 1 and (meant or words & {"action", "actions"}):
+                raise self.refusal(name, value, f"{quote_all(names)}, and here the state is the last action")
+            self.say("state", names, name)
+        elif len(names) > 1 and (meant or key.words & {"action", "actions"}):
             if meant and meant != names and self.value("actions") is None:
-                what = f"{self.path}: '{key}' is {quote_all(names)}: are they steering and throttle?"
+                what = f"{self.path}: '{name}' is {quote_all(names)}: are they steering and throttle?"
                 raise CheckpointError(what, remedy=f"if they are, say {USER} actions={','.join(meant)}")
-            self.say("actions", meant or names, key)
-        elif (last & {*WORDS["rate"]} or "rate" in last <= {*WORDS["of_rate"]}) and is_number(value, 1, 1000):
-            self.say("rate", float(value), key)
-        elif "timestamps" in words and len(value) > 1:
-            self.say("rate", round(float(1 / np.diff(value).mean()), 3), key)
-        elif self.value("size") and words & {*WORDS["image"]} and last & {*WORDS["size"]}:
+            self.say("actions", meant or names, name)
+        elif (key.has("rate") or "rate" in key.last <= {*WORDS["of_rate"]}) and is_number(value, 1, 1000):
+            self.say("rate", float(value), name)
+        elif "timestamps" in key.words and len(value) > 1:
+            self.say("rate", round(float(1 / np.diff(value).mean()), 3), name)
+        elif self.value("size") and key.words & {*WORDS["image"]} and key.has("size"):
             height, width = self.value("size")
             if not {*map(int, re.findall("[0-9]+", str(value)))} <= {1, 3, height, width}:
-                raise self.refusal(key, value, f"and its pictures are {width}x{height}: say {USER} size=WxH")
+                raise self.refusal(name, value, f"and its pictures are {width}x{height}: say {USER} size=WxH")
         else:
             return False
         return True
+
+
+class _Key:
+    """A key that nobody here knows. words: of its name and of a text as its value; last: of its name's last part."""
+
+    def __init__(self, name: str, value: Any):
+        self.name, self.value, self.last = name, value, words_of(re.split("[.:]", name)[-1])
+        self.words = words_of(name) | (words_of(value) if isinstance(value, str) else set())  # action_type: delta
+        self.several = isinstance(value, (list, tuple)) and len(value) > 1
+        self.is_label = self.has("labels") and not self.several  # the name of a run may have any words
+        self.done = (self.has("image") and "normali" in name) or any(
+            self.last >= {*these} for these in WORDS["done"]
+        )  # always, here
+
+    def has(self, kind: str) -> bool:
+        """Whether the last part of its name has one of keys.yml's words of this kind."""
+        return not self.last.isdisjoint(WORDS[kind])
+
+    @property
+    def harmless(self) -> bool:
+        """Whether it changes no action, by its value or because it is of training."""
+        if self.done and isinstance(self.value, bool):
+            return self.value
+        of_training = self.has("training") or not self.words.isdisjoint(WORDS["augments"])
+        usual = any(_same(self.value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
+        return is_nothing(self.value) or of_training or usual
+
+    def changes(self) -> str:
+        """Say what it may change by the words of its name, or "" if they say nothing of the kind."""
+        words = words_of(self.name) if self.is_label else self.words
+        meaning = next((meaning for meaning, these in WORDS["changes"].items() if words & {*these}), "")
+        one_for_each = self.several and len(self.value) == 2
+        of_numbers = self.value is True or one_for_each or words & {*WORDS["numbers"]}
+        plain = meaning and (of_numbers or not {"units", "actions"} & words_of(meaning))
+        return f"which may mean {meaning}" if plain else ""
+
+    def unclear(self, chunk: Any) -> str:
+        """Say why it cannot be passed over though its words say nothing, or "". chunk: steps of a plan."""
+        if self.done and self.value is False:
+            return "and here that is always done"
+        if isinstance(self.value, Mapping) and any(isinstance(v, Tensor) for v in self.value.values()):
+            return "which may be the weights that should drive"
+        about = self.has("image") or self.has("numbers") or (self.several and self.last & {"camera", "cameras"})
+        if about and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
+            return "and nobody here knows what that does to its numbers or pictures"
+        return ""
 
 
 def is_nothing(value: Any) -> bool:
