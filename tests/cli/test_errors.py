@@ -15,6 +15,7 @@ def here(tmp_path, monkeypatch):
         z.writestr("archive/code/net.py", b"")
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "noise.bin").write_bytes(b"\0\1\2hello")
+    (tmp_path / "lfs.pth").write_text("version https://git-lfs")
     stage = {"schema": 1, "stage": "load", "params": {}, "metrics": {}, "inputs": {}, "env": {}}
     for folder in ("episodes/episode_1/frames", "runs/mine", "pretrained_model", "empty"):
         (tmp_path / folder).mkdir(parents=True)
@@ -36,6 +37,7 @@ WRONG = [
     ("run --only 04 --name mine --samples 5", "no parameter samples"),
     ("inspect nothing.pt", "nothing.pt: not found"),
     ("inspect notes.txt", "notes.txt: no file that"),
+    ("inspect lfs.pth", "git lfs pull"),
     ("report runs/mine", "runs/mine: no verdict without"),
     ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),
     ("export-dataset empty out", "empty: no episode folders in it"),
