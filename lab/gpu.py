@@ -83,11 +83,8 @@ def compare_weights(run: Run, _machine: Machine, row: dict[str, Any]) -> list[st
     return wrong if {"backbone", "transformer"} <= set(resumed) else [*wrong, "not every phase was resumed inside"]
 
 
-ROWS = {"phases": time_phases, "weights": compare_weights}
-
-
 def measure(output: Path, device: str, size: str, episodes: Path) -> list[str]:
-    """Measure all ROWS, on episodes that are recorded if they are not there, and write each to `output` at its end.
+    """Measure both rows, on episodes that are recorded if they are not there, and write each to `output` at its end.
 
     Returns a sentence for each requirement that does not hold. Raises TrainingError without such a device.
     """
@@ -98,7 +95,7 @@ def measure(output: Path, device: str, size: str, episodes: Path) -> list[str]:
         record_episodes(episodes, DRIVES)
     with tempfile.TemporaryDirectory() as folder:
         run = partial(_train, episodes, Path(folder), size=size, machine=machine)
-        for name, fill in ROWS.items():
+        for name, fill in (("phases", time_phases), ("weights", compare_weights)):
             row, began_s = made["rows"].setdefault(name, {}), time.monotonic()
             try:
                 wrong += [f"{name}: {sentence}" for sentence in fill(run, machine, row)]

@@ -32,8 +32,7 @@ def jpegs(blue=0):
 
 def turn(rover, action=GO, seconds=0.0):
     """LeRobot's loop. Gives the last observation. Raises Late if it was itself late, for which a car rightly stops."""
-    end = time.monotonic() + seconds
-    sent = math.inf
+    end, sent = time.monotonic() + seconds, math.inf
     while True:
         observation = rover.get_observation()
         if time.monotonic() - sent > 0.8 * ride.HOLD_S:
