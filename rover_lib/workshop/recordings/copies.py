@@ -6,12 +6,13 @@ encoded anew, renamed, cut or lacks some rows; and drives of a keyboard, whose a
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 
 from rover_lib.workshop.recordings.controls import Faults
-from rover_lib.workshop.recordings.samples import Episode, pick_evenly
+from rover_lib.workshop.recordings.samples import Episode, Sample, pick_evenly
 
 RUN = 4  # consecutive actions that are compared at once
 STEPS = (1, 2, 3, 4, 5)  # a copy may have only every fifth row
@@ -65,7 +66,7 @@ def _look_alike(episode: Episode, other: Episode, pairs: list[tuple[int, int]]) 
     """Whether most pictures at the same actions are the same. pairs: a sample of each."""
     chosen, others = pick_evenly(sorted(pairs), COMPARED), 0
     for k, there in chosen:
-        others += not _is_same(_scaled(episode.samples[k].frame_bgr()), _scaled(other.samples[there].frame_bgr()))
+        others += not _is_same(_scaled(episode.samples[k]), _scaled(other.samples[there]))
         if others > SHARED * len(chosen):
             return False
     return True
@@ -78,7 +79,8 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
     return float((a * b).sum()) > CORRELATED * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
-def _scaled(frame: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
+def _scaled(sample: Sample) -> np.ndarray:
     """The picture in few pixels; of several cameras, one beside the other."""
+    frame: Any = sample.frame_bgr(SEEN[0])
     frames = frame.values() if isinstance(frame, dict) else (frame,)
     return np.stack([cv2.resize(f, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32) for f in frames])

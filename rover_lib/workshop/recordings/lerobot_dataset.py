@@ -131,7 +131,7 @@ class LerobotSample(Sample):
     def frame_name(self) -> str:
         return f"frame {self.row}"
 
-    def frame_bgr(self) -> Any:
+    def frame_bgr(self, least: int = 0) -> Any:
         """Read the picture, as Sample does; of several cameras, a dict by their names. Raises EpisodeError likewise."""
         with _as_episode_error(f"{self.frame_path}: its frame {self.row} cannot be decoded"), limited_memory():
             frames = {name: camera.read_bgr(self.row) for name, camera in self.cameras.items()}

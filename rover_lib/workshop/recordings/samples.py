@@ -144,10 +144,10 @@ class Sample:
         """The picture as it is, or turned over if it is mirrored."""
         return np.ascontiguousarray(frame[:, ::-1]) if self.mirrored else frame
 
-    def frame_bgr(self) -> np.ndarray:
-        """Read the picture: (h, w, 3) uint8 BGR. Raises EpisodeError if it is gone or not a whole JPEG."""
+    def frame_bgr(self, least: int = 0) -> np.ndarray:
+        """Read the picture: (h, w, 3) uint8 BGR; least: as of read_jpeg. Raises EpisodeError if it is gone or torn."""
         try:
-            return self.turned(read_jpeg(self.frame_path))
+            return self.turned(read_jpeg(self.frame_path, least))
         except OSError as e:
             what, found, remedy = f"cannot be read ({e.strerror})", None, "restore it or load again"
         except CameraError as e:

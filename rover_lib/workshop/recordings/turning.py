@@ -149,10 +149,9 @@ def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _grey(sample: Sample) -> np.ndarray:
-    frame = sample.frame_bgr()
-    height = round(WIDTH * frame.shape[0] / frame.shape[1])
-    small = cv2.resize(frame, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(sample.frame_bgr(WIDTH), cv2.COLOR_BGR2GRAY)
+    height = round(WIDTH * grey.shape[0] / grey.shape[1])
+    return cv2.resize(grey, (WIDTH, height), interpolation=cv2.INTER_AREA)
 
 
 def _shift(before: np.ndarray, after: np.ndarray) -> float | None:

@@ -16,7 +16,7 @@ from rover_lib.workshop.recordings.turning import LEAST_SPREAD, measure_sides
 class Seen(Sample):
     picture: np.ndarray | None = None
 
-    def frame_bgr(self):
+    def frame_bgr(self, least=0):
         return self.turned(self.picture)
 
 
