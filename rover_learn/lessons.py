@@ -75,8 +75,8 @@ class BatchedPolicy(nn.Module):
 
     def weights(self) -> dict[str, Tensor]:
         """Return a copy of the weights, on the CPU, by LeRobot's names without the leading `model.`."""
-        backbone = {f"backbone.{name}": value for name, value in self.backbone.state_dict().items()}
-        return {name: value.cpu().clone() for name, value in {**self.model.state_dict(), **backbone}.items()}
+        values = self.model.state_dict() | self.backbone.state_dict(prefix="backbone.")
+        return {name: value.cpu().clone().contiguous() for name, value in values.items()}
 
     def features(self, frames: Tensor) -> Tensor:
         """Return the feature maps, (B, D, h, w), of frames, (B, height, width, 3) uint8 RGB."""

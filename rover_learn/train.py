@@ -64,7 +64,7 @@ SIZES = {
 }
 # A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
 # hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
-FULL_VERSION = 1
+FULL_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,9 +231,9 @@ class _Training:
         seen = loop.normalised(batch[IMAGE], batch[GAIN]) if GAIN in batch else batch[IMAGE]
         return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
 
-    def judge(self, maps: loop.RowFile | None = None) -> float:
+    def judge(self, maps: loop.RowFile | None = None, units: np.ndarray | float | None = None) -> float:
         """Return the policy's mean error on the judges, in units of the spreads. maps: their feature maps, if taken."""
-        judges, units = self.judges, self.weights.cpu().numpy()
+        judges, units = self.judges, self.weights.cpu().numpy() if units is None else units
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
         errors = [loop.driving_error(self.policy, judges, rows, units, maps) for rows in every]
         self.policy.train()
@@ -269,14 +269,12 @@ def _train(
         if recipe.at:
             training = replace(training, data=Frames.of(samples, size.image_sizes[0], workers), judges=judges)
             optimizer, scheduler = _train_together_or_not(training, "at full size", recipe.carry_steps)
-    firsts = range(0, len(judges), recipe.batch)
-    errors = [loop.driving_error(policy, judges, np.arange(len(judges))[a : a + recipe.batch]) for a in firsts]
     return {
         "epoch": recipe.carry_steps or recipe.together_steps,
-        "model_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()},
+        "model_state_dict": {k: v.cpu().contiguous() for k, v in policy.state_dict().items()},
         "optimizer_state_dict": loop.to_cpu(optimizer.state_dict()),
         "scheduler_state_dict": scheduler.state_dict(),
-        "best_val_loss": np.mean(errors),
+        "best_val_loss": np.float64(training.judge(units=1.0)),
     }
 
 
@@ -355,7 +353,7 @@ def _train_transformer(training: _Training) -> None:
 
 def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> loop.RowFile:
     """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file. chosen: (n,) row numbers."""
-    batch, (size,), device = training.recipe.batch, training.size.image_sizes, training.weights.device
+    batch, (size,), device = 2 * training.recipe.batch, training.size.image_sizes, training.weights.device
     maps = loop.RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
 
     def read(step: int) -> np.ndarray:

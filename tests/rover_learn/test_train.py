@@ -59,7 +59,7 @@ def test_the_checkpoint_is_the_trainers(trained):
     # LeRobot's policy takes weights and optimiser
     policy, weights = lerobot_act(SIZES["small"]), checkpoint["model_state_dict"]
     assert not policy.load_state_dict(weights, strict=True)[0]
-    assert all(torch.isfinite(v).all() for v in weights.values())
+    assert all(torch.isfinite(v).all() and v.is_contiguous() for v in weights.values())
     # LeRobot's own start, mean 0 and variance 1, would leave a backbone without pretrained weights dead.
     assert not any(torch.all(v == 1) for k, v in weights.items() if k.endswith("running_var"))
     state = checkpoint["optimizer_state_dict"]["state"]
