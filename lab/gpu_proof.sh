@@ -3,9 +3,10 @@
 #
 #     lab/gpu_proof.sh OUT [policy] [student] [drives]      # all three if none is named
 #
-# policy: one of the real car's size, and its INT8 (OUT/policy/run.json). student: distilled from it. drives: held-out
-# error after training on 20 to 320 drives (OUT/drives.jsonl). STEPS of the policy's training: ten minutes by default.
-# What is ended goes on where it was when it is run again. Needs `rover` with what [workshop] of pyproject.toml names.
+# policy: one of the real car's size, and its INT8 (OUT/policy/run.json). student: distilled from it. drives: how well
+# policies of 20 to 320 drives plan in 40 others, and drive (OUT/drives.json); half an hour without a GPU. STEPS of the
+# policy's training: ten minutes by default. What is ended goes on where it was when it is run again. Needs `rover` with
+# what [workshop] of pyproject.toml names, and its python3 in the PATH.
 set -euo pipefail
 out=$1
 shift
@@ -27,16 +28,35 @@ student() {
 }
 
 drives() {
-  : > "$out/drives.jsonl"
+  [ -d "$out/judges" ] || rover world record "$out/judges" --count 40 --seed 1 > "$out/judges.log"
   for count in 20 40 80 160 320; do
     record "$count"
-    rover train "$out/drives-$count" "$out/of-$count.pth" ${DEVICE:+--device "$DEVICE"} > "$out/of-$count.log"
-    python3 - "$out/of-$count.pth" "$count" >> "$out/drives.jsonl" << 'END'
-import json, sys, torch
-made = torch.load(sys.argv[1], map_location="cpu", weights_only=False)
-print(json.dumps({"drives": int(sys.argv[2]), "held_out_error": float(made["best_val_loss"])}))
-END
+    [ -f "$out/of-$count.pth" ] || rover train "$out/drives-$count" "$out/of-$count.pth" ${DEVICE:+--device "$DEVICE"}
+    # A policy of few drives may not be fit to drive, which `rover run` says by its exit code.
+    [ -f "$out/of-$count/compare.json" ] || rover run "$out/of-$count.pth" "$out/drives-$count" --name "of-$count" \
+      --runs-dir "$out" --worlds 100 -p modes '[static]' || [ -f "$out/of-$count/compare.json" ]
   done
+  python3 - "$out" << 'END'
+import json, sys
+from pathlib import Path
+import numpy as np
+from rover_learn.lessons import BatchedPolicy, plans_of
+from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.recordings.episodes import load_recordings
+
+out, rows = Path(sys.argv[1]), []
+judges = load_recordings(out / "judges").samples[::4]
+recorded, driven = np.stack([s.chunk for s in judges]), ~np.stack([s.is_pad for s in judges])
+for drives in (20, 40, 80, 160, 320):
+    made = load_checkpoint(out / f"of-{drives}.pth")
+    errors = np.abs(plans_of(BatchedPolicy(made.config, made.weights), judges) - recorded)[driven].mean(0)
+    errors_pct = dict(zip(made.config.action_names, (100 * errors / np.ptp(recorded[driven], axis=0)).tolist()))
+    run = json.loads((out / f"of-{drives}" / "compare.json").read_text())
+    hits = {name: run["metrics"]["fp32"][name] for name in ("hits", "trials")}
+    rows.append({"drives": drives, "errors_pct": errors_pct, **hits})
+done = {"judged_on": len(judges), "rows": rows, "env": run["env"]}
+(out / "drives.json").write_text(json.dumps(done, indent=2) + "\n")
+END
 }
 
 for part in "${@:-policy student drives}"; do
