@@ -20,7 +20,7 @@ from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.recording.episode import CHANNELS
-from rover_lib.workshop.recordings.samples import flat_names, read_as_car
+from rover_lib.workshop.recordings.names import flat_names, read_as_car
 from rover_lib.workshop.untrusted import quote, quote_all
 
 USER, GUESS = "--facts", "a guess"
@@ -67,6 +67,12 @@ class Facts:
             which = " or ".join(f"{USER} {shlex.quote(f'ignore={each}')}" for each in (source, by) if each != USER)
             what = f"{self.path}: {by} and {source} deny each other on its {fact}"
             raise CheckpointError(what, found=f"{quote(str(before))} and {quote(str(value))}", remedy=f"say {which}")
+
+    def compare(self, fact: str, said: Mapping[str, Any]) -> None:
+        """Raise CheckpointError, as `say` does, if two sources deny each other: {source: value}. Nothing is kept."""
+        for source, value in said.items():
+            self.say(fact, value, source)
+        self.known.pop(fact, None)
 
     def read(self, content: Mapping[str, Any], where: str, noted: bool = True) -> None:
         """Read keys that nobody here knows. where: what stands before their names. noted: whether to name the rest.
@@ -130,9 +136,8 @@ class _Key:
         self.words = words_of(name) | (words_of(value) if isinstance(value, str) else set())  # action_type: delta
         self.several = isinstance(value, (list, tuple)) and len(value) > 1
         self.is_label = self.has("labels") and not self.several  # the name of a run may have any words
-        self.done = (self.has("image") and "normali" in name) or any(
-            self.last >= {*these} for these in WORDS["done"]
-        )  # always, here
+        done = any(self.last >= {*these} for these in WORDS["done"])
+        self.done = done or (self.has("image") and "normali" in name)  # always, here
 
     def has(self, kind: str) -> bool:
         """Whether the last part of its name has one of keys.yml's words of this kind."""

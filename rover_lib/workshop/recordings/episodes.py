@@ -30,14 +30,14 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
-from rover_lib.onboard.kinds import EPISODE_FILES
+from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
+from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
@@ -92,8 +92,8 @@ def load_recordings(
     root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
-    if lerobot_dataset.is_dataset(root):
-        return lerobot_dataset.load_dataset(source, chunk, progress)
+    if "dataset" in kinds_of(root):
+        return load_dataset(source, chunk, progress)
     for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
         if names not in ((), ACTION_NAMES):
             what, found = f"{root}: our recordings have one camera and name their actions", ",".join(names)

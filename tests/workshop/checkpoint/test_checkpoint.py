@@ -129,8 +129,6 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
         path.write_bytes(data)
         refused(path)
     assert "checksum" in refused(path)
-    torch.save([1], path, _use_new_zipfile_serialization=False)
-    assert "1.6" in refused(path)
     assert "list" in refused(write([1, 2], path))
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as whole:
         whole.writestr("archive/more", bytes(1000))
@@ -295,29 +293,6 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
     assert load_checkpoint(copied).config.state_norm is None
 
 
-def test_statistics_in_the_weights_beside_processors_are_refused(copied):
-    """As LeRobot wrote them before it had processors."""
-    weights = load_file(copied / "model.safetensors")
-    save_file(weights | {"unnormalize_outputs.buffer_action.std": torch.ones(2)}, copied / "model.safetensors")
-    assert "remove policy_p*processor.json" in refused(copied)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda f: edit(f / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1)), "0.01"),
-        (lambda f: edit(f / "config.json", lambda c: c.update(pretrained_revision="v1")), None),  # of LeRobot 0.6
-    ],
-    ids=["ensembling", "newer"],
-)
-def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_path, change, says):
-    inner, outer = saved_normalised(policy, tmp_path)
-    change(tmp_path)
-    checkpoint = load_checkpoint(tmp_path)
-    assert [says in note for note in checkpoint.report["notes"]] == [True] * bool(says)
-    check_is(checkpoint, policy, inner, outer)
-
-
 def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
     policy = lerobot_policy(**TINY, states=0)
     policy.save_pretrained(tmp_path / "policy")
@@ -336,6 +311,8 @@ def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
 def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
     folder = tmp_path / "out/checkpoints/000020/pretrained_model"
     inner, outer = saved_normalised(policy, folder)
+    newer = {"pretrained_revision": "v1"}  # of LeRobot 0.6, and needs no word
+    edit(folder / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1, **newer))
     with pytest.raises(CheckpointError, match="000020"):  # as copied by a program that leaves links out
         load_checkpoint(tmp_path / "out")
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
@@ -343,6 +320,8 @@ def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
         assert lerobot_folder(tmp_path / place).resolve() == folder
     checkpoint = load_checkpoint(tmp_path / "out/checkpoints/last")
     check_is(checkpoint, policy, inner, outer)
+    (note,) = checkpoint.report["notes"]
+    assert "temporal_ensemble_coeff is 0.01" in note
     assert checkpoint.report["normalisation"]["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"
     assert checkpoint.report["normalisation"]["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"
 
@@ -414,9 +393,4 @@ def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_pat
     read = load_checkpoint(tmp_path)
     assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
     assert read.recorded_as(Layout(("cam_front",), rate_hz=15.0)) is read
-    with pytest.raises(CheckpointError, match="15 steps"):
-        read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
     assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
-    (tmp_path / "origin.json").write_text('{"rate_hz": NaN}')
-    with pytest.raises(CheckpointError, match="rate_hz must be a number from 5 to 120, found nan"):
-        load_checkpoint(tmp_path)
