@@ -234,7 +234,6 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
     `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints.
-
     checked: the sha256 of weights that an earlier call has held against their config, for which LeRobot takes seconds.
     said: what the user says of it by --facts.
 

@@ -108,6 +108,7 @@ def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
     except CheckpointError:
         raise
     except Exception as e:  # each library raises types of its own
+        refuse_pointer(path, CheckpointError)
         said = e.__cause__ or e  # draccus wraps what a config's own check says
         reason = printable(" ".join(f"{type(said).__name__}: {said}".split())[:200])
         raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None

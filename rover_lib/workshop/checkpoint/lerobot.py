@@ -18,7 +18,6 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.act_config import LEROBOTS, lerobot_act
 from rover_lib.workshop.checkpoint import files
@@ -80,8 +79,8 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         by = ORIGIN if origin else GUESS
         if origin:
             facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
-        both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
-        steps = {INNER[0]: inner, OUTER[0]: outer} if both else {OUTER[0]: outer}
+        in_both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
+        steps = {INNER[0]: inner, OUTER[0]: outer} if in_both else {}
         norms = {file: each.affine("action", "ACTION", actions.shape, inverse=True) for file, each in steps.items()}
         facts.compare("normalisation of actions", {file: norm and astuple(norm) for file, norm in norms.items()})
         if (spread := outer.step.state_dict().get("action.std")) is not None:
@@ -100,7 +99,7 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
-            action_unnorm=norms[OUTER[0]],
+            action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
             **{ours: getattr(said, theirs) for ours, theirs in LEROBOTS.items()},
         )
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
@@ -253,13 +252,11 @@ class Normaliser:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    refuse_pointer(path, CheckpointError)
     with files.as_checkpoint_error(path):
         return dict(read_json(path, files.JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    refuse_pointer(path, CheckpointError)
     if not path.is_file():
         what = f"{printable(str(path))}: not found, or not a file"
         raise CheckpointError(what, remedy="merge an adapter or pieces where it was trained, and save_pretrained")

@@ -293,16 +293,15 @@ class _Dataset:
 
         The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
         """
-        shown = [(*self._shown(row, key), row) for row in self.entries]
+        shown = [(*self._shown(row, key), row["episode_index"], row["length"]) for row in self.entries]
         for file in dict.fromkeys(path for path, *_ in shown):
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
                 untrusted.check_video(file, size)
-        other = [row for _, begin, end, row in shown if abs((end - begin) * self.fps - row["length"]) >= 1]
-        wrong = {row["episode_index"] for row in other}
+        wrong = {number for _, begin, end, number, n in shown if abs((end - begin) * self.fps - n) >= 1}
         for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
-                wrong.add(after[3]["episode_index"])
+                wrong.add(after[3])
         if wrong:
             found = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
             remedy = "merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again"
@@ -372,8 +371,7 @@ def _read_info(root: Path) -> dict[str, Any]:
         what = f"{path}: lacks a data_path, frames per second, or features with dtype and shape{also}"
         raise _broken(what, quote(fps))
     for key, others in ALSO.items():
-        column = next((name for name in (key, *others) if name in features), None)
-        if column:
+        if column := next((name for name in (key, *others) if name in features), None):
             features[key] = features[column] | {"column": column}
     return info
 

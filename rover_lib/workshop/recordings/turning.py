@@ -69,9 +69,8 @@ class Sides:
     @property
     def side(self) -> str | None:
         # Each says little if it is short; together they may be sure.
-        signed = [
-            math.copysign(t.sure, t.correlation) for t in self.turnings if t.correlation and t.spread >= LEAST_SPREAD
-        ]
+        steered = [t for t in self.turnings if t.spread >= LEAST_SPREAD]
+        signed = [math.copysign(t.sure, t.correlation) for t in steered if t.correlation]
         together = sum(signed) / math.sqrt(len(signed)) if signed else 0.0
         return None if abs(together) < SURE else "right" if together < 0 else "left"
 
