@@ -37,6 +37,7 @@ WRONG = [
     ("run --only 04 --name mine --samples 5", "no parameter samples"),
     ("inspect nothing.pt", "nothing.pt: not found"),
     ("inspect notes.txt", "notes.txt: an unknown kind of file, not a checkpoint"),
+    ("inspect pretrained_model/config.json", "config.json: JSON or safetensors, not a checkpoint"),
     ("inspect lfs.pth", "git lfs pull"),
     ("report runs/mine", "runs/mine: no verdict without"),
     ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),

@@ -21,7 +21,7 @@ from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, ACTIVATIONS, BACKBONES, ActConfig, Affine, inputs_of, predictions
 from rover_lib.workshop.act_config import imagenet, lerobot_act
 from rover_lib.workshop.checkpoint import files
-from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts, is_nothing
+from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
@@ -93,7 +93,7 @@ class Checkpoint:
             what = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
             raise CheckpointError(what, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
         for key, value in facts.unknown.items():
-            if self.format == "lerobot" and not is_nothing(value):
+            if self.format == "lerobot" and value is not None:
                 raise facts.refusal(key, value, "and nobody here knows what that does")
         guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
         if guessed and not given:  # our own recordings, which it was not trained on

@@ -31,7 +31,10 @@ NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", "r
 
 
 class Facts:
-    """The facts of the policy at `path`: {fact: (value, who says it)}, keys whose meaning is unknown, and notes."""
+    """The facts of the policy at `path`: {fact: (value, who says it)}, notes, and keys whose meaning is unknown.
+
+    Of such a key that changes nothing, as its value or its name says, the value is None.
+    """
 
     def __init__(self, path: Path, said: str = ""):
         """said: what the user says, such as "rate=20 actions=throttle,steering size=64x48 ignore=KEY,KEY"."""
@@ -150,7 +153,7 @@ class _Key:
             return self.value
         of_training = self.has("training") or not self.words.isdisjoint(WORDS["augments"])
         usual = any(_same(self.value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
-        return is_nothing(self.value) or of_training or usual
+        return (self.value is not True and self.value in NOTHING) or of_training or usual
 
     def changes(self) -> str:
         """Say what it may change by the words of its name, or "" if they say nothing of the kind."""
@@ -171,11 +174,6 @@ class _Key:
         if about and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
             return "and nobody here knows what that does to its numbers or pictures"
         return ""
-
-
-def is_nothing(value: Any) -> bool:
-    """Whether a key's value is one that changes nothing, such as a scale of 1."""
-    return value is not True and value in NOTHING
 
 
 def words_of(key: str) -> set[str]:

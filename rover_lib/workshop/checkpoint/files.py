@@ -77,15 +77,13 @@ def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
     Raises CheckpointError unless all names begin so and all weights are dense floats with values.
     """
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
-    state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
-    if all(isinstance(k, str) for k in state):
-        state = {re.sub(WRAPPERS, "", k): v for k, v in state.items()}
-        if "action_head.weight" in state:  # those of the network, without the policy around it
-            state = {f"model.{k}": v for k, v in state.items()}
+    state = {re.sub(WRAPPERS, "", str(k)): v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
+    if "action_head.weight" in state:  # those of the network, without the policy around it
+        state = {f"model.{k}": v for k, v in state.items()}
     odd = []
     for key, weight in state.items():
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
-        if not isinstance(key, str) or not dense or not weight.is_floating_point():  # as a quantized tensor is not
+        if not dense or not weight.is_floating_point():  # as a quantized tensor is not
             odd.append(key)
     if odd:
         what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"

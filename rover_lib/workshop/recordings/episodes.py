@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ class _Frame:
     number: int
     time_s: float
     path: Path
-    size: tuple[int, int] | None  # None: it cannot be used
+    is_whole: bool  # and of the usual size; else it cannot be used
 
 
 def load_recordings(
@@ -194,8 +194,7 @@ def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
-    listed: list[tuple[int, float, str]] = []
-    numbers: set[float] = set()
+    listed: dict[float, tuple[int, float, str]] = {}
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
@@ -207,20 +206,19 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             said = quote_all(row.get(name) for name in written.FRAME_FIELDS)
             faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {said}")
             continue
-        if number in numbers:
+        if number in listed:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
-        numbers.add(number)
-        listed.append((int(number), time_s, name))
-    found = check_pictures(folder, [name for *_, name in listed], path, faults)
-    frames = [_Frame(number, time_s, *each) for (number, time_s, _), each in zip(listed, found, strict=True)]
-    sizes = Counter(f.size for f in frames if f.size)
+        listed[number] = int(number), time_s, name
+    found = check_pictures(folder, [name for *_, name in listed.values()], path, faults)
+    sizes = Counter(size for _, size in found if size)
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
-    for i, frame in enumerate(frames):
-        if frame.size and frame.size != usual:
-            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*frame.size, *usual)
-            faults.add(frame.path, "another_size", note)
-            frames[i] = replace(frame, size=None)
+    frames = []
+    for (number, time_s, _), (picture, size) in zip(listed.values(), found, strict=True):
+        if size and size != usual:
+            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*size, *usual)
+            faults.add(picture, "another_size", note)
+        frames.append(_Frame(number, time_s, picture, is_whole=size == usual))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
@@ -311,7 +309,6 @@ def _make_samples(
     faults.add(folder, "hole_in_time", note, len(holes))
 
     samples: list[Sample] = []
-    unknown_state = 0
     drivers = [c.driver if c else "" for c in nearest]
     held = np.array([driver == written.NOBODY for driver in drivers])
     breaks = np.union1d(holes, np.flatnonzero(held[1:] != held[:-1]) + 1)
@@ -322,16 +319,15 @@ def _make_samples(
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
         for k, i in enumerate(segment.tolist()):
-            if frames[i].size is None:
+            if not frames[i].is_whole:
                 continue
             if k == 0 and i > 0:
-                unknown_state += 1
+                faults.add(folder, "frame_without_state", "the previous frame's action is not known")
                 continue
             state = actions[i - 1] if k else np.asarray(NEUTRAL, np.float32)
             numbers = state.copy(), chunks[k], pads[k]
             shown = folder.name, frames[i].path, float(times_s[i] - times_s[0])
             samples.append(Sample(*shown, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
-    faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)
     return tuple(samples)
 
 

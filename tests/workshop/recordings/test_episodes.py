@@ -224,6 +224,8 @@ def test_equal_actions_before_other_scenes_are_no_copy(tmp_path):
         ("set/40_30_ab.jpg", "JetRacer"),
         ("policy_best.ckpt", "the first ACT"),
         ("episode_0.hdf5", "the first ACT"),
+        ("2026-01-01--0/rlog.zst", "openpilot"),
+        ("drives.zip", "unpack it"),
         ("record_7.json", "donkeycar 3.*convert_to_tub_v2.py"),
         ("data/chunk-000/file-000.parquet", "copy the whole dataset"),
         ("notes.md", "no episode folders in it, found .*notes.md; only folders of episodes"),
