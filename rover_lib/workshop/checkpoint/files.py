@@ -63,11 +63,7 @@ OTHERS = (  # how other files begin, what they are, and what to do
     (rb"\s*<", "a web page", "download the file itself"),
     (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
     (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
-    (
-        rb"[^P\x80]",
-        "an unknown kind of file",
-        f"docs/data.md names those read here; if it is damaged, {COPY_AGAIN}",
-    ),
+    (rb"[^P\x80]", "an unknown kind of file", f"docs/data.md names those read here; or is it damaged? {COPY_AGAIN}"),
 )
 
 
