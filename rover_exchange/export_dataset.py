@@ -23,8 +23,9 @@ from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.lerobot_dataset import ACTION, CAR, DRIVEN_BY, INTERVENTION, REPORT, STATE
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, CAMERA, LEAST_RATED, Episode, Recordings, Sample
+from rover_lib.workshop.recordings.lerobot_dataset import CAR, DRIVEN_BY, INTERVENTION, REPORT
+from rover_lib.workshop.recordings.names import ACTION, CAMERA, STATE
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample
 from rover_lib.workshop.recordings.turning import measure_sides
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies

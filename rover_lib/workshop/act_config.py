@@ -19,6 +19,11 @@ BACKBONES = {
     "resnet50": ("bottleneck", (3, 4, 6, 3), 2048),
 }
 ACTIVATIONS = {"relu": nn.ReLU, "gelu": nn.GELU}
+LEROBOTS = {  # fields of ActConfig by which LeRobot means the same, and its names of them
+    "dim": "dim_model", "heads": "n_heads", "feedforward": "dim_feedforward", "encoder_layers": "n_encoder_layers",
+    "decoder_layers": "n_decoder_layers", "latent": "latent_dim", "pre_norm": "pre_norm",
+    "activation": "feedforward_activation",
+}  # fmt: skip
 
 
 def backbone_blocks(backbone: str) -> list[str]:
@@ -96,16 +101,9 @@ def lerobot_act(c: ActConfig, weights: Mapping[str, Tensor] | None = None) -> "A
         vision_backbone=c.backbone,
         pretrained_backbone_weights=None,
         replace_final_stride_with_dilation=c.dilation,
-        pre_norm=c.pre_norm,
-        dim_model=c.dim,
-        n_heads=c.heads,
-        dim_feedforward=c.feedforward,
-        feedforward_activation=c.activation,
-        n_encoder_layers=c.encoder_layers,
-        n_decoder_layers=c.decoder_layers,
         use_vae=c.vae_layers > 0,
-        latent_dim=c.latent,
         n_vae_encoder_layers=max(c.vae_layers, 1),
+        **{theirs: getattr(c, ours) for ours, theirs in LEROBOTS.items()},
     )
     if weights is None:
         return ACTPolicy(config)

@@ -29,14 +29,15 @@ def here(tmp_path, monkeypatch):
 # the kinds, and tests/workshop those of the readers.
 WRONG = [
     # wrong kind or order
-    ("run noise.bin episodes", "noise.bin: not a checkpoint"),
+    ("run noise.bin episodes", "noise.bin: an unknown kind of file, not a checkpoint"),
     ("run noise.bin", "EPISODES"),
     ("run --only 04 --name nothing", "nothing"),
     ("run nothing.pth episodes", "nothing.pth: not found"),
     ("run noise.bin episodes -p worlds many", "worlds must be a whole number"),
     ("run --only 04 --name mine --samples 5", "no parameter samples"),
     ("inspect nothing.pt", "nothing.pt: not found"),
-    ("inspect notes.txt", "notes.txt: no file that"),
+    ("inspect notes.txt", "notes.txt: an unknown kind of file, not a checkpoint"),
+    ("inspect pretrained_model/config.json", "config.json: JSON or safetensors, not a checkpoint"),
     ("inspect lfs.pth", "git lfs pull"),
     ("report runs/mine", "runs/mine: no verdict without"),
     ("drive pretrained_model", "pretrained_model: this is a LeRobot checkpoint"),

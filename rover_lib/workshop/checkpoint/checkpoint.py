@@ -21,7 +21,7 @@ from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, ACTIVATIONS, BACKBONES, ActConfig, Affine, inputs_of, predictions
 from rover_lib.workshop.act_config import imagenet, lerobot_act
 from rover_lib.workshop.checkpoint import files
-from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts, is_nothing
+from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
@@ -93,7 +93,7 @@ class Checkpoint:
             what = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
             raise CheckpointError(what, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
         for key, value in facts.unknown.items():
-            if self.format == "lerobot" and not is_nothing(value):
+            if self.format == "lerobot" and value is not None:
                 raise facts.refusal(key, value, "and nobody here knows what that does")
         guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
         if guessed and not given:  # our own recordings, which it was not trained on
@@ -133,10 +133,10 @@ class Checkpoint:
             states = actions if len(c.state_names) == len(actions) else tuple(range(len(c.state_names)))
         if not guessed and actions == tuple(range(len(actions))):
             return self
-        config, weights = put_in_order(c, self.weights, states, actions)
+        ordered = self._in_order(states, actions)
         # A state that is not looked at may as well be the car's.
         state_names = ACTION_NAMES if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
-        config = replace(config, state_names=state_names, action_names=layout.action_names)
+        config = replace(ordered.config, state_names=state_names, action_names=layout.action_names)
         known: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
         if guessed:
             same = self._varies_as(samples, actions, "actions" in guessed)
@@ -150,7 +150,26 @@ class Checkpoint:
             config = replace(config, cameras=cameras, rate_hz=rate_hz)
             given: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}
             known |= {fact: (given[fact], INFO if same else f"{GUESS}, {INFO}") for fact in guessed}
-        return replace(self._told(config, known, notes), weights=weights)
+        return ordered._told(config, known, notes)
+
+    def _in_order(self, states: tuple[int, ...], actions: tuple[int, ...]) -> "Checkpoint":
+        """Return the policy with its numbers in another order. states, actions: for each number, where it is now."""
+
+        def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
+            return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
+
+        c, weights = self.config, dict(self.weights)
+        for name, order, axis in (
+            ("encoder_robot_state_input_proj.weight", states, 1),
+            ("vae_encoder_robot_state_input_proj.weight", states, 1),
+            ("vae_encoder_action_input_proj.weight", actions, 1),
+            ("action_head.weight", actions, 0),
+            ("action_head.bias", actions, 0),
+        ):
+            if name in weights:
+                weights[name] = weights[name].index_select(axis, torch.tensor(order))
+        c = replace(c, state_norm=reorder(c.state_norm, states), action_unnorm=reorder(c.action_unnorm, actions))
+        return replace(self, config=c, weights=weights)
 
     def _varies_as(self, samples: Sequence[Sample], order: tuple[int, ...], guessed: bool) -> bool:
         """Whether its actions vary as the samples', whose places in the policy are `order`: then it learned from them.
@@ -215,7 +234,6 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
 
     path: a trainer's .pth file; a LeRobot folder with config.json and model.safetensors; the output folder of
     `lerobot-train`, of which the last checkpoint is read, or one of its checkpoints.
-
     checked: the sha256 of weights that an earlier call has held against their config, for which LeRobot takes seconds.
     said: what the user says of it by --facts.
 
@@ -318,28 +336,6 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown:
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
         what = f"{path}: NaN or Inf in {quote_all(bad)}"
         raise CheckpointError(what, remedy="training diverged, take an earlier checkpoint")
-
-
-def put_in_order(
-    c: ActConfig, weights: dict[str, Tensor], states: tuple[int, ...], actions: tuple[int, ...]
-) -> tuple[ActConfig, dict[str, Tensor]]:
-    """Return the policy with its numbers in another order. states, actions: for each number, where it is now."""
-
-    def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
-        return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
-
-    weights = dict(weights)
-    for name, order, axis in (
-        ("encoder_robot_state_input_proj.weight", states, 1),
-        ("vae_encoder_robot_state_input_proj.weight", states, 1),
-        ("vae_encoder_action_input_proj.weight", actions, 1),
-        ("action_head.weight", actions, 0),
-        ("action_head.bias", actions, 0),
-    ):
-        if name in weights:
-            weights[name] = weights[name].index_select(axis, torch.tensor(order))
-    c = replace(c, state_norm=reorder(c.state_norm, states), action_unnorm=reorder(c.action_unnorm, actions))
-    return c, weights
 
 
 def write_both(

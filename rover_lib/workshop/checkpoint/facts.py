@@ -20,7 +20,7 @@ from rover_lib.onboard.checked import is_number
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
 from rover_lib.onboard.recording.episode import CHANNELS
-from rover_lib.workshop.recordings.samples import flat_names, read_as_car
+from rover_lib.workshop.recordings.names import flat_names, read_as_car
 from rover_lib.workshop.untrusted import quote, quote_all
 
 USER, GUESS = "--facts", "a guess"
@@ -31,7 +31,10 @@ NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", "r
 
 
 class Facts:
-    """The facts of the policy at `path`: {fact: (value, who says it)}, keys whose meaning is unknown, and notes."""
+    """The facts of the policy at `path`: {fact: (value, who says it)}, notes, and keys whose meaning is unknown.
+
+    Of such a key that changes nothing, as its value or its name says, the value is None.
+    """
 
     def __init__(self, path: Path, said: str = ""):
         """said: what the user says, such as "rate=20 actions=throttle,steering size=64x48 ignore=KEY,KEY"."""
@@ -67,6 +70,12 @@ class Facts:
             which = " or ".join(f"{USER} {shlex.quote(f'ignore={each}')}" for each in (source, by) if each != USER)
             what = f"{self.path}: {by} and {source} deny each other on its {fact}"
             raise CheckpointError(what, found=f"{quote(str(before))} and {quote(str(value))}", remedy=f"say {which}")
+
+    def compare(self, fact: str, said: Mapping[str, Any]) -> None:
+        """Raise CheckpointError, as `say` does, if two sources deny each other: {source: value}. Nothing is kept."""
+        for source, value in said.items():
+            self.say(fact, value, source)
+        self.known.pop(fact, None)
 
     def read(self, content: Mapping[str, Any], where: str, noted: bool = True) -> None:
         """Read keys that nobody here knows. where: what stands before their names. noted: whether to name the rest.
@@ -130,9 +139,8 @@ class _Key:
         self.words = words_of(name) | (words_of(value) if isinstance(value, str) else set())  # action_type: delta
         self.several = isinstance(value, (list, tuple)) and len(value) > 1
         self.is_label = self.has("labels") and not self.several  # the name of a run may have any words
-        self.done = (self.has("image") and "normali" in name) or any(
-            self.last >= {*these} for these in WORDS["done"]
-        )  # always, here
+        done = any(self.last >= {*these} for these in WORDS["done"])
+        self.done = done or (self.has("image") and "normali" in name)  # always, here
 
     def has(self, kind: str) -> bool:
         """Whether the last part of its name has one of keys.yml's words of this kind."""
@@ -145,7 +153,7 @@ class _Key:
             return self.value
         of_training = self.has("training") or not self.words.isdisjoint(WORDS["augments"])
         usual = any(_same(self.value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
-        return is_nothing(self.value) or of_training or usual
+        return (self.value is not True and self.value in NOTHING) or of_training or usual
 
     def changes(self) -> str:
         """Say what it may change by the words of its name, or "" if they say nothing of the kind."""
@@ -166,11 +174,6 @@ class _Key:
         if about and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
             return "and nobody here knows what that does to its numbers or pictures"
         return ""
-
-
-def is_nothing(value: Any) -> bool:
-    """Whether a key's value is one that changes nothing, such as a scale of 1."""
-    return value is not True and value in NOTHING
 
 
 def words_of(key: str) -> set[str]:

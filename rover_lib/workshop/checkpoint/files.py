@@ -63,6 +63,7 @@ OTHERS = (  # how other files begin, what they are, and what to do
     (rb"\s*<", "a web page", "download the file itself"),
     (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
     (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
+    (rb"[^P\x80]", "an unknown kind of file", f"docs/data.md names those read here; or is it damaged? {COPY_AGAIN}"),
 )
 
 
@@ -72,15 +73,13 @@ def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
     Raises CheckpointError unless all names begin so and all weights are dense floats with values.
     """
     # A batch norm counts its batches; LeRobot's are frozen and drop the count.
-    state = {k: v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
-    if all(isinstance(k, str) for k in state):
-        state = {re.sub(WRAPPERS, "", k): v for k, v in state.items()}
-        if "action_head.weight" in state:  # those of the network, without the policy around it
-            state = {f"model.{k}": v for k, v in state.items()}
+    state = {re.sub(WRAPPERS, "", str(k)): v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
+    if "action_head.weight" in state:  # those of the network, without the policy around it
+        state = {f"model.{k}": v for k, v in state.items()}
     odd = []
     for key, weight in state.items():
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
-        if not isinstance(key, str) or not dense or not weight.is_floating_point():  # as a quantized tensor is not
+        if not dense or not weight.is_floating_point():  # as a quantized tensor is not
             odd.append(key)
     if odd:
         what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
@@ -103,6 +102,7 @@ def as_checkpoint_error(path: Path, remedy: str = COPY_AGAIN) -> Iterator[None]:
     except CheckpointError:
         raise
     except Exception as e:  # each library raises types of its own
+        refuse_pointer(path, CheckpointError)
         said = e.__cause__ or e  # draccus wraps what a config's own check says
         reason = printable(" ".join(f"{type(said).__name__}: {said}".split())[:200])
         raise CheckpointError(f"{path}: LeRobot cannot use it ({reason})", remedy=remedy) from None

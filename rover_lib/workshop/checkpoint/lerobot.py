@@ -7,7 +7,7 @@ statistics and so is left as it is, is checked here.
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +18,11 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act_config import LEROBOTS, lerobot_act
 from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
-from rover_lib.workshop.recordings.samples import camera_names
+from rover_lib.workshop.recordings.names import CAMERA, camera_names
 from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
@@ -80,11 +79,10 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         by = ORIGIN if origin else GUESS
         if origin:
             facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
-        if any(name.startswith("action.") for name in inner.step.state_dict()):  # as in training
-            for source, each in ((INNER[0], inner), (OUTER[0], outer)):
-                norm = each.affine("action", "ACTION", actions.shape, inverse=True)
-                facts.say("normalisation of actions", norm and (norm.scale, norm.shift), source)
-            facts.known.pop("normalisation of actions", None)
+        in_both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
+        steps = {INNER[0]: inner, OUTER[0]: outer} if in_both else {}
+        norms = {file: each.affine("action", "ACTION", actions.shape, inverse=True) for file, each in steps.items()}
+        facts.compare("normalisation of actions", {file: norm and astuple(norm) for file, norm in norms.items()})
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
         pictures = tuple(inner.affine(k, "VISUAL", (3, 1, 1)) or Affine((1.0,) * 3, (0.0,) * 3) for k in images)
@@ -94,22 +92,15 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             state_names=files.name_numbers(numbers.shape[0] if numbers else 2, "state"),
             action_names=facts.default("actions", files.name_numbers(actions.shape[0], "action"), by),
             chunk=facts.default("chunk", said.chunk_size, CONFIG),
-            dim=said.dim_model,
-            heads=said.n_heads,
-            feedforward=said.dim_feedforward,
-            encoder_layers=said.n_encoder_layers,
-            decoder_layers=said.n_decoder_layers,
-            latent=said.latent_dim,
             vae_layers=said.n_vae_encoder_layers if said.use_vae else 0,
             backbone=facts.default("backbone", said.vision_backbone, CONFIG),
             dilation=bool(said.replace_final_stride_with_dilation),
-            pre_norm=said.pre_norm,
-            activation=said.feedforward_activation,
             rate_hz=facts.default("rate", files.RATE_HZ, by),
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
-            action_unnorm=outer.affine("action", "ACTION", actions.shape, inverse=True),
+            action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
+            **{ours: getattr(said, theirs) for ours, theirs in LEROBOTS.items()},
         )
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
     return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
@@ -141,9 +132,7 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     said = _read_json(path) if path.exists() else {}
     policy, dataset = said.get("policy") or {}, dict(said.get("dataset") or {})
     for key in SAME & raw.keys() & policy.keys():
-        facts.say(key, raw[key], f"{CONFIG}:{key}")
-        facts.say(key, policy[key], f"{TRAINED}:policy.{key}")
-        facts.known.pop(key, None)
+        facts.compare(key, {f"{CONFIG}:{key}": raw[key], f"{TRAINED}:policy.{key}": policy[key]})
     transforms = dataset.pop("image_transforms", None) or {}
     rest = {k: v for k, v in said.items() if k not in NOT_OF_POLICY} | {"dataset": dataset}
     facts.read(rest | {"policy": {k: v for k, v in policy.items() if k not in raw}}, f"{TRAINED}:", noted=False)
@@ -263,13 +252,11 @@ class Normaliser:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    refuse_pointer(path, CheckpointError)
     with files.as_checkpoint_error(path):
         return dict(read_json(path, files.JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
-    refuse_pointer(path, CheckpointError)
     if not path.is_file():
         what = f"{printable(str(path))}: not found, or not a file"
         raise CheckpointError(what, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
@@ -290,10 +277,8 @@ def write_lerobot(folder: Path, config: ActConfig, weights: dict[str, Tensor], o
     raw, normed = NormalizationMode.IDENTITY, NormalizationMode.MEAN_STD
     modes = {"STATE": normed if config.state_norm else raw, "ACTION": normed if config.action_unnorm else raw}
     policy.config.normalization_mapping = {"VISUAL": normed, **modes}
-    stats = {
-        f"observation.images.{name}": _statistics(norm, (3, 1, 1))
-        for name, norm in zip(config.cameras, config.image_norm, strict=True)
-    }
+    pictures = zip(config.cameras, config.image_norm, strict=True)
+    stats = {f"{CAMERA}{name}": _statistics(norm, (3, 1, 1)) for name, norm in pictures}
     if config.state_norm is not None:
         stats["observation.state"] = _statistics(config.state_norm, (-1,))
     if (scaled := config.action_unnorm) is not None:

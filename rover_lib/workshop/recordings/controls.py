@@ -117,14 +117,12 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
         read.append((i, values, driver))
-    pairs, formulas = {}, {}
-    for name in ACTION_NAMES:
-        recorded, meant, older = _read_actions(pwm.channel(name), read, path, faults)
-        pairs[name] = recorded, meant
-        if older:
-            formulas[name] = _formula(older)
+    found = {name: _read_actions(pwm.channel(name), read, path, faults) for name in ACTION_NAMES}
+    formulas = {name: _formula(older) for name, (*_, older) in found.items() if older}
     # Too few readings to show a formula are of older firmware too, if the other channel's are.
-    actions = {n: _take(pwm.channel(n), *both, bool(formulas), path, faults) for n, both in pairs.items()}
+    actions = {}
+    for name, (recorded, meant, _) in found.items():
+        actions[name] = _take(pwm.channel(name), recorded, meant, bool(formulas), path, faults)
     controls = []
     for i, values, driver in read:
         pair = actions["steering"].get(i), actions["throttle"].get(i)

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,14 +30,14 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
-from rover_lib.onboard.kinds import EPISODE_FILES
+from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
+from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
@@ -49,6 +49,8 @@ TABLES = {
 }
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
+Found = tuple[Path, tuple[int, int] | None]  # a listed picture, and its (height, width) if it is whole
+Samples = tuple[Sample, ...]
 HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
 
@@ -59,9 +61,9 @@ class Split:
     choosing: to pick observers and mixed blocks. held_out: judges, and nothing else.
     """
 
-    calibration: tuple[Sample, ...]
-    choosing: tuple[Sample, ...]
-    held_out: tuple[Sample, ...]
+    calibration: Samples
+    choosing: Samples
+    held_out: Samples
     note: str | None
 
     @property
@@ -76,7 +78,7 @@ class _Frame:
     number: int
     time_s: float
     path: Path
-    size: tuple[int, int] | None  # None: it cannot be used
+    is_whole: bool  # and of the usual size; else it cannot be used
 
 
 def load_recordings(
@@ -92,8 +94,8 @@ def load_recordings(
     root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
-    if lerobot_dataset.is_dataset(root):
-        return lerobot_dataset.load_dataset(source, chunk, progress)
+    if "dataset" in kinds_of(root):
+        return load_dataset(source, chunk, progress)
     for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
         if names not in ((), ACTION_NAMES):
             what, found = f"{root}: our recordings have one camera and name their actions", ",".join(names)
@@ -121,43 +123,40 @@ def load_recordings(
         faults.add(part, "killed_recording", finish)
     for folder in sorted({*others} - {*folders}):
         faults.add(folder, "no_episode", f"neither {written.DATA} nor CSV files; drives in folders of it are not read")
-    listed = progress(folders, desc="reading episodes", total=len(folders))
-    episodes = [episode for folder in listed if (episode := _load_episode(folder, chunk, sync_s, faults))]
+    episodes = []
+    for folder in progress(folders, desc="reading episodes", total=len(folders)):
+        try:
+            episodes.append(_load_episode(folder, chunk, sync_s, faults))
+        except CarError as e:
+            faults.add(folder, "no_car", str(e))
+        except EpisodeError as e:
+            faults.add(folder, e.kind or "no_formula", str(e))
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
     return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
 
 
-def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode | None:
-    """Read one folder's episode. None if it has no usable sample; a fault then says why."""
+def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode:
+    """Read one folder's episode. Raises CarError, and EpisodeError of the fault's kind, if it has no usable sample."""
     try:
         with limited_memory():
             content, tables = _read_tables(folder, faults)
             # read_car_of reads larger files
             car = written.car_in(content.get("metadata"), folder) if content else written.read_car_of(folder)
     except (OSError, ValueError, csv.Error, MemoryError) as e:
-        why = quote(str(e) or "too much memory")
-        faults.add(folder, "unreadable", f"neither {written.DATA} nor its CSV files can be read: {why}")
-        return None
-    except CarError as e:
-        faults.add(folder, "no_car", str(e))
-        return None
+        what = f"neither {written.DATA} nor its CSV files can be read: {quote(str(e) or 'too much memory')}"
+        raise EpisodeError(what, kind="unreadable") from None
     (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
-    try:
-        controls, formulas = read_controls(source, control_rows, car.pwm, faults)
-    except EpisodeError as e:
-        faults.add(folder, "no_formula", str(e))
-        return None
+    controls, formulas = read_controls(source, control_rows, car.pwm, faults)
     frames = _read_frames(folder, frames_source, frame_rows, faults)
-    samples: tuple[Sample, ...] = ()
+    samples: Samples = ()
     if controls and frames:
         controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        note = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
-        faults.add(folder, "nothing_usable", note)
-        return None
+        what = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        raise EpisodeError(what, kind="nothing_usable")
     files = tuple(p for name in EPISODE_FILES if (p := folder / name).is_file())
     counts = frames[-1].time_s - frames[0].time_s, len(frame_rows), len(control_rows)
     label = said if isinstance(said := content.get("action_label"), str) else ""
@@ -195,8 +194,7 @@ def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
 
 def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_Frame]:
     """Return the listed frames that have a time, ordered by it. A picture of another size than most cannot be used."""
-    listed: list[tuple[int, float, str]] = []
-    numbers: set[float] = set()
+    listed: dict[float, tuple[int, float, str]] = {}
     for i, row in enumerate(rows):
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
@@ -208,20 +206,19 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             said = quote_all(row.get(name) for name in written.FRAME_FIELDS)
             faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {said}")
             continue
-        if number in numbers:
+        if number in listed:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
-        numbers.add(number)
-        listed.append((int(number), time_s, name))
-    found = check_pictures(folder, [name for *_, name in listed], path, faults)
-    frames = [_Frame(number, time_s, *each) for (number, time_s, _), each in zip(listed, found, strict=True)]
-    sizes = Counter(f.size for f in frames if f.size)
+        listed[number] = int(number), time_s, name
+    found = check_pictures(folder, [name for *_, name in listed.values()], path, faults)
+    sizes = Counter(size for _, size in found if size)
     usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
-    for i, frame in enumerate(frames):
-        if frame.size and frame.size != usual:
-            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*frame.size, *usual)
-            faults.add(frame.path, "another_size", note)
-            frames[i] = replace(frame, size=None)
+    frames = []
+    for (number, time_s, _), (picture, size) in zip(listed.values(), found, strict=True):
+        if size and size != usual:
+            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*size, *usual)
+            faults.add(picture, "another_size", note)
+        frames.append(_Frame(number, time_s, picture, is_whole=size == usual))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
@@ -233,23 +230,21 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
     return kept
 
 
-def check_pictures(
-    folder: Path, names: Sequence[str], listing: Path, faults: Faults, inside: str = "."
-) -> list[tuple[Path, tuple[int, int] | None]]:
+def check_pictures(folder: Path, names: Sequence[str], listing: Path, faults: Faults, inside: str = ".") -> list[Found]:
     """Return each listed picture's path and its (height, width): None, and a fault, unless it is there and whole.
 
     names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`. Those that
     are whole are kept in the cache, and decoded again only after they have changed.
     """
-    found: list[tuple[Path, tuple[int, int] | None]] = []
+    found: list[Found] = []
     home, known, whole = os.path.realpath(folder), dict[str, Any](), dict[str, Any]()
     cache = cache_root() / f"pictures-{key_of({'in': home})}.json"
     with suppress(OSError, ValueError):  # none yet, or half of one
         known = dict(read_json(cache))
 
-    def check(name: str, path: Path) -> tuple[str, Sequence[int]] | None:
+    def check(name: str, path: Path) -> tuple[str, Sequence[int]]:
         if not os.path.realpath(path).startswith(f"{home}{os.sep}"):
-            return None
+            raise EpisodeError(f"{quote(name)} is outside of the episode")
         there = path.stat()
         # The time of any change: a copy may bring along the time of its content.
         key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
@@ -261,11 +256,10 @@ def check_pictures(
     for name, path, checked in zip(names, paths, checks, strict=True):
         size = None
         try:
-            if given := checked.result():
-                height, width = whole[given[0]] = given[1]
-                size = height, width
-            else:
-                faults.add(listing, "path_leaves_folder", f"{quote(name)} is outside of the episode")
+            key, (height, width) = checked.result()
+            size = whole[key] = height, width
+        except EpisodeError as e:
+            faults.add(listing, "path_leaves_folder", str(e))
         except CameraError as e:
             faults.add(path, "broken_jpeg", str(e))
         except (OSError, ValueError):  # not there, unreadable, a long name, a zero byte
@@ -290,7 +284,7 @@ def _nearest(times_s: np.ndarray, controls: list[Control], within_s: float) -> l
 
 def _make_samples(
     folder: Path, car: Car, frames: list[_Frame], controls: list[Control], chunk: int, sync_s: float, faults: Faults
-) -> tuple[Sample, ...]:
+) -> Samples:
     times_s = np.array([f.time_s for f in frames])
     nearest = _nearest(times_s, controls, sync_s)
     if not any(nearest):
@@ -315,7 +309,6 @@ def _make_samples(
     faults.add(folder, "hole_in_time", note, len(holes))
 
     samples: list[Sample] = []
-    unknown_state = 0
     drivers = [c.driver if c else "" for c in nearest]
     held = np.array([driver == written.NOBODY for driver in drivers])
     breaks = np.union1d(holes, np.flatnonzero(held[1:] != held[:-1]) + 1)
@@ -326,16 +319,15 @@ def _make_samples(
         index = np.arange(n)[:, None] + np.arange(chunk)
         chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
         for k, i in enumerate(segment.tolist()):
-            if frames[i].size is None:
+            if not frames[i].is_whole:
                 continue
             if k == 0 and i > 0:
-                unknown_state += 1
+                faults.add(folder, "frame_without_state", "the previous frame's action is not known")
                 continue
             state = actions[i - 1] if k else np.asarray(NEUTRAL, np.float32)
             numbers = state.copy(), chunks[k], pads[k]
             shown = folder.name, frames[i].path, float(times_s[i] - times_s[0])
             samples.append(Sample(*shown, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
-    faults.add(folder, "frame_without_state", "the previous frame's action is not known", unknown_state)
     return tuple(samples)
 
 
@@ -355,7 +347,7 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
     far = abs(count / len(episodes) - held_out_share) > 0.1
     note = f"only {len(episodes)} episodes: {count} of them are held out, not {held_out_share:.0%}" if far else None
 
-    def samples_of(drawn: list[int]) -> tuple[Sample, ...]:
+    def samples_of(drawn: list[int]) -> Samples:
         return tuple(s for i in sorted(drawn) for s in episodes[i].samples)
 
     half = count // 2
@@ -382,9 +374,7 @@ def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Spli
     return Split(tuple(calibration), tuple(choosing), tuple(held_out), note)
 
 
-def choose_calibration(
-    samples: tuple[Sample, ...], count: int = 200, seed: int = 0
-) -> tuple[tuple[Sample, ...], str | None]:
+def choose_calibration(samples: Samples, count: int = 200, seed: int = 0) -> tuple[Samples, str | None]:
     """Choose at most `count` samples that cover the recorded actions, in the given order; the same for the same seed.
 
     One half, so that observers see the extremes, is chosen by farthest points over (state, four actions along the

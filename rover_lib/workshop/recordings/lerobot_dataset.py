@@ -26,10 +26,10 @@ from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
-from rover_lib.workshop.recordings.samples import ACTION, STATE, Episode, Layout, Recordings, Sample, Source
+from rover_lib.workshop.recordings.names import ACTION, STATE, camera_names, name_numbers, name_states
+from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
 
 INFO = Path("meta/info.json")
@@ -59,11 +59,6 @@ OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-
 def _broken(what: str, found: object = None) -> EpisodeError:
     """The error of a dataset that no LeRobot wrote so, for the caller to raise."""
     return EpisodeError(f"{what}: a broken dataset", found=found, remedy=WRITE_ANEW)
-
-
-def is_dataset(root: Path) -> bool:
-    """Whether a folder is a LeRobotDataset, of whatever version."""
-    return (root / INFO).is_file()
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,10 +238,9 @@ class _Dataset:
         counts = self.info.get("total_episodes", len(starts)), self.info.get("total_frames", len(number))
         note = f"{quote(counts[0])} episodes of {quote(counts[1])} frames, and here are {here}: a part?"
         self.faults.add(self.root / INFO, "another_total", note, counts != (len(starts), len(number)))
-        scrambled = 0
-        for row, start, length in zip(self.entries, starts.tolist(), lengths.tolist(), strict=True):
-            ends = row.get("dataset_from_index"), row.get("dataset_to_index")
-            scrambled += ends not in ((None, None), (start, start + length))
+        ends = [(row.get("dataset_from_index"), row.get("dataset_to_index")) for row in self.entries]
+        right = zip(starts.tolist(), (starts + lengths).tolist(), strict=True)
+        scrambled = sum(each not in ((None, None), here) for each, here in zip(ends, right, strict=True))
         note = "dataset_from_index and _to_index of an early converter: convert it again by a newer LeRobot to train"
         self.faults.add(self.root / "meta/episodes", "scrambled_index", note, scrambled)
 
@@ -299,16 +293,15 @@ class _Dataset:
 
         The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
         """
-        shown = [(*self._shown(row, key), row) for row in self.entries]
+        shown = [(*self._shown(row, key), row["episode_index"], row["length"]) for row in self.entries]
         for file in dict.fromkeys(path for path, *_ in shown):
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
                 untrusted.check_video(file, size)
-        other = [row for _, begin, end, row in shown if abs((end - begin) * self.fps - row["length"]) >= 1]
-        wrong = {row["episode_index"] for row in other}
+        wrong = {number for _, begin, end, number, n in shown if abs((end - begin) * self.fps - n) >= 1}
         for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
-                wrong.add(after[3]["episode_index"])
+                wrong.add(after[3])
         if wrong:
             found = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
             remedy = "merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again"
@@ -378,8 +371,7 @@ def _read_info(root: Path) -> dict[str, Any]:
         what = f"{path}: lacks a data_path, frames per second, or features with dtype and shape{also}"
         raise _broken(what, quote(fps))
     for key, others in ALSO.items():
-        column = next((name for name in (key, *others) if name in features), None)
-        if column:
+        if column := next((name for name in (key, *others) if name in features), None):
             features[key] = features[column] | {"column": column}
     return info
 
@@ -387,7 +379,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout, dict[str, str]]:
     """Find the names and columns of states and actions, and the cameras: by name the key."""
     features = info["features"]
-    keys = recorded.camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
+    keys = camera_names(k for k, f in features.items() if f.get("dtype") in ("image", "video"))
     if not keys:
         remedy = f"if one of these is a camera's, call its dtype 'image' or 'video' in {INFO}, else record with one"
         raise EpisodeError(f"{root}: has no camera", found=quote_all(features), remedy=remedy)
@@ -398,19 +390,17 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
         remedy = "say once each what the policy looks through: --camera NAME, with commas between several"
         raise EpisodeError(f"{root}: {what}", found=quote_all(keys), remedy=remedy)
     sizes = {name: _picture_size(root, keys[name], features[keys[name]]) for name in names}
-    for key in (STATE, ACTION):
-        if key == STATE and key not in features:
-            if others := [k for k in features if re.search(STATES, k) and "environment" not in k]:
-                remedy = f"if it is the state, call it '{STATE}' in {INFO} and in the tables, else remove it"
-                raise EpisodeError(f"{root}: has no '{STATE}'", found=quote_all(others), remedy=remedy)
-            continue  # then it is the last action
+    has_state, given = STATE in features, source.action_names  # without one it is the last action
+    if not has_state and (others := [k for k in features if re.search(STATES, k) and "environment" not in k]):
+        remedy = f"if it is the state, call it '{STATE}' in {INFO} and in the tables, else remove it"
+        raise EpisodeError(f"{root}: has no '{STATE}'", found=quote_all(others), remedy=remedy)
+    for key in (STATE, ACTION) if has_state else (ACTION,):
         row = features.get(key, {})  # LeRobot makes 1 of 0.3 where it says bool
         if len(row.get("shape") or ()) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
             what = f"{root}: its '{key}' is missing or not a row of numbers"
             raise EpisodeError(what, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
-    actions, action_order = recorded.name_numbers(root, features, ACTION, source.action_names)
-    has_state, given = STATE in features, source.action_names
-    states, state_order = recorded.name_states(root, features, given) if has_state else (actions, action_order)
+    actions, action_order = name_numbers(root, features, ACTION, given)
+    states, state_order = name_states(root, features, given) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)
     return layout, {name: keys[name] for name in names}
 

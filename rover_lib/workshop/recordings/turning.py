@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -68,9 +69,8 @@ class Sides:
     @property
     def side(self) -> str | None:
         # Each says little if it is short; together they may be sure.
-        signed = [
-            math.copysign(t.sure, t.correlation) for t in self.turnings if t.correlation and t.spread >= LEAST_SPREAD
-        ]
+        steered = [t for t in self.turnings if t.spread >= LEAST_SPREAD]
+        signed = [math.copysign(t.sure, t.correlation) for t in steered if t.correlation]
         together = sum(signed) / math.sqrt(len(signed)) if signed else 0.0
         return None if abs(together) < SURE else "right" if together < 0 else "left"
 
@@ -134,17 +134,11 @@ def measure_turning(episode: Episode) -> Turning:
 def _shifts(samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
     """Return when two pictures were compared, in seconds, and how fast the background moved right, in pixels/s."""
     times_s, shifts = [], []
-    before = None
+    grey = lru_cache(1)(_grey)  # the second picture of a pair is the first one of the next
     for first, second in pairwise(samples[::STEP]):
-        if second.row - first.row != STEP:
-            before = None
-            continue
-        before = _grey(first) if before is None else before
-        after = _grey(second)
-        if (shift := _shift(before, after)) is not None:
+        if second.row - first.row == STEP and (shift := _shift(grey(first), grey(second))) is not None:
             times_s.append((first.time_s + second.time_s) / 2)
             shifts.append(shift / (second.time_s - first.time_s))
-        before = after
     return np.array(times_s), np.array(shifts)
 
 

@@ -9,7 +9,7 @@ from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.cli import describe_artifact
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import check_kind, kinds_of, read_head, refuse_pointer
+from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
@@ -47,10 +47,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}
-    refuse_pointer(path, RoverError)
-    if path.is_file() and read_head(path, 1) not in (b"P", b"\x80"):  # of a zip, or of a pickle
-        raise RoverError(f"{path}: no file that this project reads or writes", remedy="docs/data.md names them")
-    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+    from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint  # it names other files, as for `rover run`
 
     checkpoint = load_checkpoint(path, said=source.facts)
     return {"checkpoint": {"sha256": checkpoint.sha256, **checkpoint.report}}

@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.kinds import kinds_of
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, check_limits, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
-from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.run.units import in_todays_units
 
@@ -44,7 +44,7 @@ def load(
     policy = load_checkpoint(checkpoint, checked, source.facts)
     theirs = policy.config.cameras
     if policy.format == "lerobot" and source.cameras in ((), theirs):  # a trainer's file does not name its camera
-        source = replace(source, cameras=theirs if is_dataset(source.path) else ())
+        source = replace(source, cameras=theirs if "dataset" in kinds_of(source.path) else ())
     recordings = load_recordings(source, policy.config.chunk, p["sync_s"], progress)
     parts = split(recordings, p["held_out_share"], p["seed"])
     recorded = policy.recorded_as(recordings.layout, recordings.samples)

@@ -14,7 +14,6 @@ from rover_lib.onboard.car.pwm import Channel
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation, planned_error
 from rover_lib.workshop.recordings.controls import OLD
-from rover_lib.workshop.recordings.lerobot_dataset import is_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
 
 FRAMES = 8  # planned twice, in FP32
@@ -33,7 +32,7 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
     recorded = {n: OLD[n] for e in recordings.episodes for n in e.formulas}
     # Throttle tells the two readings apart: standing still is 0 in one of them only.
     tried = [recorded] if recorded else []
-    if car.drives_like(Car()) and not is_dataset(recordings.root) and OLD not in tried:
+    if car.drives_like(Car()) and recordings.layout.rate_hz is None and OLD not in tried:
         tried.append(OLD)
     few = pick_evenly(samples, FRAMES)
     best, least = policy, BETTER * planned_error(policy, few, 1) if tried else 0.0

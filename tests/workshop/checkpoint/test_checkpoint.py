@@ -46,7 +46,7 @@ def refused(path) -> str:
     return message
 
 
-def test_reads_the_trainers_file(tiny, tiny_policy):
+def test_reads_the_trainers_file(tiny, tiny_file, tiny_policy, tmp_path):
     c, r = tiny.config, tiny.report
     assert (c.chunk, c.dim, c.heads, c.feedforward, c.latent, c.vae_layers) == (32, 64, 4, 128, 32, 1)
     assert c.image_sizes == ((72, 128),) and c.action_names == ("steering", "throttle")
@@ -56,6 +56,10 @@ def test_reads_the_trainers_file(tiny, tiny_policy):
     assert r["file_mb"] == pytest.approx(r["weights_mb"] + r["optimizer_mb"], rel=0.02)
     pixels = "(pixel / 255 - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)"
     assert r["normalisation"] == {"cam_front": pixels, "state": "state, as it is", "action": "output, as it is"}
+    # numpy 1 pickles the float64 as numpy.core, and numpy 2 as numpy._core
+    older = {"data.pkl": lambda data: data.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")}
+    path = rewritten(tiny_file, tmp_path / "older.pth", older)
+    assert load_checkpoint(path).report["best_val_loss"] == r["best_val_loss"]
 
 
 def test_what_is_not_needed_may_be_missing_or_odd(tiny, tiny_policy, tmp_path):
@@ -70,13 +74,6 @@ def test_what_is_not_needed_may_be_missing_or_odd(tiny, tiny_policy, tmp_path):
     assert found.config == tiny.config and found.report["trainer_config"]["size"] == [1, 2]
     assert all(torch.equal(v, tiny.weights[k]) for k, v in found.weights.items() if k != "action_head.weight")
     assert "best_model.pth" in refused(tmp_path)  # a folder that holds it
-
-
-def test_reads_scalars_of_older_numpy(tiny_file, tmp_path):
-    """best_val_loss is a numpy float64, which numpy 1 pickles as numpy.core and numpy 2 as numpy._core."""
-    older = {"data.pkl": lambda data: data.replace(b"numpy._core.multiarray", b"numpy.core.multiarray")}
-    path = rewritten(tiny_file, tmp_path / "older.pth", older)
-    assert load_checkpoint(path).report["best_val_loss"] == pytest.approx(0.15)
 
 
 class Evil:
@@ -129,8 +126,6 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
         path.write_bytes(data)
         refused(path)
     assert "checksum" in refused(path)
-    torch.save([1], path, _use_new_zipfile_serialization=False)
-    assert "1.6" in refused(path)
     assert "list" in refused(write([1, 2], path))
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as whole:
         whole.writestr("archive/more", bytes(1000))
@@ -172,8 +167,6 @@ def folder(policy, tmp_path_factory):
     path = tmp_path_factory.mktemp("lerobot")
     saved_normalised(policy, path)
     for name in (INNER, OUTER):
-        step = {INNER: "normalizer_processor", OUTER: "unnormalizer_processor"}[name]
-        edit(path / name, lambda c, step=step: c.update(steps=[s for s in c["steps"] if s["registry_name"] == step]))
         edit(path / name, in_step(lambda s: s.update(state_file=STATS)))
         edit(path / name, in_step(lambda s: s["config"]["norm_map"].update(VISUAL="IDENTITY", ACTION="MIN_MAX")))
     save_file(load_file(next(path.glob("policy_pre*.safetensors"))), path / STATS)
@@ -187,7 +180,7 @@ def copied(folder, tmp_path):
 
 def in_step(change):
     """Return an edit of a processor file that applies `change` to its normaliser."""
-    return lambda content: change(content["steps"][0])
+    return lambda content: [change(s) for s in content["steps"] if s["registry_name"].endswith("normalizer_processor")]
 
 
 def test_refuses_damaged_and_divided_folders(copied):
@@ -210,10 +203,8 @@ def test_refuses_damaged_and_divided_folders(copied):
         (CONFIG, lambda c: c.pop("type"), 'write "type": "act" into it'),
         (CONFIG, lambda c: c.update(feedforward_activation="glu"), "'glu'"),
         (CONFIG, lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
-        (CONFIG, lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
         (CONFIG, lambda c: c.update(input_features={}), "features"),
         (CONFIG, lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
-        (CONFIG, lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
         (CONFIG, lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, -72, 128]), "features"),
         (CONFIG, lambda c: c.update(chunk_size=16, n_action_steps=16), "config and weights do not agree"),
         (CONFIG, lambda c: c["output_features"]["action"].update(type="STATE"), "features"),
@@ -276,13 +267,8 @@ def test_a_state_that_never_changed_is_minus_one(copied, value):
 def test_the_steps_own_type_of_a_feature_decides_how_it_is_normalised(policy, tmp_path):
     """LeRobot's step has types and modes of its own, whatever config.json says."""
     inner, outer = saved_normalised(policy, tmp_path)
-
-    def change(content):
-        (config,) = (s["config"] for s in content["steps"] if s["registry_name"] == "normalizer_processor")
-        config["features"]["observation.state"]["type"] = "ENV"
-        config["norm_map"]["ENV"] = "MIN_MAX"
-
-    edit(tmp_path / INNER, change)
+    edit(tmp_path / INNER, in_step(lambda s: s["config"]["features"][STATE].update(type="ENV")))
+    edit(tmp_path / INNER, in_step(lambda s: s["config"]["norm_map"].update(ENV="MIN_MAX")))
     theirs = type(inner).from_pretrained(tmp_path, config_filename=INNER)
     check_is(load_checkpoint(tmp_path), policy, theirs, outer)
 
@@ -293,29 +279,6 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
         assert "policy_preprocessor*" in refused(copied)
     edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
     assert load_checkpoint(copied).config.state_norm is None
-
-
-def test_statistics_in_the_weights_beside_processors_are_refused(copied):
-    """As LeRobot wrote them before it had processors."""
-    weights = load_file(copied / "model.safetensors")
-    save_file(weights | {"unnormalize_outputs.buffer_action.std": torch.ones(2)}, copied / "model.safetensors")
-    assert "remove policy_p*processor.json" in refused(copied)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (lambda f: edit(f / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1)), "0.01"),
-        (lambda f: edit(f / "config.json", lambda c: c.update(pretrained_revision="v1")), None),  # of LeRobot 0.6
-    ],
-    ids=["ensembling", "newer"],
-)
-def test_what_changes_nothing_of_a_policy_is_said_or_needs_no_word(policy, tmp_path, change, says):
-    inner, outer = saved_normalised(policy, tmp_path)
-    change(tmp_path)
-    checkpoint = load_checkpoint(tmp_path)
-    assert [says in note for note in checkpoint.report["notes"]] == [True] * bool(says)
-    check_is(checkpoint, policy, inner, outer)
 
 
 def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
@@ -336,6 +299,8 @@ def test_a_policy_that_sees_no_state_plans_as_lerobots(tmp_path):
 def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
     folder = tmp_path / "out/checkpoints/000020/pretrained_model"
     inner, outer = saved_normalised(policy, folder)
+    newer = {"pretrained_revision": "v1"}  # of LeRobot 0.6, and needs no word
+    edit(folder / "config.json", lambda c: c.update(temporal_ensemble_coeff=0.01, n_action_steps=1, **newer))
     with pytest.raises(CheckpointError, match="000020"):  # as copied by a program that leaves links out
         load_checkpoint(tmp_path / "out")
     (tmp_path / "out/checkpoints/last").symlink_to("000020")
@@ -343,6 +308,8 @@ def test_what_lerobot_train_leaves_is_found(policy, tmp_path):
         assert lerobot_folder(tmp_path / place).resolve() == folder
     checkpoint = load_checkpoint(tmp_path / "out/checkpoints/last")
     check_is(checkpoint, policy, inner, outer)
+    (note,) = checkpoint.report["notes"]
+    assert "temporal_ensemble_coeff is 0.01" in note
     assert checkpoint.report["normalisation"]["state"] == "(state - (0.3, 0.25)) / (1.2, 0.3)"
     assert checkpoint.report["normalisation"]["action"] == "output * (1.2, 0.3) + (0.3, 0.25)"
 
@@ -375,16 +342,13 @@ def test_what_we_write_is_read_back(config, weights, tmp_path):
         assert written.keys() == {"model.safetensors"}
 
 
-@pytest.mark.parametrize(
-    "norms",
-    [{}, {"state_norm": Affine((2.0, 9.0), (-0.1, 0.4)), "action_unnorm": Affine((0.4, 0.02), (0.1, 0.05))}],
-    ids=["raw actions", "normalised"],
-)
-def test_lerobots_folder(config, weights, tmp_path, norms):
+def test_lerobots_folder(config, weights, tmp_path):
+    """Driven at 30 steps a second, a student of 15 would drive twice as fast; the trainer's file cannot hold a rate."""
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
 
-    config = replace(config, **norms)
+    norms = {"state_norm": Affine((2.0, 9.0), (-0.1, 0.4)), "action_unnorm": Affine((0.4, 0.02), (0.1, 0.05))}
+    config = replace(config, rate_hz=15.0, **norms)
     write_lerobot(tmp_path / "pretrained_model", config, weights, ORIGIN)
     read = load_checkpoint(tmp_path / "pretrained_model")
     (sample,) = memory_samples(1)
@@ -393,6 +357,10 @@ def test_lerobots_folder(config, weights, tmp_path, norms):
     assert (ours - expected).abs().max() < 1e-5
     policy = ACTPolicy.from_pretrained(tmp_path / "pretrained_model")
     check_is(read, policy, *make_pre_post_processors(policy.config, str(tmp_path / "pretrained_model")))
+    assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
+    swapped = Layout(("cam_front",), rate_hz=15.0, state_order=(1, 0), action_order=(1, 0))
+    assert read.recorded_as(swapped) is read  # it is in our order, and is not turned again
+    assert json.loads((tmp_path / "pretrained_model/origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
 
 
 def test_a_full_disk_is_one_sentence(config, weights, tmp_path):
@@ -405,18 +373,3 @@ def test_a_full_disk_is_one_sentence(config, weights, tmp_path):
             write_lerobot(tmp_path / "folder", config, weights, {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
-def test_a_rate_of_its_own_is_kept_with_lerobots_folder(config, weights, tmp_path):
-    """Driven at 30 steps a second, a student of 15 would drive twice as fast; the trainer's file cannot hold a rate."""
-    slow = replace(config, rate_hz=15.0)
-    write_lerobot(tmp_path, slow, weights, ORIGIN)
-    read = load_checkpoint(tmp_path)
-    assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
-    assert read.recorded_as(Layout(("cam_front",), rate_hz=15.0)) is read
-    with pytest.raises(CheckpointError, match="15 steps"):
-        read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
-    assert json.loads((tmp_path / "origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
-    (tmp_path / "origin.json").write_text('{"rate_hz": NaN}')
-    with pytest.raises(CheckpointError, match="rate_hz must be a number from 5 to 120, found nan"):
-        load_checkpoint(tmp_path)

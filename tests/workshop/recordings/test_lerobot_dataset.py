@@ -8,7 +8,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import hostile
 import numpy as np
 import pyarrow
 import pytest
@@ -24,7 +23,6 @@ from rover_lib.onboard.errors import CheckpointError, EpisodeError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
-from rover_lib.workshop.recordings import lerobot_dataset
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Layout, Source
 from rover_lib.workshop.run.session import load
@@ -86,7 +84,6 @@ TWO = {"dtype": "float32", "shape": [2], "names": None}
         ("version https://git-lfs.github.com/spec/v1", "Git LFS"),
         (features(front=None), "has no camera"),
         (features(front={"dtype": "video", "shape": [*SIZE, 3], "info": {"is_depth_map": True}}), "colour camera"),
-        (features(front={"dtype": "image", "shape": [10_000, 10_000, 3]}), "10000x10000"),
         (features(action=TWO | {"dtype": "bool"}), "not a row of numbers"),
         (features(action=TWO | {"names": {"steering": 1, "throttle": 1}}), "'action' does not name its 2 numbers"),
         (features(action=TWO | {"names": ["steering", "steering"]}), "correct its shape and names"),
@@ -152,12 +149,6 @@ def test_frames_states_and_chunks_are_lerobots_own_items(datasets, kind):
     assert recordings.hashes().keys() == {"meta/info.json", DATA} | videos
 
 
-def test_the_names_of_a_dataset_decide_which_column_is_throttle(tmp_path):
-    said = features(action=TWO | {"names": list(SWAPPED)}, state=TWO | {"names": list(CAR)})
-    found, _ = lerobot_dataset._layout(tmp_path, said, Source(tmp_path))
-    assert (found.action_names, found.action_order, found.state_order) == (CAR, (1, 0), (0, 1))
-
-
 DATA, EPISODES_AT = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 VIDEO_AT = f"videos/{CAM}/chunk-000/file-000.mp4"
 
@@ -184,10 +175,7 @@ def column(name, value=..., row=0):
         ("video", VIDEO_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be decoded"),
         # what LeRobot accepts without a word
         ("image", DATA, column("frame_index", 1), "belong together"),
-        ("image", DATA, column("timestamp", 2.0, 3), "frames come at another rate"),
-        ("image", DATA, column("episode_index", 1), "belong together"),
         ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(data_path="../x")), "leads out of the"),
-        ("image", "data", lambda p: p.symlink_to(p.rename(p.parents[1] / "elsewhere")), "leads out of the dataset"),
         ("image", DATA, column("action"), "columns are not those of meta/info.json: a broken dataset, found action"),
         ("image", DATA, column("action", [30.0, 0.1]), "steering of 'action' is 30"),
         ("video", EPISODES_AT, column(f"videos/{CAM}/to_timestamp", 0.4), "episode 0, and 0 more, have another part"),
@@ -199,12 +187,25 @@ def test_damage_is_a_sentence(copied, kind, file, damage, says):
     assert says in refused(root)
 
 
+def table(path, change):
+    parquet.write_table(change(parquet.read_table(path)), path)
+
+
+def again(rows):
+    """The first drive's actions and pictures in the second one, as in a dataset that was merged with itself."""
+    for name in ("action", CAM):
+        column = rows.column(name).take([*range(FRAMES), *range(FRAMES), *range(2 * FRAMES, rows.num_rows)])
+        rows = rows.set_column(rows.column_names.index(name), name, column)
+    return rows
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "damage", "kind", "left"),
     [
         (DATA, column(CAM, None, 3), "broken_picture", 32),
         (DATA, column("observation.state", [0.1, np.nan]), "not_finite", 23),
+        (DATA, lambda p: table(p, again), "copy", 23),
         ("meta/info.json", lambda p: edit(p, lambda c: c.update(total_frames=99)), "another_total", 33),
     ],
 )
@@ -216,10 +217,6 @@ def test_what_is_damaged_is_left_out_and_what_is_denied_is_said(copied, file, da
 
 
 # ---- what others write in another way ------------------------------------------------------------------------------
-
-
-def table(path, change):
-    parquet.write_table(change(parquet.read_table(path)), path)
 
 
 def states_named(names):
@@ -350,7 +347,6 @@ TRIGGERS = [
     (named(action=None, state=None), (0, 1)),
     (named(action={"motors": [*SWAPPED]}, state=None), (1, 0)),
     (named(action=None, state=[[*SWAPPED]]), (1, 0)),
-    (named(action=["Throttle", "Steering"], state=["Throttle", "Steering"]), (1, 0)),
     (named(action=["linear.vel", "angular.vel"], state=["linear.vel", "angular.vel"]), (1, 0)),
     (second_camera, (0, 1)),
     (renamed("action", "act"), (0, 1)),
@@ -403,29 +399,6 @@ def test_without_a_state_it_is_the_last_action(copied):
 
 
 @pytest.mark.slow
-def test_a_torn_jpeg_and_the_same_drive_again_are_left_out(copied):
-    """PIL and OpenCV make a picture of a torn one; a dataset merged with itself judges what it has calibrated."""
-    root = copied()
-    whole = hostile.jpeg(hostile.scene(size=SIZE[::-1]))
-    pictures = [hostile.jpeg(hostile.scene(seed, SIZE[::-1])) for seed in range(32)] + [hostile.cut(whole)]
-
-    def change(t):
-        at = t.column_names.index(CAM)
-        column = pyarrow.array([{"bytes": data, "path": None} for data in pictures], t.schema.field(CAM).type)
-        actions = t.column("action").to_pylist()
-        actions[10:20] = actions[:10]
-        acted = pyarrow.array(actions, t.schema.field("action").type)
-        t = t.set_column(t.column_names.index("action"), "action", acted)
-        return t.set_column(at, CAM, column)
-
-    pictures[10:20] = pictures[:10]
-    table(root / DATA, change)
-    recordings = load_recordings(root, CHUNK)
-    assert {fault.kind: fault.count for fault in recordings.faults} == {"broken_picture": 1, "copy": 1}
-    assert [(e.id, len(e.samples)) for e in recordings.episodes] == [("episode_000001", 11), ("episode_000002", 11)]
-
-
-@pytest.mark.slow
 def test_lerobots_way_decides_of_which_size_its_policys_pictures_are(trained, datasets, tmp_path):
     """A fine-tuned policy has its base's input_features, and LeRobot never resizes."""
     smaller = shutil.copytree(trained, tmp_path / "smaller")
@@ -461,7 +434,7 @@ def planned(checkpoint, sample):
     return predictions(ACT(checkpoint.config, checkpoint.weights), [inputs_of(sample, checkpoint.config)])[0].numpy()
 
 
-def test_a_policy_is_put_into_the_recordings_order(trained, tmp_path):
+def test_a_policy_is_put_into_the_recordings_order(trained):
     policy = load_checkpoint(trained)
     swapped = Layout(("cam_front",), rate_hz=20.0, state_order=(1, 0), action_order=(1, 0))
     other = policy.recorded_as(swapped)
@@ -471,10 +444,6 @@ def test_a_policy_is_put_into_the_recordings_order(trained, tmp_path):
     found = planned(other, turned)
     assert np.abs(found - expected).max() < 1e-6 < np.abs(found - expected[:, ::-1]).max()
     assert other.config.rate_hz == 20 and other.report["normalisation"]["state"] == "(state - (0.25, 0.3)) / (0.3, 1.2)"
-    # what we write is in our order, and is not turned again
-    write_lerobot(tmp_path / "ours", replace(other.config, rate_hz=30.0), other.weights, {})
-    again = load_checkpoint(tmp_path / "ours").recorded_as(replace(swapped, rate_hz=30.0))
-    assert np.abs(planned(again, turned) - expected).max() < 1e-5
 
 
 def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
@@ -488,6 +457,3 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     for layout in (Layout(("front",), wheels, wheels, 30.0), Layout(("front",), wheels, ours, 30.0)):
         with pytest.raises(CheckpointError, match="state is left, right"):
             tiny.recorded_as(layout)
-    twice = replace(tiny, config=replace(tiny.config, cameras=("front", "wrist")))
-    with pytest.raises(CheckpointError, match="2, 2, 2, found recordings of 1, 2, 2"):
-        twice.recorded_as(Layout())  # our own
