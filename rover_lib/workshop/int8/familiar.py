@@ -4,7 +4,8 @@
     familiar, described = fit(drives, embed)
 
 The threshold is split conformal prediction: the largest score, smoothed as on the rover, of n drives that neither
-trained the policy nor fitted the scores. Of new drives like them, one in n + 1 goes beyond it, whatever the scores are.
+trained the policy nor fitted the scores. Of new drives like them, one in n + 1 goes beyond it, whatever the scores are;
+with the MARGIN fewer do.
 """
 
 from collections.abc import Callable
@@ -23,6 +24,9 @@ DIRECTIONS = 64  # the demo's drives that failed were stopped a little more ofte
 KNOWN_FRAMES = 640  # ten for each direction
 FEWEST_DRIVES = 19  # one in 20 good drives is 5 %
 MOST_DRIVES = 39  # one in 40; more would only raise the threshold
+# The largest of 20 drives is partly chance: of draws from 200 recorded ones of the demo, 16 % let more than 5 % of good
+# drives go beyond it, with this margin 9 %; all failing drives that were stopped still are.
+MARGIN = 1.1
 EVERY_S = 0.1  # between the pictures of a drive, as between a Pi's plans
 SHOWN = 6  # pictures
 BETWEEN = 0.95  # of the interval of a rate
@@ -78,7 +82,7 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     unit = np.quantile(familiar.scores(known), 0.99, axis=0).clip(1e-6)
     familiar.limits = unit.astype(np.float32)
     scores = {name: familiar.strange(np.stack([embed(s) for s in of])) for name, of in drives.unseen.items()}
-    threshold = max(map(largest_smoothed, scores.values()))
+    threshold = MARGIN * max(map(largest_smoothed, scores.values()))
     familiar.limits = (unit * threshold).astype(np.float32)
     shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
     # The share of new drives above the largest of n has a Beta(1, n) distribution; this is its interval.

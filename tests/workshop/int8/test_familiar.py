@@ -14,7 +14,7 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.int8.export import Exporter, TorchScript
-from rover_lib.workshop.int8.familiar import Drives, fit
+from rover_lib.workshop.int8.familiar import MARGIN, Drives, fit
 from rover_lib.workshop.int8.quantize import quantize, with_embedding
 from rover_lib.workshop.int8.scheme import Scheme
 
@@ -60,8 +60,8 @@ def test_of_new_drives_one_in_their_number_and_one_is_beyond_the_threshold():
         seen = iter(rng.normal(size=(12 + 2 * 19, 6)).astype(np.float32))
         familiar, found = fit(drives_of(memory_samples(1) * (12 + 2 * 19)), lambda sample, seen=seen: next(seen))
         first, both = (familiar.strange(rng.normal(size=(n, 6)).astype(np.float32)) for n in (1, 1))
-        beyond += max(first[0], (first[0] + both[0]) / 2) >= 1
-        assert found["drives"] == 19 and max(found["largest"].values()) == pytest.approx(1)
+        beyond += max(first[0], (first[0] + both[0]) / 2) >= 1 / MARGIN
+        assert found["drives"] == 19 and max(found["largest"].values()) == pytest.approx(1 / MARGIN)
     assert 0.025 < beyond / fits < 0.08  # 5 %
     ends_pct = found["stopped_low_pct"], found["stopped_high_pct"]
     assert np.allclose(ends_pct, (0.133, 17.647), atol=1e-3)  # scipy.stats.beta(1, 19).ppf
