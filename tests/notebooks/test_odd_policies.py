@@ -16,7 +16,7 @@ from rover_lib.workshop.run.session import load
 
 pytestmark = pytest.mark.slow
 RELATIVE = 1e-5  # of the largest action: LeRobot's own forward, processors included, against our FP32 artifact
-QUICK = {"samples": 6, "choosing_frames": 2, "held_out_frames": 4, "worlds": 0, "iterations": 2}
+QUICK = {"samples": 6, "choosing_frames": 2, "held_out_frames": 4, "worlds": 0, "iterations": 2, "modes": ["static"]}
 # Two arms; what a dataset may say of a car, tests/workshop/recordings/test_lerobot_dataset.py has.
 CAMERAS, RATE_HZ = {"front": (36, 64), "wrist": (48, 40)}, 50
 JOINTS = tuple(f"joint_{i}" for i in range(14))

@@ -49,9 +49,9 @@ TABLES = {
 }
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
+HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 Found = tuple[Path, tuple[int, int] | None]  # a listed picture, and its (height, width) if it is whole
 Samples = tuple[Sample, ...]
-HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
 
 
 @dataclass(frozen=True, eq=False)

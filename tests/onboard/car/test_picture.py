@@ -27,6 +27,7 @@ def test_what_is_not_all_of_a_cameras_picture_is_refused_cheaply(tmp_path):
 def test_what_a_camera_may_send_is_decoded_as_opencv_does():
     for data in (WHOLE, hostile.RESTARTS, jpeg(scene()[:, :, 0]), jpeg(scene(), 30), hostile.progressive(scene())):
         assert (decode_jpeg(data) == cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)).all()
+        assert decode_jpeg(data, 96).shape == (90, 160, 3)  # a quarter: an eighth would have 80
     begin = WHOLE.index(b"\xff\xc4")
     without_tables = WHOLE[:begin] + WHOLE[hostile.SCAN - 14 :]  # as webcams send them
     assert (decode_jpeg(without_tables) == decode_jpeg(WHOLE)).all()

@@ -126,6 +126,8 @@ def test_refuses_damaged_files(tiny_file, tmp_path):
         path.write_bytes(data)
         refused(path)
     assert "checksum" in refused(path)
+    torch.save([1], path, _use_new_zipfile_serialization=False)
+    assert "1.6" in refused(path)
     assert "list" in refused(write([1, 2], path))
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as whole:
         whole.writestr("archive/more", bytes(1000))
@@ -203,7 +205,9 @@ def test_refuses_damaged_and_divided_folders(copied):
         (CONFIG, lambda c: c.pop("type"), 'write "type": "act" into it'),
         (CONFIG, lambda c: c.update(feedforward_activation="glu"), "'glu'"),
         (CONFIG, lambda c: c.update(replace_final_stride_with_dilation=True), "LeRobot cannot use it"),
+        (CONFIG, lambda c: c.update(n_obs_steps=2), "LeRobot cannot use it"),
         (CONFIG, lambda c: c.update(input_features={}), "features"),
+        (CONFIG, lambda c: c["input_features"]["observation.state"].update(shape=[3]), "LeRobot cannot use it"),
         (CONFIG, lambda c: c["input_features"].pop("observation.state"), "encoder_robot_state_input_proj"),
         (CONFIG, lambda c: c["input_features"]["observation.images.cam_front"].update(shape=[3, -72, 128]), "features"),
         (CONFIG, lambda c: c.update(chunk_size=16, n_action_steps=16), "config and weights do not agree"),
@@ -360,7 +364,12 @@ def test_lerobots_folder(config, weights, tmp_path):
     assert read.config.rate_hz == read.recorded_as(Layout()).config.rate_hz == 15
     swapped = Layout(("cam_front",), rate_hz=15.0, state_order=(1, 0), action_order=(1, 0))
     assert read.recorded_as(swapped) is read  # it is in our order, and is not turned again
+    with pytest.raises(CheckpointError, match="15 steps"):
+        read.recorded_as(Layout(("cam_front",), rate_hz=30.0))
     assert json.loads((tmp_path / "pretrained_model/origin.json").read_text()) == ORIGIN | {"rate_hz": 15.0}
+    (tmp_path / "pretrained_model/origin.json").write_text('{"rate_hz": NaN}')
+    with pytest.raises(CheckpointError, match="rate_hz must be a number from 5 to 120, found nan"):
+        load_checkpoint(tmp_path / "pretrained_model")
 
 
 def test_a_full_disk_is_one_sentence(config, weights, tmp_path):

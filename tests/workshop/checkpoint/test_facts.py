@@ -41,6 +41,7 @@ def says_more(policy, path, config=(), **more):
     ("more", "says"),
     [
         ({"action_stats": {"mean": torch.zeros(2), "std": torch.ones(2)}}, "'action_stats.mean'"),
+        ({"hparams": {"std": [0.2, 0.1]}}, "how its numbers are normalised"),
         ({"config": {"normalize_actions": True}}, "normalised"),
         ({"config": {"crop_top": 100}}, "which part of its pictures"),
         ({"args": {"cropShape": [60, 100]}}, "which part of its pictures"),

@@ -175,7 +175,9 @@ def column(name, value=..., row=0):
         ("video", VIDEO_AT, lambda p: os.truncate(p, p.stat().st_size // 2), "cannot be decoded"),
         # what LeRobot accepts without a word
         ("image", DATA, column("frame_index", 1), "belong together"),
+        ("image", DATA, column("timestamp", 2.0, 3), "frames come at another rate"),
         ("image", "meta/info.json", lambda p: edit(p, lambda c: c.update(data_path="../x")), "leads out of the"),
+        ("image", "data", lambda p: p.symlink_to(p.rename(p.parents[1] / "elsewhere")), "leads out of the dataset"),
         ("image", DATA, column("action"), "columns are not those of meta/info.json: a broken dataset, found action"),
         ("image", DATA, column("action", [30.0, 0.1]), "steering of 'action' is 30"),
         ("video", EPISODES_AT, column(f"videos/{CAM}/to_timestamp", 0.4), "episode 0, and 0 more, have another part"),
