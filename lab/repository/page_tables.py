@@ -107,6 +107,17 @@ def _drives(root: Path) -> list[Row]:
     ]
 
 
+def _recorded(root: Path) -> list[Row]:
+    """How well policies that learned from so many drives plan in others, and drive."""
+    rows = _metrics(root / "results" / "lab", "drives")["rows"]
+    errors = (" / ".join(f"{error:.1f}" for error in row["errors_pct"].values()) for row in rows)
+    return [
+        ("drives recorded", *(str(row["drives"]) for row in rows)),
+        ("off the driver, %", *errors),
+        (f"balloons hit of {rows[0]['trials']}", *(str(row["hits"]) for row in rows)),
+    ]
+
+
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
@@ -144,6 +155,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
     "drives": _drives,
+    "recorded": _recorded,
     "learning": _learning,
     "judging": _judging,
     "parameters": _parameters,
