@@ -41,8 +41,3 @@ def _drive_seeds(seeds: Sequence[int]) -> tuple[int, list[tuple[int, str]]]:
         driven += bool((run.autonomous & (run.throttle > RESTING_US)).any())
         broke += [(seed, f"{sentence}\n    {story}") for sentence in list(broken(seen))[:1]]
     return driven, broke
-
-
-def any_broken(seeds: Sequence[int]) -> bool:
-    """Drive the story of each seed until one breaks an invariant; return whether one did."""
-    return any(_drive_seeds([seed])[1] for seed in seeds)

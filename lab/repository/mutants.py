@@ -28,8 +28,8 @@ from rover_lib.workshop.run_program import run
 RANDOM_DRIVES = 2000
 NOTICED = 3  # the exit code of random drives of which one breaks an invariant
 DRIVE = f"""
-from lab.driving.random_drives import any_broken
-raise SystemExit({NOTICED} if any_broken(range({RANDOM_DRIVES})) else 0)
+from lab.driving.random_drives import random_drives
+raise SystemExit({NOTICED} * any(random_drives(range(i, i + 100))["broken"] for i in range(0, {RANDOM_DRIVES}, 100)))
 """
 PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
 PLANTED = Path(__file__).with_name("planted")
