@@ -298,11 +298,11 @@ def _train_backbone(training: _Training) -> None:
     """Phase one: train the backbone with live batch norm, then measure on the data the statistics that stay frozen."""
     import torchvision
 
-    recipe = training.recipe
+    recipe, saved = training.recipe, training.saved
     resnet = torchvision.models.resnet18(weights=None)
     live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = training.saved.machine.taking(_ChunkFromFeatures(live, training.size)).train()
-    training.saved.train(
+    model = saved.machine.taking(_ChunkFromFeatures(live, training.size)).train()
+    saved.train(
         Phase("backbone", recipe.backbone_steps, recipe.backbone_rate),
         model,
         training.rng,
@@ -313,11 +313,8 @@ def _train_backbone(training: _Training) -> None:
         norm.reset_running_stats()
         norm.momentum = None  # torch then takes the plain mean over the batches below
     count = 16 if len(training.data) >= 16 * recipe.batch else 4
-
-    def draw(_: int) -> Batch:
-        return training.batch(recipe.batch)
-
-    for _, batch in training.saved.steps("statistics", count, training.rng, draw, backbone=live):
+    drawn = saved.steps("statistics", count, training.rng, lambda _: training.batch(recipe.batch), backbone=live)
+    for _, batch in drawn:
         with torch.no_grad():
             live(loop.normalised(batch[IMAGE], batch[GAIN]))
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
