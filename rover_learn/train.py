@@ -232,7 +232,7 @@ class _Training:
         return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
 
     def judge(self, maps: loop.RowFile | None = None, units: np.ndarray | float | None = None) -> float:
-        """Return the policy's mean error on the judges, in units of the spreads. maps: their feature maps, if taken."""
+        """Return the policy's mean error on the judges, in units of the spreads. maps, units: as of `driving_error`."""
         judges, units = self.judges, self.weights.cpu().numpy() if units is None else units
         every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
         errors = [loop.driving_error(self.policy, judges, rows, units, maps) for rows in every]
@@ -349,7 +349,7 @@ def _train_transformer(training: _Training) -> None:
 
 
 def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> loop.RowFile:
-    """Compute the frozen backbone's feature maps of the chosen rows' frames, into a file. chosen: (n,) row numbers."""
+    """Compute the frozen backbone's maps of chosen rows, (n,), into a file. No gradients: two batches fit at once."""
     batch, (size,), device = 2 * training.recipe.batch, training.size.image_sizes, training.weights.device
     maps = loop.RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
 

@@ -83,10 +83,10 @@ class Machine:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Compute as repeatably as a GPU can. Raises TrainingError if its memory is full, or if it is lost."""
+        """Compute as repeatably as a GPU can, and keep memory. Raises TrainingError if a GPU is full or lost."""
         repeatable = torch.are_deterministic_algorithms_enabled()
-        for option, value in KEPT_MEMORY.items() if hasattr(ctypes.CDLL(None), "mallopt") else ():
-            ctypes.CDLL(None).mallopt(option, value)
+        for option, value in KEPT_MEMORY.items() if hasattr(libc := ctypes.CDLL(None), "mallopt") else ():
+            libc.mallopt(option, value)
         if self.device.type == "cuda":
             os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS reads it when it starts
             torch.use_deterministic_algorithms(True, warn_only=True)
@@ -394,7 +394,7 @@ def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> Batch:
 
 
 def normalised(images: Tensor, gain: Tensor | None = None) -> Tensor:
-    """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them: as `normalise` does.
+    """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them.
 
     gain: (B, 1, 1, 1), multiplies each.
     """

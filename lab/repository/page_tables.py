@@ -108,7 +108,7 @@ def _drives(root: Path) -> list[Row]:
 
 
 def _recorded(root: Path) -> list[Row]:
-    """How well policies that learned from so many drives plan in others."""
+    """How far policies' plans are off the driver's, by the number of drives that they learned from."""
     rows = _metrics(root / "results" / "lab", "drives")["rows"]
     errors = (" / ".join(f"{error:.1f}" for error in row["errors_pct"].values()) for row in rows)
     return [("drives recorded", *(str(row["drives"]) for row in rows)), ("off the driver, %", *errors)]

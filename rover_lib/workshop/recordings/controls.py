@@ -166,7 +166,8 @@ def _read_actions(channel: Channel, rows: Rows, path: Path, faults: Faults) -> t
     if not follows_old:
         what = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither "
         remedy = "correct them, say in metadata.car which car it is, or record again"
-        raise EpisodeError(f"{what}{_formula(old)} nor {_formula(channel)}, this car's", found=seen, remedy=remedy)
+        what += f"{_formula(old)} nor {_formula(channel)}, this car's"
+        raise EpisodeError(what, found=seen, remedy=remedy, kind="no_formula")
     note = f"recorded as {_formula(old)} instead of {_formula(channel)}; {seen}; recomputed from the pulses"
     faults.add(path, f"{name}_recomputed", note, len(wrong))
     return meant, meant, old
@@ -180,7 +181,8 @@ def _refuse_other_pulses(channel: Channel, pulses_us: dict[int, float]) -> None:
     if count >= LEAST_READINGS and 2 * len(far) > count:
         what = f"{channel.name}: {len(far)} of {count} pulses lie far beyond this car's {low_us} to {high_us} us"
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
-        raise EpisodeError(what, found=f"{pulses_us[far[0]]:g} us in control {far[0]}", remedy=remedy)
+        found = f"{pulses_us[far[0]]:g} us in control {far[0]}"
+        raise EpisodeError(what, found=found, remedy=remedy, kind="no_formula")
 
 
 def _take(channel: Channel, recorded: Actions, meant: Actions, recompute: bool, path: Path, faults: Faults) -> Actions:

@@ -130,7 +130,7 @@ def load_recordings(
         except CarError as e:
             faults.add(folder, "no_car", str(e))
         except EpisodeError as e:
-            faults.add(folder, e.kind or "no_formula", str(e))
+            faults.add(folder, e.kind, str(e))
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
