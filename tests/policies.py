@@ -199,6 +199,7 @@ class MemorySample:
     picture: np.ndarray
     row: int = 0
     episode: str = "memory"
+    block: str = ""
 
     def frame_bgr(self) -> np.ndarray:
         return self.picture

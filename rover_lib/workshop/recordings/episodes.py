@@ -35,10 +35,17 @@ from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.blocks import (
+    SAME_PLACE,
+    draw_blocks,
+    name_long_drives,
+    part_by_blocks,
+    usual_rate_hz,
+)
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source, block_of
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
@@ -56,7 +63,7 @@ Samples = tuple[Sample, ...]
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Three parts that share no episode, or, if `note` says so, no moment in time.
+    """Three parts that share no episode, or, if `note` says so, no block of one or no moment in time.
 
     choosing: to pick observers and mixed blocks. held_out: judges, and nothing else.
     """
@@ -68,9 +75,9 @@ class Split:
 
     @property
     def episodes(self) -> dict[str, list[str]]:
-        """The names of each part's episodes."""
+        """The names of each part's episodes, or of its blocks where these are parted."""
         parts = {"calibration": self.calibration, "choosing": self.choosing, "held_out": self.held_out}
-        return {part: list(dict.fromkeys(s.episode for s in samples)) for part, samples in parts.items()}
+        return {part: list(dict.fromkeys(map(block_of, samples))) for part, samples in parts.items()}
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,8 @@ def load_recordings(
     if not episodes:
         remedy = "record again, or copy the whole folders, frames included"
         raise faults.nothing_usable(f"no usable sample in {len(folders)} folder(s)", remedy)
-    return Recordings(root, leave_out_copies(episodes, faults), faults.listed(), source)
+    own, blocks = name_long_drives(leave_out_copies(episodes, faults))
+    return Recordings(root, own, faults.listed(), source, blocks=blocks)
 
 
 def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Episode:
@@ -334,12 +342,15 @@ def _make_samples(
 def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -> Split:
     """Split the samples by whole episodes, drawn at random with `seed`; half of the held-out share is for choosing.
 
-    With fewer than three episodes, each is split along its time instead, with a gap of one chunk between the parts;
-    `note` says so. Raises EpisodeError for a share outside (0, 1), and for recordings too short to be split.
+    Long drives are split by their blocks instead, and fewer than three episodes along their time, with a gap of one
+    chunk between the parts; `note` says so. Raises EpisodeError for a share outside (0, 1), and for recordings too
+    short to be split.
     """
     if not 0 < held_out_share < 1:
         raise EpisodeError("held_out_share must be between 0 and 1", found=held_out_share)
     episodes = recordings.episodes
+    if recordings.blocks:
+        return _split_by_blocks(recordings, held_out_share, seed)
     if len(episodes) < 3:
         return _split_by_time(episodes, held_out_share)
     count = min(max(round(len(episodes) * held_out_share), 2), len(episodes) - 1)
@@ -352,6 +363,19 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
 
     half = count // 2
     return Split(samples_of(order[count:]), samples_of(order[:half]), samples_of(order[half:count]), note)
+
+
+def _split_by_blocks(recordings: Recordings, held_out_share: float, seed: int) -> Split:
+    """Split by the blocks that are left, if episodes were left out since they were named."""
+    episodes, there = recordings.episodes, {s.block for s in recordings.samples}
+    places = [[name for name in names if name in there] for names in recordings.blocks]
+    drawn = draw_blocks([names for names in places if len(names) > 2], held_out_share, np.random.default_rng(seed))
+    if not drawn:
+        return _split_by_time(episodes, held_out_share)
+    count = sum(map(len, places))
+    each_s = sum(bool(s.block) for s in recordings.samples) / usual_rate_hz(episodes) / count
+    note = f"{count} blocks of some {each_s:.0f} s, {len(drawn)} of them held out, with gaps of a plan between"
+    return Split(**part_by_blocks(episodes, drawn), note=f"{note}: judged on {SAME_PLACE}")
 
 
 def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Split:

@@ -26,6 +26,7 @@ from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.blocks import name_long_drives
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.names import ACTION, STATE, camera_names, name_numbers, name_states
@@ -156,7 +157,8 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
         raise faults.nothing_usable("no usable sample", WRITE_ANEW)
     if layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
-    return Recordings(dataset.root, leave_out_copies(episodes, faults), faults.listed(), source, layout)
+    own, blocks = name_long_drives(leave_out_copies(episodes, faults))
+    return Recordings(dataset.root, own, faults.listed(), source, layout, blocks)
 
 
 class _Dataset:

@@ -124,6 +124,7 @@ class Sample:
     car: Car = field(default_factory=Car)
     pulses_us: tuple[float, float] | None = None
     mirrored: bool = False  # turn the picture over, as it is mirrored beside the other recordings'
+    block: str = ""  # which block of a long drive it is in, see blocks.py; "" where whole episodes are parted
 
     @property
     def frame_name(self) -> str:
@@ -142,6 +143,11 @@ class Sample:
         except CameraError as e:
             what, found, remedy = e.what, e.found, "delete it or record the episode again"
         raise EpisodeError(f"{self.frame_path}: {what}", found=found, remedy=remedy)
+
+
+def block_of(sample: Any) -> str:
+    """The name of what is parted and drawn as a whole, as its samples are alike: a block, or else the episode."""
+    return sample.block or sample.episode
 
 
 def car_of(samples: Iterable[Any]) -> Car:
@@ -174,7 +180,8 @@ class Episode:
     """One drive.
 
     duration_s: from the first to the last frame. frames, controls: how many the recording lists.
-    formulas: by channel, that of its actions before they were recomputed from the pulses.
+    formulas: by channel, that of its actions before they were recomputed from the pulses. session: what it is a piece
+    of, "" if it is whole; begin_s: where its first frame lies in that, in seconds.
     """
 
     id: str
@@ -187,6 +194,8 @@ class Episode:
     files: tuple[Path, ...]  # those that the numbers came from
     formulas: Mapping[str, str] = field(default_factory=dict)
     corrects: bool = False  # whether a human intervened in it: lerobot-rollout can leave out what the policy drove
+    session: str = ""
+    begin_s: float = 0.0
 
     @cached_property
     def by_policy(self) -> bool:
@@ -196,13 +205,17 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """All usable episodes below `root`, and every fault that was found."""
+    """All usable episodes below `root`, and every fault that was found.
+
+    blocks: the names of the blocks of each place, such as each tub of a folder; () where whole episodes are parted.
+    """
 
     root: Path
     episodes: tuple[Episode, ...]
     faults: tuple[Fault, ...]
     source: Source
     layout: Layout = Layout()
+    blocks: tuple[tuple[str, ...], ...] = ()
 
     @property
     def samples(self) -> tuple[Sample, ...]:

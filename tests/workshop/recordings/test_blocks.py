@@ -1,0 +1,55 @@
+"""Long drives in blocks: what is held out, and how far apart the parts are."""
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rover_lib.workshop.recordings.blocks import name_blocks, name_long_drives
+from rover_lib.workshop.recordings.episodes import split
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of
+
+RATE_HZ, CHUNK = 20, 32
+
+
+def drive(count, name="tub from 0", begin_s=0.0, session="s"):
+    """An episode of a session, `count` frames long, whose actions are its session's frame numbers."""
+    first, samples = round(begin_s * RATE_HZ), []
+    for k in range(count):
+        following = np.minimum(k + np.arange(CHUNK), count - 1)
+        chunk = np.stack([following + first] * 2, 1).astype(np.float32)
+        samples.append(Sample(name, Path("p.jpg"), k / RATE_HZ, chunk[0], chunk, k + np.arange(CHUNK) >= count, k))
+    return Episode(
+        name, Path("tub"), "", count / RATE_HZ, count, count, tuple(samples), (), {}, False, session, begin_s
+    )
+
+
+def parted(episodes, share=0.25, seed=0):
+    named, names = name_blocks(episodes)
+    return split(Recordings(Path("tub"), named, (), Source(Path("tub")), blocks=(names,)), share, seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("count", [398, 614, 1098, 2239, 5015, 14135])
+def test_a_tenth_to_a_quarter_is_held_out_a_plan_away(count, seed):
+    pieces = [drive(count // 2), drive(count - count // 2, "tub from 1", count // 2 / RATE_HZ + 0.2)]
+    parts = parted(pieces, seed=seed)
+    learned, chosen, judged = parts.calibration, parts.choosing, parts.held_out
+    assert 0.1 < len(judged) / count < 0.25 and (len(judged) + len(chosen)) / count < 0.26
+    assert len(learned) > 0.4 * count and "the same track and hour" in parts.note
+    assert not set(parts.episodes["held_out"]) & {*parts.episodes["calibration"], *parts.episodes["choosing"]}
+    times = [np.array([s.state[0] for s in part]) for part in (learned, chosen, judged)]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(times[a][:, None] - times[b]).min() >= CHUNK - 4  # 0.2 s of the session were not recorded
+    acted = [{*np.concatenate([s.chunk[~s.is_pad, 0] for s in part])} for part in (learned, chosen, judged)]
+    assert not any(a & b for a, b in product(acted, acted) if a is not b)
+
+
+def test_drives_of_seconds_and_many_of_them_are_parted_whole():
+    for episodes in ([drive(600, f"e{i}", session="") for i in range(5)], [drive(1300, f"e{i}") for i in range(20)]):
+        assert name_long_drives(episodes) == (tuple(episodes), ())
+        assert block_of(episodes[0].samples[0]) == "e0"
+    (few, *_), ((*names,),) = name_long_drives([drive(2400, session=""), drive(2400, "tub from 1", session="")])
+    assert few.samples[0].block == names[0] and len(names) == 12
+    assert not name_blocks([drive(87)])[1]
