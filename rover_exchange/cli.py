@@ -8,10 +8,10 @@ from typing import Any
 
 import click
 
-from rover_lib.cli.prepare import size_option
+from rover_lib.cli.prepare import EPISODES, THROTTLE, size_option
 from rover_lib.onboard.cli import AS_JSON, FILE, LOG_DRIVE, open_view, show, sum_up, view_options
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import Output, PathTo, check_kind, kinds_of
+from rover_lib.onboard.kinds import Output, PathTo, check_kind
 from rover_lib.workshop.progress import terminal_bar
 
 SIZE = click.option(
@@ -20,13 +20,13 @@ SIZE = click.option(
 
 
 @click.command("export-dataset", short_help="Write recordings, or a tub, as a LeRobotDataset v3.")
-@click.argument("recordings", type=FILE)
+@click.argument("recordings", type=EPISODES)
 @click.argument("out", type=FILE)
 @SIZE
-@click.option("--throttle", type=click.Choice(["as-recorded", "negated"]), help="For a tub that drives forward by < 0.")
+@THROTTLE
 @AS_JSON
 def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: bool, **options: Any) -> None:
-    """Write our RECORDINGS, or a donkeycar tub, as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
+    """Write our RECORDINGS, or donkeycar tubs, as a LeRobotDataset v3 to the new folder OUT, for lerobot-train.
 
     lerobot-train trains at the size of the pictures: at the recorded size it takes 25 times as long as with sides a
     fifth as long. On a GPU it waits for pictures unless lerobot-edit-dataset has made videos of them. What is repaired
@@ -37,17 +37,9 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
     pilot drove are left out, and episodes end where records are missing.
     """
     from rover_exchange.export_dataset import export_dataset as write
+    from rover_lib.workshop.recordings.samples import Source
 
-    source: Any = recordings
-    if "tub" in kinds_of(recordings):
-        from rover_exchange.tub import read_tub
-        from rover_lib.onboard.car.car import this_car
-
-        source = read_tub(recordings, this_car(), terminal_bar(), throttle)
-    elif throttle:
-        raise RoverError(f"{recordings}: --throttle is for donkeycar tubs", remedy="leave it out")
-    else:
-        check_kind(recordings, "recordings")
+    source = Source.of(recordings, throttle=throttle or "")
     _print_export(write(source, out, progress=terminal_bar(), **options), out, as_json)
 
 

@@ -25,7 +25,7 @@ from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import CAR, DRIVEN_BY, INTERVENTION, REPORT
 from rover_lib.workshop.recordings.names import ACTION, CAMERA, STATE
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample, Source
 from rover_lib.workshop.recordings.turning import measure_sides
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
@@ -34,7 +34,7 @@ SHORTEST = 2  # rows in the shortest episode: a single row has no spread to norm
 
 
 def export_dataset(
-    episodes: Path | str | Recordings,
+    episodes: Path | str | Source,
     out: Path | str,
     *,
     size: tuple[int, int] | None = None,
@@ -42,10 +42,10 @@ def export_dataset(
 ) -> dict[str, Any]:
     """Write all usable samples to `out`, a new folder, once it is complete, and return what was written and left out.
 
-    episodes: the recordings, or their folder. Pictures become PNG in parquet; `lerobot-edit-dataset` makes videos of
-    them. size: (height, width) to which the pictures are resized; None keeps the recorded size. Raises EpisodeError for
-    recordings that cannot be used, of several cars, rates or (without `size`) picture sizes, a size that no artifact
-    takes, and an existing `out`; RoverError while another process makes `out`.
+    episodes: the recordings' folder, or its Source. Pictures become PNG in parquet; `lerobot-edit-dataset` makes videos
+    of them. size: (height, width) to which the pictures are resized; None keeps the recorded size. Raises EpisodeError
+    for recordings that cannot be used, of several cars, rates or (without `size`) picture sizes, a size that no
+    artifact takes, and an existing `out`; RoverError while another process makes `out`.
     """
     out = Path(out)
     if out.exists() or out.is_symlink():
@@ -53,10 +53,7 @@ def export_dataset(
     least, most = SIDES_PX
     if size and not least <= min(size) <= max(size) <= most:
         raise EpisodeError(f"pictures must have {least} to {most} pixels a side", found=f"{size[1]}x{size[0]}")
-    if isinstance(episodes, Recordings):
-        recordings = episodes
-    else:
-        recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
+    recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None:
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = usual_rate_hz(recordings)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.cli.prepare import CHECKPOINT, EPISODES, FACTS, size_option, with_source
+from rover_lib.cli.prepare import CHECKPOINT, EPISODES, FACTS, THROTTLE, size_option, with_source
 from rover_lib.onboard.cli import FILE
 from rover_lib.onboard.kinds import Output
 from rover_lib.workshop.progress import terminal_bar
@@ -87,8 +87,9 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @FACTS
+@THROTTLE
 @of_a_recipe
-def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, **options: Any) -> None:
+def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, throttle: str | None, **options: Any) -> None:
     """Train CHECKPOINT further on what humans drove in EPISODES: first the old recordings, then the new ones.
 
     A human's frames in a drive of the policy are corrections, and count more; the policy's own frames are not
@@ -100,7 +101,7 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, **options
     from rover_lib.workshop.recordings.samples import Source
 
     recipe = FinetuneRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
-    sources = [Source.of(each, facts=facts) for each in episodes]
+    sources = [Source.of(each, facts=facts, throttle=throttle or "") for each in episodes]
     folder = learn_on(checkpoint, sources, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
 

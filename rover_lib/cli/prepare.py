@@ -31,6 +31,9 @@ CHECKPOINT, EPISODES = PathTo("checkpoint"), PathTo("recordings")
 ACTION_NAMES = click.option("--action-names", default="", help="Of a LeRobotDataset's actions, if it has none.")
 CAMERA = click.option("--camera", default="", help="A LeRobotDataset's cameras that the policy uses, with commas.")
 FACTS = click.option("--facts", default="", help="Of a policy, if its files lack them: rate=20 actions=A,B size=WxH.")
+THROTTLE = click.option(
+    "--throttle", type=click.Choice(["as-recorded", "negated"]), help="For donkeycar tubs that drive forward by < 0."
+)
 
 
 def with_source(command: Callable[..., None]) -> Callable[..., None]:
@@ -39,11 +42,13 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     @ACTION_NAMES
     @CAMERA
     @FACTS
+    @THROTTLE
     @functools.wraps(command)
-    def called(*args: Any, episodes: Path, action_names: str, camera: str, facts: str, **options: Any) -> None:
+    def called(*args: Any, episodes: Path, **options: Any) -> None:
         from rover_lib.workshop.recordings.samples import Source
 
-        return command(*args, episodes=Source.of(episodes, action_names, camera, facts), **options)
+        said = {name: options.pop(name) or "" for name in ("action_names", "camera", "facts", "throttle")}
+        return command(*args, episodes=Source.of(episodes, **said), **options)
 
     return called
 
@@ -54,6 +59,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @ACTION_NAMES
 @CAMERA
 @FACTS
+@THROTTLE
 @click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
 @click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")
@@ -64,7 +70,8 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
     """Load, calibrate, quantize, compare and benchmark CHECKPOINT with the recordings in EPISODES.
 
-    EPISODES is a folder of recordings or a LeRobotDataset v3, here and in every other command.
+    EPISODES is a folder of recordings, a LeRobotDataset, a donkeycar tub or a folder of tubs, here and in every other
+    command.
     Executes five notebooks in the run's folder. Ends with a verdict, also in run.json: which artifact to deploy,
     what failed, and what to do about it.
 

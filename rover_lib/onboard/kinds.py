@@ -34,7 +34,10 @@ CALLED = {
 WANTED = {  # what a command takes: the kinds, and how to get one
     "artifact": (("artifact",), "rover run CHECKPOINT EPISODES makes policy_<mode>.pt"),
     "checkpoint": (("checkpoint", "pretrained"), "the checkpoint comes first: best_model.pth, or LeRobot's folder"),
-    "recordings": (("recordings", "dataset"), "give the folder that holds episode_*, or a LeRobotDataset's"),
+    "recordings": (
+        ("recordings", "dataset", "tub"),
+        "give the folder that holds episode_*, a LeRobotDataset's, or a donkeycar tub",
+    ),
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
@@ -63,8 +66,6 @@ def check_kind(path: Path | str, wanted: str) -> None:
         raise RoverError(f"{path}: not found", remedy=remedy)
     if not found or set(found) & set(takes):
         return
-    if found[0] == "tub":
-        remedy = "rover export-dataset TUB OUT"
     raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 

@@ -12,8 +12,7 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from rover_exchange.tub import read_tub
-from rover_lib.onboard.car.car import Car, read_car
+from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.stage import read_stage
@@ -110,7 +109,7 @@ READERS = {
     "episode_data.json": lambda path: load_recordings(path.parent, 8),
     "best_model.pth": load_checkpoint,
     "calibration.pt": Calibration.load,
-    "manifest.json": lambda path: read_tub(path.parent, Car()),
+    "manifest.json": lambda path: load_recordings(path.parent),
 }
 
 
@@ -151,5 +150,4 @@ def test_what_takes_many_times_its_size(tmp_path, name):
     (tmp_path / "manifest.json").write_text('{"paths": ["catalog_0.catalog"]}')
     (tmp_path / "episode_data.json").touch()
     (tmp_path / name).write_bytes(SMALL_VALUES[name])
-    read = load_recordings if name.startswith(("episode", "control")) else lambda path: read_tub(path, Car())
-    assert hostile.outcome_of(read, tmp_path, most_bytes=50_000_000).startswith("said ")
+    assert hostile.outcome_of(load_recordings, tmp_path, most_bytes=50_000_000).startswith("said ")

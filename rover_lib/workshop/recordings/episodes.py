@@ -12,13 +12,8 @@ sample, because its state would be invented.
 """
 
 import csv
-import json
 import math
-import os
-from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,13 +22,11 @@ from typing import Any
 import numpy as np
 
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.car.pwm import NEUTRAL
-from rover_lib.onboard.errors import CameraError, CarError, EpisodeError
+from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 from rover_lib.onboard.recording import episode as written
 from rover_lib.onboard.stage import read_plain
-from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import (
     SAME_PLACE,
@@ -45,8 +38,10 @@ from rover_lib.workshop.recordings.blocks import (
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source, block_of
+from rover_lib.workshop.recordings.pictures import HOLE_INTERVALS, HOLE_S, check_pictures
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source, block_of, following
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
+from rover_lib.workshop.recordings.tub import find_tubs, load_tubs
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
@@ -55,9 +50,6 @@ TABLES = {
     "frame_samples": ("frame_data.csv", written.FRAME_FIELDS),
 }
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
-HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
-HOLE_S = 0.5  # always a hole in time, whatever the usual interval: no camera of a moving car is that slow
-Found = tuple[Path, tuple[int, int] | None]  # a listed picture, and its (height, width) if it is whole
 Samples = tuple[Sample, ...]
 
 
@@ -91,7 +83,7 @@ class _Frame:
 def load_recordings(
     root: Path | str | Source, chunk: int = 32, sync_s: float = 0.05, progress: Progress = silent
 ) -> Recordings:
-    """Read every episode folder below `root` (or `root` itself, if it is one), or a LeRobotDataset.
+    """Read every episode folder below `root` (or `root` itself, if it is one), a LeRobotDataset, or donkeycar tubs.
 
     chunk: actions per sample. sync_s: largest distance in time between a frame and its control. Faults are counted, and
     what they affect is repaired or skipped. Raises EpisodeError if nothing usable is left, with the most frequent
@@ -101,12 +93,18 @@ def load_recordings(
     root = source.path
     if chunk < 1 or not sync_s > 0:
         raise EpisodeError("chunk must be at least 1 and sync_s above 0", found=f"{chunk} and {sync_s}")
-    if "dataset" in kinds_of(root):
+    kinds = kinds_of(root)
+    if "dataset" not in kinds:
+        for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
+            if names not in ((), ACTION_NAMES):
+                what, found = f"{root}: our recordings and tubs have one camera and named actions", ",".join(names)
+                raise EpisodeError(what, found=f"{option} {found}", remedy="leave it out")
+        if tubs := find_tubs(root, kinds):
+            return load_tubs(source, tubs, chunk, progress)
+    if source.throttle:
+        raise EpisodeError(f"{root}: --throttle is for donkeycar tubs", found=source.throttle, remedy="leave it out")
+    if "dataset" in kinds:
         return load_dataset(source, chunk, progress)
-    for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
-        if names not in ((), ACTION_NAMES):
-            what, found = f"{root}: our recordings have one camera and name their actions", ",".join(names)
-            raise EpisodeError(what, found=f"{option} {found}", remedy="leave it out")
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
         if any((root / name).exists() for name in EPISODE_FILES):
@@ -219,14 +217,9 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
             continue
         listed[number] = int(number), time_s, name
     found = check_pictures(folder, [name for *_, name in listed.values()], path, faults)
-    sizes = Counter(size for _, size in found if size)
-    usual = max(sizes, key=sizes.__getitem__, default=(0, 0))
     frames = []
-    for (number, time_s, _), (picture, size) in zip(listed.values(), found, strict=True):
-        if size and size != usual:
-            note = "{} pixels high, {} wide, and most here {} and {}: another camera's?".format(*size, *usual)
-            faults.add(picture, "another_size", note)
-        frames.append(_Frame(number, time_s, picture, is_whole=size == usual))
+    for (number, time_s, _), (picture, usable) in zip(listed.values(), found, strict=True):
+        frames.append(_Frame(number, time_s, picture, usable))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
     kept = frames[:1]
@@ -236,48 +229,6 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         else:
             faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
     return kept
-
-
-def check_pictures(folder: Path, names: Sequence[str], listing: Path, faults: Faults, inside: str = ".") -> list[Found]:
-    """Return each listed picture's path and its (height, width): None, and a fault, unless it is there and whole.
-
-    names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`. Those that
-    are whole are kept in the cache, and decoded again only after they have changed.
-    """
-    found: list[Found] = []
-    home, known, whole = os.path.realpath(folder), dict[str, Any](), dict[str, Any]()
-    cache = cache_root() / f"pictures-{key_of({'in': home})}.json"
-    with suppress(OSError, ValueError):  # none yet, or half of one
-        known = dict(read_json(cache))
-
-    def check(name: str, path: Path) -> tuple[str, Sequence[int]]:
-        if not os.path.realpath(path).startswith(f"{home}{os.sep}"):
-            raise EpisodeError(f"{quote(name)} is outside of the episode")
-        there = path.stat()
-        # The time of any change: a copy may bring along the time of its content.
-        key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
-        return key, known.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
-
-    paths = [folder / inside / name.replace("\\", "/") for name in names]
-    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:  # decoding releases the interpreter's lock
-        checks = [pool.submit(check, *each) for each in zip(names, paths, strict=True)]
-    for name, path, checked in zip(names, paths, checks, strict=True):
-        size = None
-        try:
-            key, (height, width) = checked.result()
-            size = whole[key] = height, width
-        except EpisodeError as e:
-            faults.add(listing, "path_leaves_folder", str(e))
-        except CameraError as e:
-            faults.add(path, "broken_jpeg", str(e))
-        except (OSError, ValueError):  # not there, unreadable, a long name, a zero byte
-            faults.add(listing, "frame_missing", f"{quote(name)} is listed but cannot be read")
-        found.append((path, size))
-    if whole.keys() - known.keys():
-        with suppress(OSError):
-            cache.parent.mkdir(parents=True, exist_ok=True)
-            cache.write_text(json.dumps(whole))
-    return found
 
 
 def _nearest(times_s: np.ndarray, controls: list[Control], within_s: float) -> list[Control | None]:
@@ -323,9 +274,7 @@ def _make_samples(
     with_action = np.flatnonzero(known)
     cuts = np.flatnonzero((np.diff(with_action) > 1) | np.isin(with_action[1:], breaks)) + 1
     for segment in np.split(with_action, cuts):
-        n = len(segment)
-        index = np.arange(n)[:, None] + np.arange(chunk)
-        chunks, pads = actions[segment][np.minimum(index, n - 1)], index >= n
+        chunks, pads = following(actions[segment], chunk)
         for k, i in enumerate(segment.tolist()):
             if not frames[i].is_whole:
                 continue

@@ -30,7 +30,7 @@ from rover_lib.workshop.recordings.blocks import name_long_drives
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
 from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.names import ACTION, STATE, camera_names, name_numbers, name_states
-from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, following
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
 
 INFO = Path("meta/info.json")
@@ -315,8 +315,7 @@ class _Dataset:
         rows = np.flatnonzero(self.columns["episode_index"] == number)
         columns = {key: values[rows] for key, values in self.columns.items()}
         n, name = len(rows), f"episode_{number:06d}"
-        index = np.arange(n)[:, None] + np.arange(chunk)
-        chunks, pads = columns[ACTION][np.minimum(index, n - 1)], index >= n
+        chunks, pads = following(columns[ACTION], chunk)
         taken_over = columns.get(INTERVENTION, np.zeros(n)).astype(bool)
         times_s = columns["timestamp"] - columns["timestamp"][0]
         finite = np.isfinite(columns[ACTION]).all() and np.isfinite(columns[STATE]).all()

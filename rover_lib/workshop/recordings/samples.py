@@ -21,7 +21,8 @@ LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
 HANDLED = {  # what is done about a fault, by its kind
-    "repaired": "serial_burst|unsorted_.*_times|reverse_on_a_car_without|stood_unrecorded|scrambled_index|other_units",
+    "repaired": "serial_burst|unsorted_.*_times|stood_unrecorded|scrambled_index|other_units",
+    "read as stopped": "reverse_on_a_car_without",
     "recomputed from the pulses": ".*_recomputed",
     "taken as recorded": "another_export|another_total|one_sided_steering|no_times|.*_disagrees_with_pulse",
     "left out": ".*",
@@ -34,26 +35,29 @@ class Source:
 
     action_names: the names of its actions, in the order of its columns, and of its states too if those are unnamed.
     cameras: the cameras that the policy looks through, in the policy's order. facts: what a policy's files do not say,
-    as checkpoint.facts reads it.
+    as checkpoint.facts reads it. throttle: "as-recorded" or "negated", for tubs of mostly negative throttles.
     """
 
     path: Path
     action_names: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     facts: str = ""
+    throttle: str = ""
 
     @classmethod
-    def of(cls, path: "Path | str | Source", action_names: str = "", camera: str = "", facts: str = "") -> "Source":
+    def of(
+        cls, path: "Path | str | Source", action_names: str = "", camera: str = "", facts: str = "", throttle: str = ""
+    ) -> "Source":
         """Make a source from a path and a command line's comma-separated names; a Source is returned unchanged."""
         if isinstance(path, Source):
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
-        return cls(Path(path), names, cameras, facts)
+        return cls(Path(path), names, cameras, facts, throttle)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
         """The recordings that a run loaded, by load.json's params, or those `elsewhere`, with the same names."""
-        said = (given.get(name, "") for name in ("action_names", "camera", "facts"))
+        said = (given.get(name, "") for name in ("action_names", "camera", "facts", "throttle"))
         return cls.of(elsewhere or given["episodes"], *said)
 
 
@@ -274,6 +278,16 @@ class Recordings:
 def relative(path: Path, root: Path) -> str:
     """Return a file's path as reports show it: relative to `root`, or only its name if it lies elsewhere."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+
+
+def following(actions: np.ndarray, chunk: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the chunk of each of a part's actions, (n, A) -> (n, chunk, A), and its padding, (n, chunk) bool.
+
+    A chunk has the action itself and the following ones; past the end, the last one again.
+    """
+    n = len(actions)
+    index = np.arange(n)[:, None] + np.arange(chunk)
+    return actions[np.minimum(index, n - 1)], index >= n
 
 
 def pick_evenly(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:

@@ -21,7 +21,7 @@ def name_stranger(root: Path) -> tuple[str, str] | None:
         inside = islice(root.glob("*/" * depth), MOST_FILES)
         folders = sorted(p for p in inside if p.is_dir() and not any(n.startswith(".") for n in p.parts[-depth:]))
         for kind, words, remedy in (
-            ("tub", "donkeycar tubs", "rover export-dataset {} OUT, and so for each"),
+            ("tub", "donkeycar tubs", "give one of them, such as {}"),
             ("dataset", "LeRobotDatasets", "give one of them, such as {}"),
             ("recordings", "folders of recordings", "give one of them, such as {}"),
             ("pretrained", "LeRobot checkpoints", "they hold no drives: give recordings, {} as the checkpoint"),

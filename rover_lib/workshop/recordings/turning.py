@@ -1,4 +1,4 @@
-"""Which way the cars of recordings steer, episode by episode, and which pictures are mirrored.
+"""Which way the cars of recordings steer, drive by drive, and which pictures are mirrored.
 
 Steering is correlated with the horizontal shift of the pictures' upper part between frames (optical flow), at the delay
 with the strongest correlation, which is judged as one of far fewer, independent frames (Bartlett's formula).
@@ -29,19 +29,22 @@ SMOOTH = 5  # examined pictures
 LEAST_PAIRS = 25
 LEAST_SPREAD = 0.05  # standard deviation of steering, of full; with less, other motion decides the correlation
 SURE = 2.2  # standard errors from no correlation
+MOST_PAIRS = 1000  # of a drive, of its longest pieces: two minutes are enough for any
 
 
 @dataclass(frozen=True)
 class Turning:
     """correlation: of steering with the shift of the background to the right. sure: its standard errors from 0.
 
-    spread: the standard deviation of steering, a share of full.
+    episode: its name, or that of the session that it is a piece of. spread: the standard deviation of steering, a share
+    of full. pieces: the names of all its episodes.
     """
 
     episode: str
     correlation: float | None
     sure: float
     spread: float
+    pieces: tuple[str, ...] = ()
 
     @property
     def side(self) -> str | None:
@@ -77,7 +80,7 @@ class Sides:
     @property
     def mirrored(self) -> list[str]:
         """The episodes whose pictures, or steering, are mirrored beside most of the others'."""
-        return [t.episode for t in self.turnings if self.side and t.side not in (None, self.side)]
+        return [piece for t in self.turnings if self.side and t.side not in (None, self.side) for piece in t.pieces]
 
     @property
     def denied(self) -> bool:
@@ -98,34 +101,47 @@ class Sides:
 
 
 def measure_sides(recordings: Recordings, progress: Progress = silent, most: int | None = None) -> Sides:
-    """Measure each episode, or at most `most` of them, evenly chosen; none of what is no car with one camera."""
+    """Measure each drive, or at most `most` of them, evenly chosen; none of what is no car with one camera."""
     layout = recordings.layout
     if layout.action_names != ACTION_NAMES or len(layout.cameras) > 1:
         return Sides(())
-    episodes = pick_evenly(recordings.episodes, most or len(recordings.episodes))
+    sessions: dict[str, list[Episode]] = {}
+    for episode in recordings.episodes:  # the camera stays as it is while a session lasts
+        sessions.setdefault(episode.session or episode.id, []).append(episode)
+    drives = pick_evenly(list(sessions.values()), most or len(sessions))
     # OpenCV releases the interpreter's lock, so threads help.
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
-        turnings = tuple(progress(pool.map(measure_turning, episodes), desc="which way it steers", total=len(episodes)))
-    said = {s.car.positive for e in episodes for s in e.samples}
+        turnings = tuple(progress(pool.map(measure_turning, drives), desc="which way it steers", total=len(drives)))
+    said = {e.samples[0].car.positive for drive in drives for e in drive}
     # A LeRobotDataset, which states its rate, has no car's file.
     return Sides(turnings, said.pop() if len(said) == 1 and layout.rate_hz is None else None)
 
 
-def measure_turning(episode: Episode) -> Turning:
-    """Measure one drive of one camera."""
-    samples = episode.samples
-    steering = np.array([s.chunk[0, 0] for s in samples], float)
-    best = Turning(episode.id, None, 0.0, float(steering.std()))
+def measure_turning(drive: Sequence[Episode]) -> Turning:
+    """Measure one drive of one camera, by its longest pieces."""
+    pieces, left = list[Sequence[Sample]](), STEP * MOST_PAIRS
+    for episode in sorted(drive, key=lambda e: -len(e.samples)):
+        begin = max(0, len(episode.samples) - left) // 2
+        pieces.append(episode.samples[begin : begin + left])
+        left -= len(pieces[-1])
+        if left < STEP * LEAST_PAIRS:
+            break
+    steering = np.array([s.chunk[0, 0] for samples in pieces for s in samples], float)
+    names = tuple(e.id for e in drive)
+    best = Turning(drive[0].session or names[0], None, 0.0, float(steering.std()), names)
     if best.spread < LEAST_SPREAD / 2:
         return best  # and no picture has to be read
     try:
-        times_s, shifts = _shifts(samples)
+        shifts = [_shifts(samples) for samples in pieces]
     except EpisodeError:
         return best
-    every_s = np.array([s.time_s for s in samples])
-    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(shifts) >= LEAST_PAIRS else ():
-        steered = np.interp(times_s - delay_s, every_s, steering)
-        found = _correlation(_smooth(steered), _smooth(shifts))
+    moved = np.concatenate([of for _, of in shifts])
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(moved) >= LEAST_PAIRS else ():
+        steered = []
+        for samples, (times_s, _) in zip(pieces, shifts, strict=True):
+            every_s = np.array([s.time_s for s in samples])
+            steered.append(np.interp(times_s - delay_s, every_s, [s.chunk[0, 0] for s in samples]))
+        found = _correlation(_smooth(np.concatenate(steered)), _smooth(moved))
         if found and found[1] > best.sure:
             best = replace(best, correlation=found[0], sure=found[1])
     return best

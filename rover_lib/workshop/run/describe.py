@@ -40,9 +40,9 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if kind == "stage":
         content = read_stage(path, None)
         return {"report": {**content, "metrics": sorted(content["metrics"]), "inputs": len(content["inputs"])}}
-    if kind == "tub" or not path.exists():
+    if not path.exists():
         check_kind(path, "recordings")  # says what to do
-    if kind in ("recordings", "dataset") or (kind is None and path.is_dir()):
+    if kind in ("recordings", "dataset", "tub") or (kind is None and path.is_dir()):
         recordings = load_recordings(source, progress=progress)
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}

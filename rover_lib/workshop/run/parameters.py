@@ -28,6 +28,7 @@ RULES = {
     **dict.fromkeys(("checkpoint", "episodes", "rovers"), Rule(_is_path, "a path")),
     "run_dir": Rule(lambda v: _is_path(v) and not Path(v).is_file(), "a folder's path"),
     **dict.fromkeys(("action_names", "camera", "facts"), of_type(str)),
+    "throttle": Rule(lambda v: v in ("", "as-recorded", "negated"), "as-recorded, negated or empty"),
     **dict.fromkeys(("samples", "choosing_frames", "iterations"), whole(1, MOST)),
     "held_out_frames": whole(2, MOST),  # whose pictures are swapped
     **dict.fromkeys(("seed", "worlds", "pushes"), whole(0, MOST)),

@@ -229,7 +229,7 @@ def test_equal_actions_before_other_scenes_are_no_copy(tmp_path):
         ("record_7.json", "donkeycar 3.*convert_to_tub_v2.py"),
         ("data/chunk-000/file-000.parquet", "copy the whole dataset"),
         ("notes.md", "no episode folders in it, found .*notes.md; only folders of episodes"),
-        ("tub_1/manifest.json", "a folder of 1 donkeycar tubs, not our recordings, found tub_1; rover export-dataset"),
+        ("tub_1/manifest.json", "tub_1/manifest.json: lists no catalogs"),
         ("more/episode_1/episode_data.json", "a folder of 1 folders of recordings"),
     ],
 )

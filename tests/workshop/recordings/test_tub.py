@@ -12,12 +12,19 @@ from command import rover
 from test_episodes import kinds
 
 from rover_exchange.export_dataset import usual_rate_hz
-from rover_exchange.tub import read_tub
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.workshop.recordings.samples import frame_rate_hz
+from rover_lib.workshop.recordings import tub as reader
+from rover_lib.workshop.recordings.episodes import load_recordings, split
+from rover_lib.workshop.recordings.samples import Source, frame_rate_hz
 
-LEFT = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")  # reverses, and turns left
+LEFT = read_car(Path(__file__).parents[3] / "lab/cars/crawler.yml")  # reverses, and turns left
+
+
+def read_tub(root, car, throttle="", chunk=2):
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(reader, "this_car", lambda: car)
+        return load_recordings(Source.of(root, throttle=throttle), chunk)
 
 
 def angle(i):
@@ -119,21 +126,27 @@ def test_runs_of_a_few_records_and_odd_times_have_no_rate(tmp_path):
 GAPS = {"hole_in_time", "gaps_unrecorded"}
 
 
+STOOD = {"stood_unrecorded"}
+
+
 @pytest.mark.parametrize(
-    ("off", "gap_ms", "found"), [(0.1, 250, {"stood_unrecorded"}), (0.0, 250, GAPS), (0.1, 223, GAPS)]
+    ("zeros", "gap_ms", "found"), [(0, 250, STOOD), (1, 250, STOOD), (2, 250, GAPS), (0, 223, GAPS)]
 )
-def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, off, gap_ms, found):
-    """donkeycar's default: indexes go on, and three real tubs fell into 305 to 1,300 pieces of three frames."""
+def test_where_only_throttle_was_recorded_a_drive_has_standing_parts(tmp_path, zeros, gap_ms, found):
+    """donkeycar's default: indexes go on, and three real tubs fell into 305 to 1,300 pieces of three frames.
+
+    In real ones 0.2 to 1.7 % of the records have throttle 0: one in 80 is not enough to tell that all zeros are there.
+    """
     rows, ms = records(80), 1_629_500_000_000
     for i, row in enumerate(rows):
         ms += 50 if i % 4 else gap_ms
-        row.update({"_timestamp_ms": ms, "user/throttle": 0.3 if i else off})
+        row.update({"_timestamp_ms": ms, "user/throttle": 0 if 40 <= i < 40 + zeros else 0.3})
     recordings = read_tub(tub(tmp_path / "tub", rows), LEFT)
     bridged = found == {"stood_unrecorded"}
     assert kinds(recordings).keys() == found
     assert len(recordings.episodes) == (1 if bridged else 20)
     if bridged:
-        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.1, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
+        assert [s.state[1] for s in recordings.samples[1:9]] == pytest.approx([0.3, 0.3, 0.3, 0, 0.3, 0.3, 0.3, 0])
     assert any("AUTO_RECORD_ON_THROTTLE" in fault.note for fault in recordings.faults)
 
 
@@ -161,9 +174,6 @@ def test_what_is_broken_is_counted(tmp_path):
     found = kinds(read_tub(root, LEFT))
     expected = {"broken_record": 5, "records_missing": 1, "frame_missing": 1, "broken_jpeg": 1, "deleted_record": 2}
     assert found == expected
-    (root / "catalog_0.catalog").unlink()
-    with pytest.raises(EpisodeError, match="catalog_missing"):
-        read_tub(root, LEFT)
     deleted = '{"paths": ["catalog_0.catalog"], "deleted_indexes": [1e400]}'
     for manifest in ('{"paths": 1}', deleted, "", " " * 10_000_001, None):
         (root / "manifest.json").unlink()
@@ -171,12 +181,16 @@ def test_what_is_broken_is_counted(tmp_path):
             (root / "manifest.json").write_text(manifest)
         with pytest.raises(EpisodeError, match=r"manifest\.json"):
             read_tub(root, LEFT)
+    (root / "manifest.json").write_text('{"paths": ["catalog_1.catalog"]}')
+    with pytest.raises(EpisodeError, match="catalog_missing.*catalogs included"):
+        read_tub(root, LEFT)
+    (root / "catalog_0.catalog").unlink()
+    with pytest.raises(EpisodeError, match="a donkeycar tub without its catalogs"):
+        read_tub(root, LEFT)
 
 
 @pytest.mark.slow
 def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatch):
-    from rover_lib.workshop.recordings.episodes import load_recordings
-
     root = tub(tmp_path / "tub", records(50), deleted=[25])
     (tmp_path / "car.yml").write_text(yaml_of(LEFT))
     monkeypatch.setenv("ROVER_CAR", str(tmp_path / "car.yml"))
