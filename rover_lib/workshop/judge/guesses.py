@@ -23,6 +23,7 @@ from rover_lib.workshop.recordings.samples import Sample
 DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
 SURE_PCT = 95
+MEAN, MEDIAN, MEAN_PLAN = "the mean action", "the median action", "the mean plan"  # guesses that need no eyes
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,36 @@ class Judged:
         return {**asdict(self), "warnings": self.warnings()}
 
 
+def blind_plans(chunks: np.ndarray, is_pad: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the plans, (C, A) each, that need no eyes, of what a policy could learn from.
+
+    chunks: (n, C, A) recorded actions; is_pad: (n, C) bool, steps past the end of a recording.
+    """
+    actions, shape = chunks[~is_pad].astype(np.float64), chunks.shape[1:]
+    # At a step that no plan reaches, the mean action stands.
+    padded = np.broadcast_to(is_pad[..., None], chunks.shape)
+    steps = np.ma.masked_array(chunks.astype(np.float64), padded).mean(0).filled(actions.mean(0))
+    constants = {MEAN: actions.mean(0), MEDIAN: np.median(actions, 0)}
+    return {name: np.broadcast_to(value, shape) for name, value in constants.items()} | {MEAN_PLAN: steps}
+
+
+def frame_errors(plans: np.ndarray, recorded: np.ndarray, is_pad: np.ndarray) -> np.ndarray:
+    """Return (n, A): each frame's mean absolute error over its recorded steps. plans: (n, C, A), or one for all."""
+    errors = np.abs(plans.astype(np.float64) - recorded) * ~is_pad[..., None]
+    return errors.sum(1) / (~is_pad).sum(1)[:, None]
+
+
+def least_blind_errors(
+    learned: np.ndarray, learned_pad: np.ndarray, recorded: np.ndarray, is_pad: np.ndarray
+) -> np.ndarray:
+    """Return (A,): by action, the mean error on recorded chunks of the best plan without eyes, in the action's unit.
+
+    learned, learned_pad: what a policy could learn from; recorded, is_pad: what judges it: (n, C, A) and (n, C).
+    """
+    errors = [frame_errors(plan, recorded, is_pad).mean(0) for plan in blind_plans(learned, learned_pad).values()]
+    return np.asarray(errors).min(0)
+
+
 def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
     """Hold the FP32 plans of a comparison and the guesses against the driver.
 
@@ -77,26 +108,20 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     units = {a: pct for a in report.action_names if (pct := report.pct(a)) is not None}
     if not units or not learned:
         return None
-    recorded, known = report.recorded, ~report.is_pad
-    acted = np.stack([s.chunk for s in learned])
-    pads = np.stack([s.is_pad for s in learned])
-    every = acted[~pads]
-    # At a step that no plan reaches, the last one that was reached stands.
-    steps = np.ma.masked_array(acted, np.broadcast_to(pads[..., None], acted.shape)).mean(0).filled(every.mean(0))
+    learned_chunks, learned_pads = np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned])
     judged = [i for i, a in enumerate(report.action_names) if a in units]
 
     def errors_of(plans: np.ndarray) -> np.ndarray:
         """(n, judged actions): each frame's mean error over its recorded steps, in percent of the recorded range."""
-        e = np.abs(plans.astype(np.float64) - recorded) * known[..., None]
-        return (e.sum(1) / known.sum(1)[:, None])[:, judged] * list(units.values())
+        return frame_errors(plans, report.recorded, report.is_pad)[:, judged] * list(units.values())
 
     own = errors_of(report.reference)
-    constants = [errors_of(np.broadcast_to(value, acted.shape[1:])) for value in (every.mean(0), np.median(every, 0))]
-    found = {"a constant action": min(constants, key=lambda e: e.mean())}
+    blind = {name: errors_of(plan) for name, plan in blind_plans(learned_chunks, learned_pads).items()}
+    found = {"a constant action": min((blind[MEAN], blind[MEDIAN]), key=lambda e: e.mean())}
     states = np.stack([s.state for s in report.samples])
     if states.shape[1] == len(report.action_names):
         found["the last action again"] = errors_of(states[:, None])
-    found["the mean plan"] = errors_of(steps)
+    found[MEAN_PLAN] = blind[MEAN_PLAN]
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
     counts = np.array([len(p) for p in pieces])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.guesses import LEAST_EPISODES, against_guesses
+from rover_lib.workshop.judge.guesses import LEAST_EPISODES, against_guesses, least_blind_errors
 
 CHUNK, RANGE = 8, {"steering": (-1.0, 1.0), "throttle": (0.0, 0.1)}
 GUESSES = ["a constant action", "the last action again", "the mean plan"]
@@ -84,6 +84,15 @@ def test_the_guesses_know_only_what_could_be_learned_from():
     constants = [off(lambda s, c=c: np.tile(c, (CHUNK, 1))) for c in (every.mean(0), np.median(every, 0))]
     expected = [min(constants, key=lambda e: sum(e.values())), off(lambda s: s.state), off(lambda s: steps)]
     assert [g.errors_pct for g in judged.guesses.values()] == [pytest.approx(e, rel=1e-4) for e in expected]
+
+
+def test_the_best_blind_guess_of_each_action():
+    """By hand: steering is best guessed by its median, throttle, which rises in every plan, by the mean plan."""
+    learned = np.array([[[0, 0.1], [0, 0.3]], [[0, 0.1], [0, 0.3]], [[0.9, 0.1], [0.9, 9]]])
+    pads = np.array([[False, False], [False, False], [False, True]])
+    recorded = np.array([[[0.1, 0.1], [0.3, 0.3]], [[-0.1, 0.15], [9, 9]]])
+    errors = least_blind_errors(learned, pads, recorded, np.array([[False, False], [False, True]]))
+    assert errors == pytest.approx([(0.2 + 0.1) / 2, (0 + 0.05) / 2])
 
 
 def test_the_interval_has_95_percent_of_the_draws():
