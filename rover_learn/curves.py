@@ -3,28 +3,41 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rover_lib.workshop.plots.style import new_figure
 
+FILE = "curves.json"
+ROUND = ", round "  # between the name of a phase and the number of its round
+
 
 def leave_curves(
-    folder: Path, losses: Mapping[str, Sequence[float]], errors: Mapping[str, Sequence[Sequence[float]]]
+    folder: Path,
+    losses: Mapping[str, Sequence[float]],
+    errors: Mapping[str, Sequence[Sequence[float]]],
+    actions: Mapping[str, Mapping[str, Any]],
 ) -> None:
     """Write curves.json and curves.png into a new folder, and TensorBoard's files if that is installed.
 
-    losses: of each step, by phase. errors: [step, held-out error], by phase.
+    losses: of each step, by phase; the rounds of a phase are one after the other. errors: [step or round, *held-out errors by action], by phase, in % of the range.
+    actions: what was learned of each, as of `Judges.summary`.
     """
     folder.mkdir()
-    losses = {phase: values for phase, values in losses.items() if values}
-    (folder / "curves.json").write_text(json.dumps({"losses": losses, "errors": errors}) + "\n")
-    figure, (axes,) = new_figure(1, max(len(losses), 1))
-    for ax, (phase, values) in zip(axes, losses.items(), strict=False):
-        ax.plot(values, label="loss")
-        if judged := errors.get(phase):
-            ax.plot(*zip(*judged, strict=True), "o-", label="held-out error")
+    losses = _join_rounds(losses)
+    (folder / FILE).write_text(json.dumps({"losses": losses, "errors": errors, "actions": actions}) + "\n")
+    figure, rows = new_figure(2, max(len(losses), 1), height_in=5.5)
+    for ax, (phase, values) in zip(rows[0], losses.items(), strict=False):
+        ax.plot(values)
         ax.set(title=phase, xlabel="step", yscale="log")
+    rows[0][0].set_ylabel("loss")
+    for ax, (phase, judged) in zip(rows[1], errors.items(), strict=False):
+        steps = [row[0] for row in judged]
+        for i, (name, found) in enumerate(actions.items(), 1):
+            (line,) = ax.plot(steps, [row[i] for row in judged], "o-", label=name)
+            ax.axhline(found["blind_pct"], color=line.get_color(), linestyle=":", label=f"{name}, without eyes")
+        ax.set(title=phase, xlabel="step, or round")
         ax.legend()
-    axes[0].set_ylabel("loss, error")
+    rows[1][0].set_ylabel("held-out error, % of the range")
     figure.savefig(folder / "curves.png")
     try:
         from torch.utils.tensorboard import SummaryWriter
@@ -32,6 +45,22 @@ def leave_curves(
         return
     with SummaryWriter(str(folder)) as writer:
         for phase, values in losses.items():
-            for name, points in (("loss", enumerate(values)), ("held-out error", errors.get(phase, ()))):
-                for step, value in points:
-                    writer.add_scalar(f"{name}/{phase}", value, int(step))
+            for step, value in enumerate(values):
+                writer.add_scalar(f"loss/{phase}", value, step)
+        for phase, judged in errors.items():
+            for at, *by_action in judged:
+                for name, error in zip(actions, by_action, strict=True):
+                    writer.add_scalar(f"held-out error, %/{phase}/{name}", error, int(at))
+
+
+def _join_rounds(losses: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
+    joined: dict[str, list[float]] = {}
+    for phase, values in losses.items():
+        if values:
+            joined.setdefault(phase.partition(ROUND)[0], []).extend(values)
+    return joined
+
+
+def read_actions(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what a training says of each action; {} for one of an older program."""
+    return json.loads((folder / FILE).read_text()).get("actions", {})

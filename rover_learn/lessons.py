@@ -21,7 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from rover_learn import training
-from rover_learn.training import ACTION, GAIN, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
+from rover_learn.augment import GAIN
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import ActConfig, Affine

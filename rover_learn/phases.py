@@ -33,7 +33,7 @@ from rover_lib.workshop.recordings.samples import Sample
 from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.session import SMALL_GMAC
 
-MOST = {"to_parent": 1.0, "held_out_share": 0.999}
+MOST = {"to_parent": 1.0, "held_out_share": 0.999, "mirrored": 0.5, "blur": 1.0, "shift": 0.2}
 MAY_BE_ZERO = ("seed", "transformer_warmup")
 LEAST_RATE, LARGE = 1e-9, 10**9
 SMALLEST_RANGE = 0.02  # for an action that hardly changes, as errors are divided by the range
@@ -218,7 +218,7 @@ class Work(ABC):
 
     def write_policy(self, folder: Path, name: str, learned: Learned, loss: float, recordings: str) -> dict[str, str]:
         """Write best_model.pth, pretrained_model/ and the curves of a run of that name; return the files' sha256."""
-        leave_curves(folder / "curves", learned.losses, {})
+        leave_curves(folder / "curves", learned.losses, {}, {})
         settings = {"learning_rate": self.recipe.rate, "batch_size": self.recipe.batch, "seed": self.recipe.seed}
         settings |= {"data_dir": recordings, "output_dir": name, "device": self.machine.device.type}
         origin = {f"{self.ROLE}_sha256": self.origin.sha256, f"{self.ROLE}_format": self.origin.format}

@@ -2,13 +2,13 @@
 
     train("episodes", "best_model.pth")
 
-The ResNet starts from random weights, and with frozen batch norm it would learn nothing. So there are three phases: the
-backbone alone, with live batch norm, learns to predict the chunk; then the transformer learns on the frozen backbone's
-features, which are computed once; then both learn together at a tenth of the rate.
+There are three phases: the backbone alone, with live batch norm, learns to predict the plan; then the transformer
+learns on the frozen backbone's features, which are computed once; then both learn together at a tenth of the rate.
 
+A phase stops by what it sees: backbone and whole policy learn in rounds, as long as their error on recordings that they
+do not learn from falls, within a budget of minutes. That error is shown by action, beside the best guess without eyes.
 No weight depends on the picture's size, so the real car's policy goes through these phases at a quarter of its pixels,
-and a few more steps at its own size carry it there. While the transformer learns, it is judged by episodes that it does
-not learn from, and the best weights are kept. Recordings that are mirrored beside the others are turned over.
+and a few more steps at its own size carry it there. Recordings that are mirrored beside the others are turned over.
 """
 
 import math
@@ -26,10 +26,16 @@ import torch
 from torch import Tensor, nn
 
 from rover_exchange.export_dataset import lerobot_train
+from rover_learn import augment as augment_module
+from rover_learn import backbone as backbone_module
+from rover_learn import judges as judges_module
 from rover_learn import training as loop
-from rover_learn.curves import leave_curves
-from rover_learn.phases import VERSIONS, Recipe
-from rover_learn.training import ACTION, GAIN, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Machine, Phase, Resumable
+from rover_learn.augment import Augmentation
+from rover_learn.backbone import FEATURES, PlanFromFeatures, Pretrained, live_backbone, measure_statistics
+from rover_learn.curves import ROUND, leave_curves
+from rover_learn.judges import Judges
+from rover_learn.phases import LARGE, VERSIONS, Recipe
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Best, Frames, Machine, Phase, Resumable
 from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import EpisodeError, TrainingError
 from rover_lib.onboard.params import params
@@ -53,25 +59,30 @@ from rover_lib.workshop.recordings.turning import measure_sides
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy
 
-FEATURES, HEAD_WIDTH = 512, 32  # of ResNet18's last stage, and of the first phase's head
 SMALL_DIM = 256  # below it, a second thread saves a quarter on a quiet machine, and on a busy one trebles the time
 PLANNED_HZ = 30.0  # of the user's trainer
+EXACT_BELOW_HZ = 15.0  # half a frame a second would be more than 3 % of a slower rate
 SIZES = {
     "small": ActConfig(
         image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
     ),
     "full": ActConfig(),
 }
+FALLS = 0.02  # a further round is worth its time while the error falls by this share
+BACKBONE_SHARE = 0.75  # of the budget, for the backbone's rounds: the other phases take about as long as one of them
 # A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
 # hour or more is made anew only when this number is raised. Raise it when you change what the same recipe results in.
-FULL_VERSION = 2
+FULL_VERSION = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecipe(Recipe):
     """How long and how fast each phase trains: an entry of params.yml's section `train`, which explains each number.
 
-    at: (height, width) of the pictures in all phases but the last; None: the policy's own, and no last phase.
+    backbone_steps, together_steps: of a round; backbone_rounds, together_rounds: at most. minutes: a budget, of the
+    processor or, on a GPU, as they pass: no further round begins that would not fit. mirrored: share of the pictures
+    that are turned over. light to noise: see Augmentation. at: (height, width) of the pictures in all phases but the
+    last; None: the policy's own, and no last phase.
     """
 
     PHASES = ("backbone", "transformer", "together", "carry")
@@ -86,16 +97,35 @@ class TrainingRecipe(Recipe):
     backbone_rate: float
     transformer_rate: float
     transformer_warmup: int = 0
+    backbone_rounds: int = 1
+    together_rounds: int = 1
+    minutes: float = float(LARGE)
+    mirrored: float = 0.0
+    light: float = 0.25
+    offset: float = 0.0
+    shift: float = 0.0
+    blur: float = 0.0
+    noise: float = 0.0
     at: tuple[int, int] | None = None
     carry_steps: int = 0
 
+    @property
+    def augmentation(self) -> Augmentation:
+        return Augmentation(self.light, self.offset, self.shift, self.blur, self.noise)
+
     @classmethod
-    def of(cls, size: str, device: str, steps: int | None = None, batch: int | None = None) -> Self:
-        """Return the recipe of params.yml for that size; with cuda's own values, if it has some. steps: in all."""
+    def of(
+        cls, size: str, device: str, steps: int | None = None, batch: int | None = None, minutes: float | None = None
+    ) -> Self:
+        """Return the recipe of params.yml for that size; with cuda's own values, if it has some.
+
+        steps: in all, of one round each. minutes: the budget instead of the recipe's.
+        """
         recipes = params()["train"]
         values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
         recipe = cls.read(f"train: {size}", values | {"at": tuple(values["at"]) if values.get("at") else None})
         recipe = recipe if steps is None else recipe.of_few(steps)
+        recipe = recipe if minutes is None else replace(recipe, minutes=minutes)
         return replace(recipe, batch=batch, transformer_batch=batch, together_batch=batch) if batch else recipe
 
     def of_few(self, steps: int) -> Self:
@@ -107,7 +137,8 @@ class TrainingRecipe(Recipe):
             "feature_samples": min(self.feature_samples, steps * batches["transformer_batch"]),
             "judged": min(self.judged, max(8, steps)),
         }
-        return replace(self.of_steps(steps), **batches, **counts, transformer_warmup=0)
+        once = replace(self.of_steps(steps), backbone_rounds=1, together_rounds=1, transformer_warmup=0)
+        return replace(once, **(batches | counts))
 
 
 def train(
@@ -117,7 +148,9 @@ def train(
     seed: int = 0,
     steps: int | None = None,
     batch: int | None = None,
+    minutes: float | None = None,
     *,
+    backbone: Path | str | None = None,
     machine: Machine | None = None,
     progress: Progress = silent,
     say: Callable[[str], object] = silent,
@@ -127,11 +160,13 @@ def train(
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
     part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
     size: 'small' (72x128) or 'full' (the user's policy, 360x640). steps: of all phases together, batch: of each phase;
-    None: the recipe's. machine: None takes the best that there is. say: is told what it trains on, and how that went.
+    minutes: its budget; None: the recipe's. backbone: weights that it begins with, as Pretrained.of takes them; None:
+    random ones. machine: None takes the best that there is. say: is told what it trains on, and how that goes.
 
-    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/, and the same policy as
-    LeRobot's folder, <name>_pretrained_model/. On one machine the same input gives the same weights, even if training
-    was ended at any moment and started again. A checkpoint that was made before is taken from the cache.
+    Returns out_path, which appears complete or not at all; beside it are its <name>_curves/, which say of each action
+    how far it is off, and the same policy as LeRobot's folder, <name>_pretrained_model/. On one machine the same input
+    gives the same weights, even if training was ended at any moment and started again, unless the budget ended it. A
+    checkpoint that was made before is taken from the cache.
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     out_path = Path(out_path)
@@ -142,15 +177,18 @@ def train(
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))
     if seed < 0:
         raise TrainingError("training needs a seed from 0", found=seed)
-    recipes = {each: TrainingRecipe.of(size, each, steps, batch) for each in ("cpu", "cuda")}
+    recipes = {each: TrainingRecipe.of(size, each, steps, batch, minutes) for each in ("cpu", "cuda")}
     recipe = recipes[kind]
+    pretrained = None if backbone is None else Pretrained.of(backbone, say)
     p = params()["calibration"]
     recordings = load_recordings(episodes, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
     made_of = {"size": asdict(SIZES[size]), "seed": seed, "split": p}
     made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
     made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})
-    learners = sys.modules[__name__], loop, preprocess, act_module, act_config, episodes_module, controls
+    made_of |= pretrained.origin if pretrained else {}
+    phases = backbone_module, augment_module, judges_module, loop, act_module, act_config
+    learners = sys.modules[__name__], *phases, preprocess, episodes_module, controls
     sources = () if size == "full" and steps is None else learners
     keys = {each: made_of | {"recipe": asdict(made_by)} for each, made_by in recipes.items()}
     begun = {each: cache_root() / f"training-{key_of(key, *sources)}" for each, key in keys.items()}
@@ -160,15 +198,16 @@ def train(
 
     def make(folder: Path) -> None:
         known = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": kind, "seed": seed}
-        known |= {"data_dir": "episodes", "output_dir": "checkpoints", "rate_hz": int(rate_hz)}
-        known |= {"pretrained_backbone": False}
+        known |= {"data_dir": "episodes", "output_dir": "checkpoints", "pretrained_backbone": pretrained is not None}
+        known |= {"rate_hz": int(rate_hz) if rate_hz.is_integer() else rate_hz}
         with machine.computing(), Resumable(unfinished, machine, progress) as saved:
             began_s = time.monotonic()
-            trained = _train(_turned(recordings, progress), SIZES[size], recipe, seed, saved)
-            say(f"in {time.monotonic() - began_s:.0f} s, held-out error {trained['best_val_loss']:.4f}")
-            leave_curves(folder / "curves", saved.losses, saved.judged)
+            trained, actions = _train(_turned(recordings, progress), SIZES[size], recipe, seed, saved, pretrained, say)
+            say(f"in {time.monotonic() - began_s:.0f} s")
+            leave_curves(folder / "curves", saved.losses, saved.judged, actions)
             weights = {name.removeprefix("model."): v for name, v in trained["model_state_dict"].items()}
             config, origin = replace(SIZES[size], rate_hz=rate_hz), {"trained_by": asdict(recipe), "device": kind}
+            origin |= pretrained.origin if pretrained else {}
             write_lerobot(folder / "pretrained_model", config, weights, origin)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             save_torch(folder / "best_model.pth", {**trained, "config": trainer_config(SIZES[size], **known)})
@@ -181,6 +220,11 @@ def train(
     with atomic_path(out_path) as temporary:
         shutil.copyfile(made / "best_model.pth", temporary)
     return out_path
+
+
+def curves_of(checkpoint: Path) -> Path:
+    """Return the folder of the curves of a checkpoint that `train` wrote."""
+    return checkpoint.with_name(f"{checkpoint.stem}_curves")
 
 
 def _rate_hz(recordings: Recordings) -> float:
@@ -196,7 +240,8 @@ def _rate_hz(recordings: Recordings) -> float:
         raise EpisodeError(what, found=layout.words(), remedy=remedy)
     rates = [found for e in recordings.episodes if (found := recorded.frame_rate_hz(e.samples)) is not None]
     found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
-    return float(round(found_hz)) if layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ) else PLANNED_HZ
+    as_recorded = layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ)
+    return round(found_hz, 2 if found_hz < EXACT_BELOW_HZ else 0) if as_recorded else PLANNED_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:
@@ -210,132 +255,194 @@ def _turned(recordings: Recordings, progress: Progress) -> Recordings:
 
 @dataclass(frozen=True)
 class _Training:
-    """What every phase works with. weights: (2,), one divided by each action's spread, on the training's device."""
+    """What every phase works with. weights: (2,), what an error of 1 in each action counts, on the device."""
 
     size: ActConfig  # with the pictures' size in the first phases; the policy's own may be larger
     policy: "ACTPolicy"
     data: Frames
-    judges: Frames  # of other episodes
+    judging: Frames  # of other episodes
+    judges: Judges
     recipe: TrainingRecipe
     weights: Tensor
     rng: np.random.Generator
     saved: Resumable
+    say: Callable[[str], object]
 
     def batch(self, count: int) -> Batch:
         """Draw the next batch of `count` frames, each at most once."""
         rows = self.rng.choice(len(self.data), min(count, len(self.data)), replace=False)
-        return loop.batch_of(self.data, rows, self.rng, self.weights.device)
+        recipe = self.recipe
+        return loop.batch_of(self.data, rows, self.rng, self.weights.device, recipe.augmentation, recipe.mirrored)
 
     def loss(self, batch: Batch) -> Tensor:
-        """Return the policy's loss; pictures in their light become its input, feature maps are that already."""
-        seen = loop.normalised(batch[IMAGE], batch[GAIN]) if GAIN in batch else batch[IMAGE]
+        """Return the policy's loss; pictures become its input, feature maps are that already."""
+        seen = loop.normalised(batch[IMAGE], batch) if batch[IMAGE].dtype == torch.uint8 else batch[IMAGE]
         return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
 
-    def judge(self, maps: loop.RowFile | None = None, units: np.ndarray | float | None = None) -> float:
-        """Return the policy's mean error on the judges, in units of the spreads. maps, units: as of `driving_error`."""
-        judges, units = self.judges, self.weights.cpu().numpy() if units is None else units
-        every = [np.arange(a, min(a + 64, len(judges))) for a in range(0, len(judges), 64)]
-        errors = [loop.driving_error(self.policy, judges, rows, units, maps) for rows in every]
+    def plans(self, maps: loop.RowFile | None = None) -> np.ndarray:
+        """Return the policy's plans on what judges it, (n, C, A). maps: as of `plans_on`."""
+        count = len(self.judging)
+        rows = [np.arange(first, min(first + 64, count)) for first in range(0, count, 64)]
+        plans = np.concatenate([loop.plans_on(self.policy, self.judging, each, maps) for each in rows])
         self.policy.train()
-        return float(np.average(errors, weights=[len(rows) for rows in every]))
+        return plans
+
+    def judge(self, maps: loop.RowFile | None = None) -> np.ndarray:
+        """Return the policy's errors by action, (A,), in % of the range."""
+        return self.judges.errors_pct(self.plans(maps))
 
 
 def _train(
-    recordings: Recordings, size: ActConfig, recipe: TrainingRecipe, seed: int, saved: Resumable
-) -> dict[str, Any]:
-    """Train, and return everything in the checkpoint except its config."""
+    recordings: Recordings,
+    size: ActConfig,
+    recipe: TrainingRecipe,
+    seed: int,
+    saved: Resumable,
+    pretrained: Pretrained | None,
+    say: Callable[[str], object],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Train, and return everything in the checkpoint except its config, and what was learned of each action."""
     p, device, workers = params()["calibration"], saved.machine.device, saved.machine.workers
     parts = split(recordings, p["held_out_share"], p["seed"])
     first = replace(size, image_sizes=(recipe.at,)) if recipe.at else size
     samples, judging = pick_evenly(parts.calibration, recipe.samples), pick_evenly(parts.choosing, recipe.judged)
     data = Frames.of(samples, first.image_sizes[0], workers)
-    judges = Frames.of(judging, size.image_sizes[0], workers)
-    spread = np.maximum(data.chunks[~data.is_pad].std(axis=0), 1e-3)  # of each action, (2,): errors count in it
+    frames = Frames.of(judging, first.image_sizes[0], workers)
+    judges = Judges.of(recordings.layout.action_names, data.chunks, data.is_pad, frames.chunks, frames.is_pad)
+    actions = data.chunks[~data.is_pad]
+    mean, spread = actions.mean(axis=0), np.maximum(actions.std(axis=0), 1e-3)
+    # Errors count in % of the range, so that a throttle that is held does not outweigh steering by its noise. The
+    # largest spread counts 1, as LeRobot's loss has a second part.
+    weights = torch.from_numpy((1 / judges.ranges / (spread / judges.ranges).max()).astype(np.float32)).to(device)
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         policy = lerobot_act(size)
         # Start with plans near the mean action: those of an untrained head are wild.
         with torch.no_grad():
             policy.model.action_head.weight.mul_(torch.from_numpy(spread)[:, None])
-            policy.model.action_head.bias.copy_(torch.from_numpy(data.chunks[~data.is_pad].mean(axis=0)))
+            policy.model.action_head.bias.copy_(torch.from_numpy(mean))
         saved.machine.taking(policy)
-        weights, rng = torch.from_numpy(1 / spread).to(device), np.random.default_rng([seed, 77])
-        judged = Frames.of(judging, first.image_sizes[0], workers) if recipe.at else judges
-        training = _Training(first, policy, data, judged, recipe, weights, rng, saved)
-        _train_backbone(training)
+        rng = np.random.default_rng([seed, 77])
+        training = _Training(first, policy, data, frames, judges, recipe, weights, rng, saved, say)
+        backbone = saved.machine.taking(live_backbone(pretrained))
+        head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(device)
+        _train_backbone(training, head)
         _train_transformer(training)
-        before = min((error for _, error in saved.judged.get("transformer", ())), default=None)
-        optimizer, scheduler = _train_together_or_not(training, "all together", recipe.together_steps, before)
+        optimizer, scheduler = _train_together(training, "all together", recipe.together_steps, recipe.together_rounds)
         if recipe.at:
-            training = replace(training, data=Frames.of(samples, size.image_sizes[0], workers), judges=judges)
-            optimizer, scheduler = _train_together_or_not(training, "at full size", recipe.carry_steps)
-    return {
+            data, frames = (Frames.of(each, size.image_sizes[0], workers) for each in (samples, judging))
+            training = replace(training, data=data, judging=frames)
+            optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
+        plans = training.plans()
+    errors = judges.errors_pct(plans)
+    say(f"on recordings that it did not learn from: {judges.words(errors)}")
+    checkpoint = {
         "epoch": recipe.carry_steps or recipe.together_steps,
         "model_state_dict": {k: v.cpu().contiguous() for k, v in policy.state_dict().items()},
         "optimizer_state_dict": loop.to_cpu(optimizer.state_dict()),
         "scheduler_state_dict": scheduler.state_dict(),
-        "best_val_loss": np.float64(training.judge(units=1.0)),
+        "best_val_loss": np.float64(np.abs(plans - judges.chunks)[~judges.is_pad].mean()),
     }
+    return checkpoint, judges.summary(errors)
 
 
-class _ChunkFromFeatures(nn.Module):
-    """The backbone with the first phase's throw-away head, which maps the features at all positions to a chunk."""
+def _train_backbone(training: _Training, model: PlanFromFeatures) -> None:
+    """Phase one: train the backbone in rounds, then measure on the data the statistics that stay frozen."""
+    recipe, saved, live = training.recipe, training.saved, model.backbone
+    at_steps = torch.from_numpy(model.steps).to(training.weights.device)
 
-    def __init__(self, backbone: nn.Module, size: ActConfig):
-        super().__init__()
-        self.backbone, self.chunk = backbone, size.chunk
-        convolution = nn.Conv2d(FEATURES, HEAD_WIDTH, 1)
-        last = nn.Linear(HEAD_WIDTH * math.prod(size.grid(*size.image_sizes[0])), 2 * size.chunk)
-        nn.init.zeros_(last.weight)  # start with "no action": real actions are small, and an untrained head's are not
-        nn.init.zeros_(last.bias)
-        self.head = nn.Sequential(convolution, nn.ReLU(), nn.Flatten(), last)
+    def loss(batch: Batch) -> Tensor:
+        error = (model(loop.normalised(batch[IMAGE], batch)) - batch[ACTION][:, at_steps]) * training.weights
+        return (error.square() * ~batch[IS_PAD][:, at_steps][..., None]).mean()
 
-    def forward(self, image: Tensor) -> Tensor:
-        return self.head(self.backbone(image)["feature_map"]).unflatten(1, (self.chunk, 2))
+    def judge() -> tuple[float, np.ndarray]:
+        """Return the mean squared error, as of `loss`, and the errors by action, in % of the range."""
+        model.eval()
+        data, plans = training.judging, []
+        with torch.no_grad():
+            for first in range(0, len(data), 64):
+                rows = np.arange(first, min(first + 64, len(data)))
+                pictures = torch.from_numpy(data.pictures(rows)).to(training.weights.device)
+                plans.append(model(loop.normalised(pictures)).cpu().numpy())
+        model.train()
+        recorded, known = data.chunks[:, model.steps], ~data.is_pad[:, model.steps]
+        errors = (np.concatenate(plans) - recorded)[known]
+        squared = float(np.square(errors * training.weights.cpu().numpy()).mean())
+        return squared, 100 * np.abs(errors).mean(axis=0) / training.judges.ranges
 
+    def learn(phase: str, number: int) -> None:
+        saved.train(
+            Phase(phase, recipe.backbone_steps, recipe.backbone_rate / number**0.5),
+            model,
+            training.rng,
+            batch=lambda _: training.batch(recipe.batch),
+            loss=loss,
+        )
 
-def _train_backbone(training: _Training) -> None:
-    """Phase one: train the backbone with live batch norm, then measure on the data the statistics that stay frozen."""
-    import torchvision
-
-    recipe, saved = training.recipe, training.saved
-    resnet = torchvision.models.resnet18(weights=None)
-    live = torchvision.models._utils.IntermediateLayerGetter(resnet, {"layer4": "feature_map"})
-    model = saved.machine.taking(_ChunkFromFeatures(live, training.size)).train()
-    saved.train(
-        Phase("backbone", recipe.backbone_steps, recipe.backbone_rate),
-        model,
-        training.rng,
-        batch=lambda _: training.batch(recipe.batch),
-        loss=lambda batch: loop.error_of(model(loop.normalised(batch[IMAGE], batch[GAIN])), batch, training.weights),
-    )
-    for norm in (m for m in live.modules() if isinstance(m, nn.BatchNorm2d)):
-        norm.reset_running_stats()
-        norm.momentum = None  # torch then takes the plain mean over the batches below
+    model.train()
+    _in_rounds(training, model, "backbone", recipe.backbone_rounds, BACKBONE_SHARE, learn, judge)
+    model.train()
+    measure_statistics(live)
     count = 16 if len(training.data) >= 16 * recipe.batch else 4
     drawn = saved.steps("statistics", count, training.rng, lambda _: training.batch(recipe.batch), backbone=live)
     for _, batch in drawn:
         with torch.no_grad():
-            live(loop.normalised(batch[IMAGE], batch[GAIN]))
+            live(loop.normalised(batch[IMAGE], batch))
     weights = {k: v for k, v in live.state_dict().items() if not k.endswith("num_batches_tracked")}
     training.policy.model.backbone.load_state_dict(weights)
 
 
+def _in_rounds(
+    training: _Training,
+    module: nn.Module,
+    name: str,
+    rounds: int,
+    share: float,
+    learn: Callable[[str, int], None],
+    judge: Callable[[], tuple[float, np.ndarray]],
+    best: float = math.inf,
+) -> None:
+    """Train a module in rounds while its error falls and the budget lasts, and leave it with its best weights.
+
+    share: of the budget, that this phase and those before it may take. learn: does a round, by its phase's name and its
+    number from 1. judge: the error that counts, and the errors by action. best: the error before the first round.
+    """
+    saved, judged = training.saved, list[list[float]]()
+    kept = {k: v.clone() for k, v in module.state_dict().items()}
+    for number in range(1, rounds + 1):
+        phase = name if number == 1 else f"{name}{ROUND}{number}"
+        if number > 1 and not saved.may_begin(phase, number - 1, share * 60 * training.recipe.minutes):
+            training.say(f"{name}: the budget of {training.recipe.minutes:g} minutes ends it")
+            break
+        learn(phase, number)
+        error, errors_pct = judge()
+        judged.append([number, *map(float, errors_pct)])
+        training.say(f"{phase}: {training.judges.words(errors_pct)}")
+        falls, before = error < best * (1 - FALLS), best
+        if error < before:
+            best, kept = error, {k: v.clone() for k, v in module.state_dict().items()}
+        if not falls:
+            break
+    module.load_state_dict(kept)
+    saved.judged[name] = judged
+
+
 def _train_transformer(training: _Training) -> None:
-    """Phase two: train all but the backbone on features that are computed once, of each frame as it is and mirrored."""
-    policy, recipe, data = training.policy, training.recipe, training.data
+    """Phase two: train all but the backbone on features that are computed once, of each frame as it is and varied."""
+    policy, recipe, data, rng = training.policy, training.recipe, training.data, training.rng
     backbone = policy.model.backbone.eval()
     chosen = np.asarray(pick_evenly(range(len(data)), recipe.feature_samples))
-    views = [_features(training, view, data, chosen, backbone) for view in ("plain", "mirrored")]
-    judged = _features(training, "judges", training.judges, np.arange(len(training.judges)), backbone)
+    flipped = rng.random(len(chosen)) < recipe.mirrored  # in the second view
+    views = [_features(training, view, data, chosen, backbone, flipped) for view in ("plain", "varied")]
+    judged = _features(training, "judges", training.judging, np.arange(len(training.judging)), backbone)
 
     def batch(step: int) -> Batch:
-        kept = training.rng.choice(len(chosen), min(recipe.transformer_batch, len(chosen)), replace=False)
+        kept = rng.choice(len(chosen), min(recipe.transformer_batch, len(chosen)), replace=False)
         rows = chosen[kept]
-        states, chunks = loop.swap_states(data, rows, training.rng), data.chunks[rows].copy()
-        if step % 2:  # mirrored
-            states[:, 0] *= -1
-            chunks[:, :, 0] *= -1
+        states, chunks = loop.swap_states(data, rows, rng), data.chunks[rows].copy()
+        if step % 2:
+            states[flipped[kept], 0] *= -1
+            chunks[flipped[kept], :, 0] *= -1
         arrays = {IMAGE: views[step % 2][kept], STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
         return loop.on_device(arrays, training.weights.device)
 
@@ -344,42 +451,67 @@ def _train_transformer(training: _Training) -> None:
     phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
     with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
         best = Best(lambda: training.judge(judged))
-        training.saved.train(phase, policy, training.rng, batch, training.loss, best)
+        training.saved.train(phase, policy, rng, batch, training.loss, best)
+        training.say(f"transformer: {training.judges.words(training.judge(judged))}")
     policy.model.backbone = backbone
 
 
-def _features(training: _Training, view: str, data: Frames, chosen: np.ndarray, backbone: nn.Module) -> loop.RowFile:
-    """Compute the frozen backbone's maps of chosen rows, (n,), into a file. No gradients: two batches fit at once."""
-    batch, (size,), device = 2 * training.recipe.batch, training.size.image_sizes, training.weights.device
+def _features(
+    training: _Training,
+    view: str,
+    data: Frames,
+    chosen: np.ndarray,
+    backbone: nn.Module,
+    flipped: np.ndarray | None = None,
+) -> loop.RowFile:
+    """Compute the frozen backbone's maps of chosen rows, (n,), into a file. No gradients: two batches fit at once.
+
+    flipped: (n,) bool, which are mirrored in the view "varied", whose pictures are varied as the backbone's phase does.
+    """
+    count, (size,), device, rng = (
+        2 * training.recipe.batch,
+        training.size.image_sizes,
+        training.weights.device,
+        training.rng,
+    )
     maps = loop.RowFile(training.saved.folder / f"{view}.rows", (FEATURES, *training.size.grid(*size)))
+    augmentation = training.recipe.augmentation
 
-    def read(step: int) -> np.ndarray:
-        images = data.pictures(chosen[step * batch : (step + 1) * batch])
-        return np.ascontiguousarray(images[:, :, ::-1]) if view == "mirrored" else images
+    def read(step: int) -> Batch:
+        rows = slice(step * count, (step + 1) * count)
+        images, variation = data.pictures(chosen[rows]), dict[str, np.ndarray]()
+        if view == "varied" and flipped is not None:
+            images[flipped[rows]] = images[flipped[rows], :, ::-1]
+            images, variation = augmentation.shifted(images, rng), augmentation.draw(len(images), rng)
+        return loop.on_device({IMAGE: images, **variation}, device)
 
-    for _, images in training.saved.steps(f"features, {view}", -(-len(chosen) // batch), training.rng, read, maps=maps):
+    for _, batch in training.saved.steps(f"features, {view}", -(-len(chosen) // count), rng, read, maps=maps):
+        variation = {name: value for name, value in batch.items() if name != IMAGE}
         with torch.no_grad():
-            maps.append(backbone(loop.normalised(torch.from_numpy(images).to(device)))["feature_map"].cpu())
+            maps.append(backbone(loop.normalised(batch[IMAGE], variation))["feature_map"].cpu())
     return maps
 
 
-def _train_together_or_not(
-    training: _Training, name: str, steps: int, before: float | None = None
-) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: all parameters at a tenth of the rate; stays if it is no worse than what was, `before` if known."""
-    policy, saved = training.policy, training.saved
-    apart = {k: v.clone() for k, v in policy.state_dict().items()}
-    before = training.judge() if before is None else before
-    policy.train()
-    made = saved.train(
-        Phase(name, steps, training.recipe.transformer_rate / 10),
-        policy,
-        training.rng,
-        batch=lambda _: training.batch(training.recipe.together_batch),
-        loss=training.loss,
-    )
-    after = training.judge()
-    saved.judged[name] = [[0, before], [steps, after]]
-    if after > before:
-        policy.load_state_dict(apart)
-    return made
+def _train_together(training: _Training, name: str, steps: int, rounds: int = 1) -> tuple[torch.optim.Optimizer, Any]:
+    """Phase three: all parameters at a tenth of the rate, in rounds; a round stays if it is no worse than before."""
+    policy, saved, made = training.policy, training.saved, list[Any]()
+
+    def judge() -> tuple[float, np.ndarray]:
+        errors = training.judge()
+        return float(errors.mean()), errors
+
+    def learn(phase: str, _: int) -> None:
+        policy.train()
+        made[:] = saved.train(
+            Phase(phase, steps, training.recipe.transformer_rate / 10),
+            policy,
+            training.rng,
+            batch=lambda _: training.batch(training.recipe.together_batch),
+            loss=training.loss,
+        )
+
+    before = training.judge()
+    _in_rounds(training, policy, name, rounds, 1.0, learn, judge, float(before.mean()))
+    saved.judged[name].insert(0, [0, *map(float, before)])
+    optimizer, scheduler = made
+    return optimizer, scheduler

@@ -12,7 +12,7 @@ import math
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -25,6 +25,7 @@ import torch.nn.functional as F
 from filelock import Timeout
 from torch import Tensor, nn
 
+from rover_learn.augment import Augmentation, vary
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 from rover_lib.onboard.stage import private_lock
@@ -40,7 +41,6 @@ T = TypeVar("T")
 M = TypeVar("M", bound=nn.Module)
 Batch = dict[str, Tensor]
 IMAGE, STATE, ACTION, IS_PAD = "observation.images.cam_front", "observation.state", "action", "action_is_pad"
-GAIN = "gain"  # what a batch's pictures are multiplied by
 SWAPPED_STATES = 0.5  # the share of samples that get another's state, so that the state does not give the action away
 STANDING_THROTTLE = 0.01  # below it the car stands, which no frame shows, so such a state is never swapped
 SAVE_EVERY_S = 60.0
@@ -68,6 +68,10 @@ class Machine:
         where = training_device(device, TrainingError)
         cores = (os.cpu_count() or 1) if where.type == "cuda" else 0
         return cls(where, cores if workers is None else workers, amp)
+
+    def seconds(self) -> float:
+        """Return the time that a budget counts: of the processor, or, if a GPU computes, as it passes."""
+        return time.monotonic() if self.device.type == "cuda" else time.process_time()
 
     def words(self) -> str:
         if self.device.type == "cuda":
@@ -200,12 +204,12 @@ class Phase:
 
 @dataclass
 class Best:
-    """The best weights so far. judge: returns the module's error now. stale: how often they were not beaten since.
+    """The best weights so far. judge: returns the module's errors now, by action; their mean counts.
 
-    seen: [step, error] of each judgement.
+    stale: how often they were not beaten since. seen: [step, *errors] of each judgement.
     """
 
-    judge: Callable[[], float]
+    judge: Callable[[], Sequence[float] | np.ndarray]
     error: float = math.inf
     stale: int = 0
     weights: dict[str, Tensor] = field(default_factory=dict)
@@ -213,8 +217,9 @@ class Best:
 
     def see(self, module: nn.Module, step: int) -> None:
         """Judge the module, and keep its weights if they are better than all before."""
-        error = self.judge()
-        self.seen.append([step, error])
+        errors = [float(each) for each in self.judge()]
+        error = sum(errors) / len(errors)
+        self.seen.append([step, *errors])
         self.stale += 1
         if error < self.error:
             self.error, self.stale = error, 0
@@ -231,8 +236,8 @@ class Best:
 class Resumable:
     """A training in phases, in a folder, that resumes to the last bit after a power cut at any moment.
 
-    every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase. judged: [step, error] of
-    each judgement, by phase.
+    every_s: seconds between two saves, more if saving is slow. losses: of each step, by phase. judged: [step, *errors]
+    of each judgement, by phase. earlier_s: spent before this process, by the clock of a budget.
     """
 
     folder: Path
@@ -242,6 +247,7 @@ class Resumable:
     clock: Callable[[], float] = time.monotonic
     losses: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     judged: dict[str, list[list[float]]] = field(default_factory=dict)
+    earlier_s: float = 0.0
 
     def __enter__(self) -> "Resumable":
         """Make the folder and lock it. Raises TrainingError if another process trains in it."""
@@ -253,10 +259,22 @@ class Resumable:
             raise TrainingError("another process trains the same", found=self.folder, remedy="wait for it") from None
         for left in self.folder.glob(".*.pt"):  # of a process that was killed while it saved
             left.unlink()
+        self._began_s = self.machine.seconds()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
+
+    def spent_s(self) -> float:
+        """Return the seconds that this training has taken, those of interrupted processes included."""
+        return self.earlier_s + self.machine.seconds() - self._began_s
+
+    def may_begin(self, phase: str, rounds: int, budget_s: float) -> bool:
+        """Whether a further round fits into the budget, after `rounds` of it; one that has begun is always ended."""
+        if (self.folder / f"{phase}.pt").exists():
+            return True
+        spent_s = self.spent_s()
+        return spent_s + spent_s / rounds <= budget_s
 
     def steps(
         self,
@@ -326,6 +344,7 @@ class Resumable:
     def _save(self, file: Path, phase: str, step: int, drawn: Any, parts: dict[str, Any]) -> None:
         content = {"step": step, "parts": {name: part.state_dict() for name, part in parts.items()}}
         content |= {"numpy": drawn, "torch": torch.get_rng_state(), "losses": self.losses[phase]}
+        content["spent_s"] = self.spent_s()
         save_torch(file, content | {"cuda": torch.cuda.get_rng_state_all()})
 
     def _restore(self, file: Path, phase: str, rng: np.random.Generator, parts: dict[str, Any]) -> int:
@@ -342,6 +361,7 @@ class Resumable:
         if len(content["cuda"]) == torch.cuda.device_count():
             torch.cuda.set_rng_state_all(content["cuda"])
         self.losses[phase] = content["losses"]
+        self.earlier_s = max(self.earlier_s, content["spent_s"])
         return content["step"]
 
 
@@ -373,16 +393,22 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def batch_of(data: Frames, rows: np.ndarray, rng: np.random.Generator, device: torch.device) -> Batch:
-    """Return a batch to train on: half of the samples mirrored, half of the states swapped, and GAIN, another light."""
-    flipped = rng.random(len(rows)) < 0.5
+def batch_of(
+    data: Frames,
+    rows: np.ndarray,
+    rng: np.random.Generator,
+    device: torch.device,
+    augmentation: Augmentation,
+    mirrored: float,
+) -> Batch:
+    """Return a batch to learn from: half of the states swapped, its pictures' variation, a share of all mirrored."""
+    flipped = rng.random(len(rows)) < mirrored
     images, states, chunks = data.pictures(rows), swap_states(data, rows, rng), data.chunks[rows].copy()
     images[flipped] = images[flipped, :, ::-1]
     states[flipped, 0] *= -1
     chunks[flipped, :, 0] *= -1
-    gain = rng.uniform(0.8, 1.25, (len(rows), 1, 1, 1)).astype(np.float32)
-    arrays = {IMAGE: images, GAIN: gain, STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
-    return on_device(arrays, device)
+    arrays = {IMAGE: augmentation.shifted(images, rng), STATE: states, ACTION: chunks, IS_PAD: data.is_pad[rows]}
+    return on_device(arrays | augmentation.draw(len(rows), rng), device)
 
 
 def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> Batch:
@@ -393,14 +419,12 @@ def on_device(arrays: dict[str, np.ndarray], device: torch.device) -> Batch:
     return tensors
 
 
-def normalised(images: Tensor, gain: Tensor | None = None) -> Tensor:
+def normalised(images: Tensor, variation: Mapping[str, Tensor] | None = None) -> Tensor:
     """Return pictures, (B, height, width, 3) uint8, as LeRobot's forward expects them.
 
-    gain: (B, 1, 1, 1), multiplies each.
+    variation: as `vary` takes it; None: pictures are as they were taken.
     """
-    x = images.permute(0, 3, 1, 2).float()
-    if gain is not None:
-        x = (x * gain).clamp_(max=255)
+    x = vary(images, variation or {})
     mean, std = (torch.tensor(each, device=x.device)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
     return (x / 255 - mean) / std
 
@@ -470,10 +494,8 @@ class Given(nn.Module):
         return {"feature_map": features}
 
 
-def driving_error(
-    policy: "ACTPolicy", data: Frames, rows: np.ndarray, units: np.ndarray | float = 1.0, maps: RowFile | None = None
-) -> float:
-    """Return the mean absolute error of the policy's plans on these rows (no latent is sampled), times `units`.
+def plans_on(policy: "ACTPolicy", data: Frames, rows: np.ndarray, maps: RowFile | None = None) -> np.ndarray:
+    """Return the policy's plans, (n, C, A), on these rows, as it drives: no latent is sampled.
 
     maps: feature maps to take instead of the pictures.
     """
@@ -481,8 +503,7 @@ def driving_error(
     seen = data.pictures(rows) if maps is None else maps[rows]
     batch = on_device({IMAGE: seen, STATE: data.states[rows]}, next(policy.parameters()).device)
     batch[IMAGE] = normalised(batch[IMAGE]) if maps is None else batch[IMAGE]
-    chunks = policy.predict_action_chunk(batch)
-    return float((np.abs(chunks.cpu().numpy() - data.chunks[rows]) * units)[~data.is_pad[rows]].mean())
+    return policy.predict_action_chunk(batch).cpu().numpy()
 
 
 def to_cpu(value: Any) -> Any:

@@ -1,16 +1,20 @@
 """A tiny training of LeRobot's ACT leaves a checkpoint of the user's trainer, the same after a kill in any phase."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import torchvision
+from command import rover
 from interrupted import interrupt
 from lerobot.policies.act.modeling_act import ACTPolicy
 from recorded import record_drives
 
 from rover_learn import train as train_module
 from rover_learn import training as training_module
+from rover_learn.backbone import IMAGENET, Pretrained
 from rover_learn.train import SIZES, train
 from rover_learn.training import Machine
 from rover_lib.onboard.errors import RoverError
@@ -86,6 +90,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     assert not list((tmp_path / "cache").glob("training-*")), "what was saved on the way is of no use any more"
     curves = json.loads((tmp_path / "killed_curves/curves.json").read_text())
     assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [2, 3, 2]
+    assert list(curves["actions"]) == ["steering", "throttle"] and len(curves["errors"]["backbone"][0]) == 3
     assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
     lerobots = ACTPolicy.from_pretrained(tmp_path / "killed_pretrained_model").state_dict()
     assert all(torch.equal(v, lerobots[k]) for k, v in whole["model_state_dict"].items())
@@ -123,3 +128,108 @@ def test_what_cannot_be_trained_is_refused(drives, tmp_path, wrong, monkeypatch)
         machine = Machine.of(wrong.pop("device", "cpu"))
         train(**{"episodes": drives, "out_path": tmp_path / "best_model.pth", "machine": machine, **wrong})
     assert not list(tmp_path.iterdir())
+
+
+def save_resnet(path, change=lambda weights: None):
+    """Save torchvision's random weights after a change; return them."""
+    torch.manual_seed(3)
+    weights = torchvision.models.resnet18(weights=None).state_dict()
+    change(weights)
+    torch.save(weights, path)
+    return weights
+
+
+def test_a_training_begins_with_the_backbone_of_a_file_and_says_so(drives, tmp_path, set_params):
+    few = "transformer_steps: 1, together_steps: 0, batch: 4, transformer_batch: 4, samples: 20, feature_samples: 8, "
+    set_params(f"train: {{small: {{backbone_steps: 1, backbone_rate: 1.0e-9, {few}judged: 8}}}}")
+    weights = save_resnet(tmp_path / "resnet18.pth")
+    out = train(drives, tmp_path / "policy.pth", backbone=tmp_path / "resnet18.pth", machine=CPU)
+    made = torch.load(out, weights_only=False)
+    learned = made["model_state_dict"]
+    assert torch.allclose(learned["model.backbone.conv1.weight"], weights["conv1.weight"], atol=1e-6)
+    assert torch.allclose(learned["model.backbone.layer4.1.conv2.weight"], weights["layer4.1.conv2.weight"], atol=1e-6)
+    said = json.loads((tmp_path / "policy_pretrained_model/config.json").read_text())
+    assert made["config"]["pretrained_backbone"] and said["pretrained_backbone_weights"] is None, "nothing to download"
+    assert "resnet18.pth" in (tmp_path / "policy_pretrained_model/origin.json").read_text()
+
+
+def drop(weights):
+    del weights["layer1.0.conv1.weight"]
+
+
+def spoil(weights):
+    weights["conv1.weight"][0, 0, 0, 0] = torch.nan
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [(drop, "layer1.0.conv1.weight is missing"), (spoil, "not finite"), (None, "not a file of weights")],
+)
+def test_a_file_of_another_backbone_is_refused(tmp_path, change, says):
+    file = tmp_path / "weights.pth"
+    if change:
+        save_resnet(file, change)
+    else:
+        file.write_text("weights")
+    with pytest.raises(RoverError, match=says):
+        Pretrained.of(file, print)
+
+
+def test_without_internet_the_backbone_begins_at_random_and_says_so(monkeypatch):
+    def refused(*_, **__):
+        raise OSError("no network")
+
+    monkeypatch.setattr("torch.hub.load_state_dict_from_url", refused)
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", refused)
+    said = []
+    assert Pretrained.of(IMAGENET, said.append) is None
+    assert said == ["the backbone begins with random weights: ImageNet's cannot be fetched (no network)"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "fits", "learned", "kept"),
+    [
+        ([5, 4, 3, 2], True, 4, 4),  # as many rounds as the recipe has
+        ([5, 4, 3.99, 2], True, 3, 3),  # it hardly falls any more
+        ([5, 4, 6, 2], True, 3, 2),  # it rises: the round before stays
+        ([5, 4, 3, 2], False, 1, 1),  # the budget lasts for one
+    ],
+)
+def test_rounds_go_on_while_the_error_falls(errors, fits, learned, kept):
+    module, said, rounds = torch.nn.Linear(1, 1, bias=False), [], []
+    saved = SimpleNamespace(may_begin=lambda *_: fits, judged={})
+    judges = SimpleNamespace(words=lambda errors_pct: f"steering {errors_pct[0]:.1f} %")
+    training = SimpleNamespace(saved=saved, judges=judges, say=said.append, recipe=SimpleNamespace(minutes=3))
+
+    def learn(phase, number):
+        rounds.append(phase)
+        torch.nn.init.constant_(module.weight, number)
+
+    def judge():
+        error = errors[len(rounds) - 1]
+        return error, np.array([error])
+
+    train_module._in_rounds(training, module, "backbone", 4, 0.5, learn, judge)
+    assert len(rounds) == learned and module.weight.item() == kept
+    assert rounds[:2] == ["backbone", "backbone, round 2"][:learned]
+    assert said[0] == "backbone: steering 5.0 %" and ("budget" in said[-1]) == (not fits)
+    assert saved.judged["backbone"] == [[k + 1, errors[k]] for k in range(learned)]
+
+
+@pytest.mark.parametrize(
+    ("steering", "says"), [(7.1, "next: rover run 'my policy.pth' "), (15.6, "steering was not learned: 15.6 % off")]
+)
+def test_a_command_to_go_on_is_printed_only_for_what_was_learned(drives, tmp_path, monkeypatch, steering, says):
+    found = {"error_pct": steering, "blind_pct": 15.6, "varies": True, "learned": steering < 15}
+
+    def trained(_episodes, out, **_options):
+        curves = train_module.curves_of(out)
+        curves.mkdir()
+        (curves / "curves.json").write_text(json.dumps({"actions": {"steering": found}}))
+        return out
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_module, "train", trained)
+    result = rover("train", drives, "my policy.pth", "--backbone", "none")
+    assert result.exit_code == 0 and says in result.output, result.output
+    assert ("next:" in result.output) == (steering < 15)

@@ -10,6 +10,7 @@ from policies import normalise
 from torch import nn
 
 from rover_learn import training
+from rover_learn.augment import GAIN
 from rover_learn.training import Best, Machine, Phase, RepeatablePool, Resumable, RowFile, normalised
 from rover_lib.onboard.errors import TrainingError
 
@@ -139,7 +140,7 @@ def test_the_best_weights_are_kept_and_what_learns_by_heart_stops(tmp_path, monk
     errors, weights = iter([3.0, 1.0, *[2.0] * steps]), []
 
     def best(model):
-        return Best(lambda: weights.append(model.weight.item()) or next(errors))
+        return Best(lambda: weights.append(model.weight.item()) or [next(errors)])
 
     kept = learn(tmp_path, steps, lambda y: y.square().sum(), best)
     assert len(weights) == judged and kept == weights[1] != weights[-1]
@@ -150,7 +151,7 @@ def test_pictures_become_a_policys_input_as_on_the_rover():
     pictures = np.random.default_rng(0).integers(0, 256, (2, 6, 5, 3), np.uint8)
     assert np.array_equal(normalised(torch.from_numpy(pictures)).numpy(), normalise(pictures))
     gain = np.array([0.8, 1.25], np.float32)[:, None, None, None]
-    lit = normalised(torch.from_numpy(pictures), torch.from_numpy(gain)).numpy()
+    lit = normalised(torch.from_numpy(pictures), {GAIN: torch.from_numpy(gain)}).numpy()
     assert np.array_equal(lit, normalise(np.minimum(pictures * gain, 255)))
 
 
