@@ -19,8 +19,8 @@ def leave_curves(
 ) -> None:
     """Write curves.json and curves.png into a new folder, and TensorBoard's files if that is installed.
 
-    losses: of each step, by phase; the rounds of a phase are one after the other. errors: [step or round, *held-out errors by action], by phase, in % of the range.
-    actions: what was learned of each, as of `Judges.summary`.
+    losses: of each step, by phase; the rounds of a phase are one after the other. errors: [step or round, *held-out
+    errors by action], by phase, in % of the range. actions: what was learned of each, as of `Judges.summary`.
     """
     folder.mkdir()
     losses = _join_rounds(losses)
