@@ -56,11 +56,14 @@ look:
 	test -x $(LOOK)/bin/rover || { $(PYTHON) -m venv $(LOOK) && $(LOOK)/bin/pip install --quiet '.[look]'; }
 	$(LOOK)/bin/rover demo
 
+# As many steps as two minutes have, and no weights from the internet: the same policy on each machine of a kind.
+DEMO_TRAINING = --steps 880 --backbone none
+
 # Recordings that another version of the world made are recorded again. It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)
 	@rm -f $(DEMO)
 	$(ROVER) world record runs/demo/episodes
-	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth
+	$(ROVER) train runs/demo/episodes runs/demo/best_model.pth $(DEMO_TRAINING)
 	$(ROVER) run runs/demo/best_model.pth runs/demo/episodes --name demo --worlds 40
 	@touch $(DEMO)
 	@echo
@@ -120,7 +123,7 @@ check-release: lint $(DEMO)
 count: $(READY)
 	@test '$(NAME)' != full -o -f runs/full/policy_static.onnx.zip || { \
 	$(ROVER) world record runs/full/episodes --count $(if $(LEARNED),80,16) && \
-	$(ROVER) train runs/full/episodes runs/full/best_model.pth --size full $(if $(LEARNED),,--steps 24) && \
+	$(ROVER) train runs/full/episodes runs/full/best_model.pth --size full --backbone none $(if $(LEARNED),,--steps 24) && \
 	{ $(ROVER) run runs/full/best_model.pth runs/full/episodes --name full --samples 64 -p modes '[static]'; $(ROVER) export runs/full --onnx; }; }
 	$(LAB) arm 'runs/$(NAME)'
 
