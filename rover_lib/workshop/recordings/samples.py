@@ -212,6 +212,7 @@ class Recordings:
     """All usable episodes below `root`, and every fault that was found.
 
     blocks: the names of the blocks of each place, such as each tub of a folder; () where whole episodes are parted.
+    kind: what they are, a key of onboard.kinds.CALLED.
     """
 
     root: Path
@@ -220,6 +221,7 @@ class Recordings:
     source: Source
     layout: Layout = Layout()
     blocks: tuple[tuple[str, ...], ...] = ()
+    kind: str = "recordings"
 
     @property
     def samples(self) -> tuple[Sample, ...]:
@@ -265,7 +267,9 @@ class Recordings:
             "controls": sum(e.controls for e in self.episodes),
             "samples": len(self.samples),
             "duration_s": sum(e.duration_s for e in self.episodes),
+            "kind": self.kind,
             "layout": self.layout.words(),
+            "blocks": sum(map(len, self.blocks)),  # 0 where whole episodes are parted
             "labels": sorted({e.label for e in self.episodes}),
             "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
