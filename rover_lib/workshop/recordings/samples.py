@@ -1,6 +1,7 @@
 """The common form of our recordings and LeRobot's: samples, and what was wrong."""
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -53,6 +54,12 @@ class Source:
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
         return cls(Path(path), names, cameras, facts, throttle)
+
+    def typed(self) -> str:
+        """What a user types for it."""
+        said = {"--action-names": self.action_names, "--camera": self.cameras, "--throttle": (self.throttle,)}
+        options = [part for name, values in said.items() if any(values) for part in (name, ",".join(values))]
+        return shlex.join([str(self.path), *options])
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
@@ -268,6 +275,7 @@ class Recordings:
             "samples": len(self.samples),
             "duration_s": sum(e.duration_s for e in self.episodes),
             "kind": self.kind,
+            "throttle": self.source.throttle,
             "layout": self.layout.words(),
             "blocks": sum(map(len, self.blocks)),  # 0 where whole episodes are parted
             "labels": sorted({e.label for e in self.episodes}),
