@@ -263,7 +263,7 @@ def test_what_a_tub_needs_is_kept_for_the_next_stage(tmp_path):
 def test_reverse_is_said_to_be_read_as_stopped(tmp_path):
     """40 % of a tub's records were called "repaired"."""
     (fault,) = read_tub(tub(tmp_path / "tub", records(70)), Car()).faults
-    assert fault.handled == "read as stopped" and fault.note.startswith("43 % of the records have negative throttle")
+    assert fault.handled == "read as stopped" and fault.note.startswith("53 % of the records have negative throttle")
     assert "reverse_us" in fault.note and "--throttle as-recorded" in fault.note
 
 
