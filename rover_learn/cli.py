@@ -147,4 +147,4 @@ def train(episodes: "Source", output: Path, backbone: str, **options: Any) -> No
     actions = read_actions(curves_of(output))
     if lacking := not_learned(actions):
         return click.echo("\n".join(lacking))
-    click.echo(f"next: {shlex.join(['rover', 'run', str(output), str(episodes.path), '--name', 'mine'])}")
+    click.echo(f"next: rover run {shlex.quote(str(output))} {episodes.typed()} --name mine")
