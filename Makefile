@@ -47,8 +47,8 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
 	$(VENV)/bin/python -m pip --version > /dev/null 2>&1 || $(VENV)/bin/python -m ensurepip --upgrade --default-pip > /dev/null || $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip
-	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,look,dev,docs]' -e ./lerobot_robot_rover
+	$(VENV)/bin/python -m pip install --quiet 'uv>=0.8'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python --group dev --group docs -e '.[workshop,look]' -e ./lerobot_robot_rover
 	@touch $@
 
 # Without torch, in an environment of its own.

@@ -29,11 +29,12 @@ from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.workshop.installed import SHIPPED
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.parameters import check_parameters
 
-NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
+NOTEBOOKS = SHIPPED / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Notebooks for a finished run, which `make count`, `rover run --only 07`, `rover world students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
@@ -156,7 +157,7 @@ def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
 def _refuse_senseless(notebooks: list[Path], given: Mapping[str, Any]) -> None:
     """Raise RoverError for parameters that none of the notebooks has, impossible values, and missing notebooks."""
     if missing := [path for path in notebooks if not path.is_file()]:
-        raise RoverError(f"{missing[0]}: not found", remedy="run from a checkout of the project")
+        raise RoverError(f"{missing[0]}: not found", remedy="install the project again")
     known = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
     if unknown := sorted(given.keys() - known):
         raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(known)}")
