@@ -127,17 +127,9 @@ count: $(READY)
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
 
-# This opens a copy, so that cells that are run again there change no run; a copy that is there stays. Checkpoint and
-# recordings stay where they are. Without NAME it opens the repository's notebooks. The environment is that of the
-# kernels of `rover run` (KERNEL_ENVIRONMENT). A container may have no user but root.
-COPY = $(if $(filter default,$(origin AS)),$(NAME)-copy,$(AS))
-OPENED = $(if $(filter file,$(origin NAME)),notebooks,runs/$(COPY))
-MADE = $(wildcard $(addprefix runs/$(NAME)/,*.ipynb *.json *.html policy_* calibration*.pt figures))
+# Without NAME it opens the repository's notebooks.
 notebooks-open: $(READY)
-	@test '$(OPENED)' = notebooks -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover inspect shows the runs that there are' >&2; exit 1; }
-	@test '$(COPY)' != '$(NAME)' -a \( -f '$(OPENED)/01_load.ipynb' -o ! -e '$(OPENED)' \) || { echo '$(OPENED): is the run itself, or no copy of one: give the copy another name, AS=try1' >&2; exit 1; }
-	@test -e '$(OPENED)' || { rm -rf '$(OPENED).part' && mkdir '$(OPENED).part' && cp -r $(MADE) '$(OPENED).part' && mv '$(OPENED).part' '$(OPENED)'; }
-	env OMP_WAIT_POLICY=PASSIVE PYTHONWARNINGS='ignore:Currently,ignore:IProgress not found' TORCH_CPP_LOG_LEVEL=ERROR $(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) --LabApp.default_url=/lab/tree/01_load.ipynb '$(OPENED)'
+	$(if $(filter file,$(origin NAME)),$(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(AS),--as '$(AS)'))
 
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish

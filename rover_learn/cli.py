@@ -127,6 +127,7 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
     again to resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
     """
     from rover_learn.train import train as train_policy
+    from rover_lib.workshop.installed import command_line
 
     click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
-    click.echo(f"next: rover run {output} {episodes.path} --name mine")
+    click.echo(f"next: {command_line('rover', 'run', output, episodes.path, '--name', 'mine')}")

@@ -10,7 +10,7 @@ from typing import Any, cast
 import click
 from click.core import ParameterSource
 
-from rover_lib.cli import prepare
+from rover_lib.cli import prepare, programs
 from rover_lib.onboard import cli as onboard
 from rover_lib.onboard.cli import FROM_0, VERSION, Rover
 from rover_lib.onboard.kinds import Number
@@ -37,12 +37,19 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
 ROVERS = onboard.main.commands
 # What most people need, by what they do; below it all others. inspect, drive, view and log can do more here than there.
 SECTIONS: dict[str, list[click.Command]] = {
-    "Prepare a policy": [prepare.run, prepare.inspect, prepare.report, ROVERS["benchmark"], prepare.export],
+    "Prepare a policy": [
+        prepare.run,
+        prepare.inspect,
+        prepare.report,
+        programs.notebooks,
+        ROVERS["benchmark"],
+        prepare.export,
+    ],
     "Drive": [ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive],
     "Look": [],
     "Teach": [],
     "Recordings": [],
-    "A rover's models, and arming it": [ROVERS["release"], ROVERS["arm-car"]],
+    "A rover's models, and arming it": [programs.playbook, ROVERS["release"], ROVERS["arm-car"]],
 }
 for title in ("Teach", "Look", "Recordings"):
     SECTIONS[title] += [entry.load() for entry in entry_points(group=f"rover.{title.lower()}")]

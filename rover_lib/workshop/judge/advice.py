@@ -1,6 +1,7 @@
 """Say what to do about what failed in a run, what weakens its verdict, and what to type next."""
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -119,16 +120,24 @@ def list_cautions(
 def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names) -> list[dict[str, str]]:
     """Return at most three commands to type next, with the reason for each: next.txt."""
     failed = [row["gate"] for row in judged["failed"] if row["gate"].startswith(GATED)]
-    allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
+    artifact = names.artifact(judged["deploy"] or best)
     lines = fill_in(
         "next.txt",
         judged=judged,
         compare=stages["compare"],
         names=names,
-        artifact=names.artifact(judged["deploy"] or best),
+        artifact=artifact,
+        deployed=_deployed(artifact, sorted(judged["refused"])),
         other_robot=set(judged["refused"]) - set(MAY_DIFFER),
-        allow=f" -e '{allow}'" if allow else "",
         failed=failed,
     )
     steps = [line.rpartition("  # ") for line in lines[:NEXT_COMMANDS]]
     return [{"command": command, "why": why} for command, _, why in steps]
+
+
+def _deployed(artifact: str, allow: Sequence[str]) -> str:
+    """What deploy.yml is told by -e. Ansible splits name=value at spaces, and reads JSON as it is."""
+    if not allow and re.fullmatch(r"[\w./-]+", artifact):
+        return f"rover_artifact={artifact}"
+    told: dict[str, Any] = {"rover_artifact": artifact}
+    return json.dumps(told | ({"rover_allow": list(allow)} if allow else {}), ensure_ascii=False)

@@ -16,7 +16,7 @@ from rover_lib.workshop.installed import SHIPPED
 from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
-NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
+NO_ROVER = "no rover's benchmark is here; rover playbook benchmark fetches them"
 CLOCK = SHIPPED / "results" / "clock" / "clock.json"  # its program: commit 545214c
 
 

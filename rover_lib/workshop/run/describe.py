@@ -77,6 +77,6 @@ def verdict_of(run_dir: Path) -> str:
         if all(sha256_of(path) == sha256 for path, sha256 in there.items()):
             return str(judged["metrics"]["headline"])
     if (run_dir / "compare.json").is_file():
-        return f"no verdict of its files: rover report {run_dir}"
+        return f"no verdict of its files: rover report {shlex.quote(str(run_dir))}"
     made = next((p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT")
     return f"no run yet: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
