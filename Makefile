@@ -114,7 +114,7 @@ check-release: lint $(DEMO)
 	for car in crawler inverted; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done
 	$(LAB) random runs/random.json
 	$(MAKE) mutants
-	$(LAB) pi runs/pi.json
+	$(LAB) --install pi runs/pi.json
 
 # NAME=full needs no checkpoint: it makes one. After 24 steps a policy does not drive, so that its run fails its gates.
 count: $(READY)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, show
+from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, notify, show
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.kinds import PathTo, Preset
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
@@ -24,6 +24,23 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
     if (sizes := re.fullmatch(r"(\d+)x(\d+)", value)) is None:
         raise click.BadParameter("width and height in pixels are wanted, as in 320x180")
     return int(sizes[2]), int(sizes[1])
+
+
+def preset(section: str, key: str) -> dict[str, Any]:
+    """What makes an option show params.yml's value."""
+    return {"cls": Preset, "preset": lambda p, _: p[section][key]}
+
+
+class Resumable(click.Command):
+    """A long command that, run again after Ctrl-C, goes on where it was."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run it."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            notify("\nrover: stopped; run the same command again to resume")
+            ctx.exit(130)
 
 
 Turned = tuple[tuple[str, str], ...]
@@ -48,17 +65,26 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
-@click.command(short_help="Turn a checkpoint into artifacts and a verdict.")
+@click.command(short_help="Turn a checkpoint into artifacts and a verdict.", cls=Resumable)
 @click.argument("checkpoint", type=CHECKPOINT, required=False)
 @click.argument("episodes", type=EPISODES, required=False)
 @ACTION_NAMES
 @CAMERA
 @FACTS
-@click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option(
+    "--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/; letters, digits, _ - ."
+)
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")
+@click.option(
+    "--samples", type=FROM_1, help="Calibration samples [default: params.yml].", **preset("calibration", "samples")
+)
 @click.option("--worlds", type=FROM_0, help="Balloon worlds to drive in [default: 0].")
-@click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].")
+@click.option(
+    "--iterations",
+    type=FROM_1,
+    help="Timed inferences per mode [default: params.yml].",
+    **preset("benchmark", "iterations"),
+)
 @click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
 @click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
 def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
