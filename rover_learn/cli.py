@@ -45,9 +45,7 @@ def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--amp/--no-amp", default=False, show_default=True, help="Mixed precision, in bfloat16."),
         click.option("--workers", type=click.IntRange(min=0), help="Threads that read ahead [default: all for a GPU]."),
         click.option("--device", metavar="cpu|cuda|cuda:N", help="[default: cuda where there is one]"),
-        click.option(
-            "--batch", type=click.IntRange(min=1), help="Samples in each step [default: params.yml].", **BATCH
-        ),
+        click.option("--batch", type=click.IntRange(min=1), help="Samples in a step [default: params.yml].", **BATCH),
         click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml].", **STEPS),
     ):
         called = option(called)
@@ -59,7 +57,7 @@ def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
     for option in (
         of_a_training,
         click.option("--runs-dir", type=FILE, default="runs", show_default=True),
-        click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/; letters, digits, _ - ."),
+        click.option("--name", required=True, help="Of the run's folder in <runs-dir>: letters, digits, _ - ."),
     ):
         command = option(command)
     return command

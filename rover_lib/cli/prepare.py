@@ -26,9 +26,8 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return int(sizes[2]), int(sizes[1])
 
 
-def preset(section: str, key: str) -> dict[str, Any]:
-    """What makes an option show params.yml's value."""
-    return {"cls": Preset, "preset": lambda p, _: p[section][key]}
+SAMPLES: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["calibration"]["samples"]}
+ITERATIONS: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["benchmark"]["iterations"]}
 
 
 class Resumable(click.Command):
@@ -72,19 +71,12 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
 @CAMERA
 @FACTS
 @click.option(
-    "--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/; letters, digits, _ - ."
+    "--name", default="mine", show_default=True, help="Of the run's folder in <runs-dir>: letters, digits, _ - ."
 )
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option(
-    "--samples", type=FROM_1, help="Calibration samples [default: params.yml].", **preset("calibration", "samples")
-)
+@click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].", **SAMPLES)
 @click.option("--worlds", type=FROM_0, help="Balloon worlds to drive in [default: 0].")
-@click.option(
-    "--iterations",
-    type=FROM_1,
-    help="Timed inferences per mode [default: params.yml].",
-    **preset("benchmark", "iterations"),
-)
+@click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].", **ITERATIONS)
 @click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
 @click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
 def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
