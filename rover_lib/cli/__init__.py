@@ -3,8 +3,10 @@
 Other packages of the same install add commands by the entry points `rover.<section>` of pyproject.toml.
 """
 
+import os
 from functools import partial
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, cast
 
 import click
@@ -12,8 +14,11 @@ from click.core import ParameterSource
 
 from rover_lib.cli import prepare, programs
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.car.car import FILE_VARIABLE
 from rover_lib.onboard.cli import FROM_0, VERSION, Rover
 from rover_lib.onboard.kinds import Number
+from rover_lib.onboard.params import FOR_THIS_RUN
+from rover_lib.workshop.installed import IN_WHEEL
 
 
 @click.command(help=onboard.drive.help, short_help="Drive a car, or in the balloon world, with an artifact.")
@@ -72,8 +77,12 @@ def main(debug: bool) -> None:
     """Put a learned driving policy on a small computer.
 
     A checkpoint (LeRobot ACT) and recordings go in; an INT8 artifact that a Raspberry Pi can run, an honest comparison
-    with the original and a benchmark come out. Start with `make demo`, or with `rover run` on your own files.
+    with the original and a benchmark come out. Start with `rover demo`, or with `rover run` on your own files.
     """
+    if IN_WHEEL:  # in a checkout these files stand at its top
+        for variable, name in ((FOR_THIS_RUN, "params.yml"), (FILE_VARIABLE, "car.yml")):
+            if Path(name).is_file():
+                os.environ.setdefault(variable, str(Path(name).resolve()))
 
 
 cast(click.Group, ROVERS["release"]).add_command(prepare.wheelhouse)

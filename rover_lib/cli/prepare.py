@@ -10,7 +10,7 @@ import click
 
 from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, notify, show
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import PathTo, Preset
+from rover_lib.onboard.kinds import Output, PathTo, Preset, check_kind, kinds_of
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
@@ -138,28 +138,40 @@ def inspect(episodes: "Source", as_json: bool) -> None:
     show(describe(episodes, terminal_bar()), as_json)
 
 
-@click.command(short_help="Write a run's policies for ONNX Runtime, or its model card.")
-@click.argument("run_dir", type=PathTo("run"))
-@click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
+@click.command(short_help="Write policies for ONNX Runtime, or a run's model card.")
+@click.argument("source", metavar="RUN_DIR|CHECKPOINT", type=FILE)
+@click.option("--onnx", is_flag=True, help="Of a run policy_fp32.onnx.zip and policy_static.onnx.zip.")
+@click.option("-o", "--output", type=Output(), help="Of a checkpoint: the graph [default: its name, here, with .onnx].")
+@FACTS
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--license", help="For the card, such as apache-2.0 [default: the checkpoint's, if it names one].")
 @click.option("--base-model", metavar="USER/NAME", help="For the card: the FP32 policy on the Hub [default: likewise].")
-def export(run_dir: Path, onnx: bool, card: bool, **about: str | None) -> None:
-    """Write the policies of the run in RUN_DIR for another engine, or for others to use.
+def export(source: Path, onnx: bool, output: Path | None, facts: str, card: bool, **about: str | None) -> None:
+    """Write the policies of a run for another engine, or for others to use; or one checkpoint as a graph in FP32.
 
-    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md.
+    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. Of a CHECKPOINT, which needs neither
+    recordings nor a run, the plain graph: docs/api.md has its contract. --card: see docs/lerobot.md.
     """
     if not (onnx or card):
         raise click.UsageError("for what? --onnx or --card")
+    if not card and not (source / "quantize.json").is_file() and {"checkpoint", "pretrained"} & {*kinds_of(source)}:
+        from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+        from rover_lib.workshop.run.pipeline import export_graph
+
+        written = export_graph(load_checkpoint(source, said=facts), output or Path(f"{source.resolve().stem}.onnx"))
+        return click.echo(f"{written}: {written.stat().st_size / 1e6:.1f} MB, FP32")
+    check_kind(source, "run")
+    if output or facts:
+        raise click.UsageError("--output and --facts belong to a checkpoint, not to a run")
     if card:
         from rover_lib.workshop.run.run_report import write_card
 
-        click.echo(f"written: {write_card(run_dir, **about)}")
+        click.echo(f"written: {write_card(source, **about)}")
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 
-        for name, digest in export_onnx(run_dir, terminal_bar()).items():
-            path = run_dir / name
+        for name, digest in export_onnx(source, terminal_bar()).items():
+            path = source / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.columns import align, benchmark_rows
+from rover_lib.onboard.columns import align, benchmark_rows, in_words
 from rover_lib.onboard.errors import RoverError, of_system, printable
 from rover_lib.onboard.kinds import Number, Output, PathTo, Preset, check_output
 
@@ -189,7 +189,7 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     if json_file and json_file != Path("-"):
         json_file.write_text(json.dumps(report.summary(), indent=2) + "\n")
     else:
-        show(report.summary(), bool(json_file))
+        show(report.summary() if json_file else in_words(report.summary()), bool(json_file))
     return code
 
 
@@ -524,7 +524,7 @@ def sum_up(file: Path, drive: int, as_json: bool) -> Any:
 
     flight = read_log(file, drive)
     summary = flight.summary()
-    show(summary if as_json else {k: v for k, v in summary.items() if k != "events"}, as_json)
+    show(summary if as_json else in_words({k: v for k, v in summary.items() if k != "events"}), as_json)
     for event in () if as_json else flight.events:
         click.echo(f"{event.t_s:9.2f} s  {event.text}")
     return flight

@@ -11,11 +11,11 @@ from typing import Any
 from jinja2 import ChainableUndefined, Environment, FileSystemLoader
 
 from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
+from rover_lib.onboard.columns import UNITS
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
-UNITS = {"mb": "MB", "ms": "ms", "pct": "%", "g": "10^9", "fps": "1/s", "hz": "Hz", "c": "Celsius"}
 NEXT_COMMANDS, MOST_CAUTIONS = 3, 5
 MOST_EPISODES = 3  # a remedy names at most this many
 
