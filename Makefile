@@ -137,7 +137,7 @@ notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.page_tables
 
 # The pages, and all that they link to. A link to anything else fails the build.
-PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md ansible/roles/rover/meta/argument_specs.yml firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
+PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md ansible/roles/rover/meta/argument_specs.yml ansible/roles/rover/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
 
 docs: $(READY)
 	rm -rf runs/pages runs/site

@@ -9,6 +9,7 @@ A folder may be of several kinds, such as a run and a LeRobot checkpoint. A path
 import math
 import os
 import re
+import shlex
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -40,7 +41,7 @@ WANTED = {  # what a command takes: the kinds, and how to get one
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
-ON_HUB = {"checkpoint": "", "recordings": "--repo-type dataset "}  # what LeRobot's Hub has, with hf's option for it
+ON_HUB = {"checkpoint": (), "recordings": ("--repo-type", "dataset")}  # what LeRobot's Hub has, with hf's option for it
 POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 POLICY_FILES = ("config.json", "adapter_config.json", "pretrained_model", "checkpoints", "last", "model.safetensors")
@@ -76,7 +77,8 @@ def _download(name: str, wanted: str) -> str:
     if wanted not in ON_HUB or not re.fullmatch(r"[\w.-]+/[\w.-]+", name) or Path(name).parent.exists():
         return ""
     folder = name.partition("/")[2]
-    return f"of the Hub? `hf download {ON_HUB[wanted]}{name} --local-dir {folder}`, then give {folder}"
+    command = shlex.join(["hf", "download", *ON_HUB[wanted], name, "--local-dir", folder])
+    return f"of the Hub? `{command}`, then give {folder}"
 
 
 def refuse_pointer(path: Path, error: type[RoverError]) -> None:

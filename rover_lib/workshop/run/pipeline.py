@@ -147,8 +147,22 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
 def export_graph(checkpoint: Checkpoint, path: Path | str) -> Path:
     """Write FP32 as a plain ONNX graph, for which neither a run nor recordings are needed; return its path.
 
-    docs/api.md has the graph's contract; it is no artifact. Raises ArtifactError, and writes nothing, if ONNX Runtime
-    computes something else than the policy for random observations: a graph is the same for any.
+    `rover export best_model.pth --onnx` does it. `rover export runs/mine --onnx` writes artifacts, FP32 and INT8, whose
+    zip holds the same graph as `archive/model.onnx`. Opset 17, static shapes, one file:
+
+    | name | type and shape | content |
+    |---|---|---|
+    | in: `state` | float32 (1, S) | as recorded, such as steering and throttle of the frame before |
+    | in: `frame_<camera>`, one each | uint8 (height, width, 3) | **RGB**, resized to the policy's size by the caller |
+    | out: `chunk` | float32 (1, steps, A) | actions as recorded, not clipped |
+    | out: `embedding`, of artifacts that know their way | float32 (1, D) | what tells how familiar a picture is |
+
+    Inside are the picture's scaling to [0, 1] and its normalisation, those of state and actions, and the VAE's latent
+    of zeros. Metadata: `states`, `actions` (their order), `rate_hz`, `checkpoint` (SHA-256), and `guessed`, which of
+    these nothing says.
+
+    Raises ArtifactError, and writes nothing, if ONNX Runtime computes something else than the policy does for random
+    observations.
     """
     config, rng = checkpoint.config, np.random.default_rng(0)
     policy = ACT(config, checkpoint.weights)

@@ -35,7 +35,7 @@ def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
 
 
 DRIVES = re.compile(
-    r"ansible-playbook|rover (?:drive|view|release|playbook)|lerobot_robot_rover |one to deploy"
+    r"ansible-playbook|rover (?:drive|view|release|playbook d)|lerobot_robot_rover |one to deploy"
     r"|[Vv]erdict: deploy|put it on the rover|first metres"
 )
 
