@@ -3,8 +3,8 @@
     python -m lab.repository.page_tables        # what `make notebooks` does at its end
 
 A table stands once in README.md, a page of docs/ or the role's README.md, between `<!-- table NAME, by page_tables -->`
-and `<!-- end -->`. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left
-out.
+and `<!-- end -->`. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is
+left out.
 """
 
 import json

@@ -57,12 +57,12 @@ def notebooks(run_dir: Path, name: str | None) -> None:
     from rover_lib.workshop.run import run_folder
     from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT
 
-    run_dir = run_dir.resolve()
+    run_dir = run_dir.absolute()  # beside a link, not beside what it leads to
     copy = run_folder(run_dir.parent, name or f"{run_dir.name}-copy", RoverError)
     first = "01_load.ipynb"
     if not (run_dir / first).is_file():
         raise RoverError(f"{run_dir}: no notebooks in it", remedy="rover run makes a run with notebooks")
-    if copy == run_dir or (copy.exists() and not (copy / first).is_file()):
+    if copy == run_dir.resolve() or (copy.exists() and not (copy / first).is_file()):
         raise RoverError(f"{copy}: is the run itself, or no copy of one", remedy="name the copy otherwise: --as try1")
     if not copy.exists():
         copy_run(run_dir, copy)

@@ -177,6 +177,8 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
         except papermill.PapermillExecutionError as e:
+            if e.ename == "KeyboardInterrupt":  # Ctrl-C reaches the kernel too
+                raise KeyboardInterrupt from e
             raise RoverError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
             raise RoverError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e
