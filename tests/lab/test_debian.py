@@ -12,7 +12,7 @@ def test_root_installs_nothing_unasked(monkeypatch):
     monkeypatch.setattr(debian.os, "geteuid", lambda: 0)
     monkeypatch.setattr(debian.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.delenv(debian.INSTALL, raising=False)
-    with pytest.raises(RoverError, match="sudo apt-get install .* gcc-avr, or as root python -m lab --install"):
+    with pytest.raises(RoverError, match=r"sudo apt-get install .* gcc-avr, or as root python -m lab --install"):
         debian.install_packages(["gcc-avr"], "the emulated Arduino")
     assert started == []
     monkeypatch.setenv(debian.INSTALL, "1")
