@@ -54,6 +54,7 @@ KERNEL_ENVIRONMENT = {
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
+START_S = 600  # papermill's 60 did not suffice on a machine with seven busy programs for each core
 LINE = re.compile(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", re.M)  # of a parameters cell
 
 
@@ -171,7 +172,8 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
-    how = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "kernel_manager_class": ThisPython}
+    how: dict[str, Any] = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "start_timeout": START_S}
+    how |= {"kernel_manager_class": ThisPython}
     with patch.dict(os.environ, KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
