@@ -377,7 +377,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
 def release(ctx: click.Context, models: Path, sandboxed: bool, **expected: Any) -> None:
-    """Manage the rover's models, as `ansible-playbook ansible/deploy.yml` does it over a network."""
+    """Manage the rover's models, as `rover playbook deploy` does it over a network."""
     from rover_lib.onboard.artifact.acceptance import Expected
     from rover_lib.onboard.care.release import Releases, check_in_sandbox
 

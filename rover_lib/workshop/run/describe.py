@@ -16,7 +16,7 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.recordings.turning import measure_sides
 
-FIRST = "make demo, or rover run, makes the first"
+FIRST = "rover run makes the first; in a clone, make demo too"
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
