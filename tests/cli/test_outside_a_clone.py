@@ -80,6 +80,8 @@ def test_a_wheel_makes_a_run_in_an_empty_folder(tmp_path, tiny_file):
     needs = [*extras["dependencies"], *extras["optional-dependencies"]["workshop"]]
     names = with_needs(list({re.match(r"[\w.-]+", need)[0] for need in needs}))
     installed = Installed(tmp_path, wheel(tmp_path), names)
+    (installed.bin.parent / "share").symlink_to(Path(sys.prefix, "share"))  # JupyterLab's pages
+    (installed.bin / "ansible-playbook").symlink_to(Path(sys.executable).with_name("ansible-playbook"))
     (folder := tmp_path / "an empty folder").mkdir()
     shutil.copy(tiny_file, folder / "my policy.pth")
     record_drives(folder / "my drives", drives=4, frames=40)
