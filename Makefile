@@ -47,8 +47,8 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and f"Python 3.11 to 3.13 is needed, found {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv --without-pip $(VENV)
 	$(VENV)/bin/python -m pip --version > /dev/null 2>&1 || $(VENV)/bin/python -m ensurepip --upgrade --default-pip > /dev/null || $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip
-	$(VENV)/bin/python -m pip install --quiet 'uv>=0.5'
-	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python -e '.[workshop,look,dev,docs]' -e ./lerobot_robot_rover
+	$(VENV)/bin/python -m pip install --quiet 'uv>=0.8'
+	$(VENV)/bin/uv pip install --quiet --python $(VENV)/bin/python --group dev --group docs -e '.[workshop,look]' -e ./lerobot_robot_rover
 	@touch $@
 
 # Without torch, in an environment of its own.
@@ -117,7 +117,7 @@ check-release: lint $(DEMO)
 	for car in crawler inverted; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done
 	$(LAB) random runs/random.json
 	$(MAKE) mutants
-	$(LAB) pi runs/pi.json
+	$(LAB) --install pi runs/pi.json
 
 # NAME=full needs no checkpoint: it makes one. After 24 steps a policy does not drive, so that its run fails its gates.
 count: $(READY)
@@ -130,17 +130,9 @@ count: $(READY)
 mutants: $(READY)
 	$(LAB) mutants runs/mutants.json --drives
 
-# This opens a copy, so that cells that are run again there change no run; a copy that is there stays. Checkpoint and
-# recordings stay where they are. Without NAME it opens the repository's notebooks. The environment is that of the
-# kernels of `rover run` (KERNEL_ENVIRONMENT). A container may have no user but root.
-COPY = $(if $(filter default,$(origin AS)),$(NAME)-copy,$(AS))
-OPENED = $(if $(filter file,$(origin NAME)),notebooks,runs/$(COPY))
-MADE = $(wildcard $(addprefix runs/$(NAME)/,*.ipynb *.json *.html policy_* calibration*.pt figures))
+# Without NAME it opens the repository's notebooks.
 notebooks-open: $(READY)
-	@test '$(OPENED)' = notebooks -o -f 'runs/$(NAME)/01_load.ipynb' || { echo 'there is no run runs/$(NAME): rover inspect shows the runs that there are' >&2; exit 1; }
-	@test '$(COPY)' != '$(NAME)' -a \( -f '$(OPENED)/01_load.ipynb' -o ! -e '$(OPENED)' \) || { echo '$(OPENED): is the run itself, or no copy of one: give the copy another name, AS=try1' >&2; exit 1; }
-	@test -e '$(OPENED)' || { rm -rf '$(OPENED).part' && mkdir '$(OPENED).part' && cp -r $(MADE) '$(OPENED).part' && mv '$(OPENED).part' '$(OPENED)'; }
-	env OMP_WAIT_POLICY=PASSIVE PYTHONWARNINGS='ignore:Currently,ignore:IProgress not found' TORCH_CPP_LOG_LEVEL=ERROR $(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) --LabApp.default_url=/lab/tree/01_load.ipynb '$(OPENED)'
+	$(if $(filter file,$(origin NAME)),$(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(AS),--as '$(AS)'))
 
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish
@@ -148,7 +140,7 @@ notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.page_tables
 
 # The pages, and all that they link to. A link to anything else fails the build.
-PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md ansible/roles/rover/meta/argument_specs.yml firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
+PAGES = *.md params.yml lab/params.yml docs/* ansible/README.md ansible/roles/rover/meta/argument_specs.yml ansible/roles/rover/README.md firmware/README.md lab/README.md notebooks/*.ipynb pictures/* results/*/*.json
 
 docs: $(READY)
 	rm -rf runs/pages runs/site

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from rover_exchange.cli import open_browser
+from rover_lib.cli.prepare import Resumable
 from rover_lib.onboard.cli import FILE, open_view, view_options
 from rover_lib.onboard.kinds import PathTo
 from rover_lib.workshop.progress import terminal_bar
@@ -61,7 +62,7 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar())}")
 
 
-@world.command(short_help="Judge distilled policies beside their teacher.")
+@world.command(short_help="Judge distilled policies beside their teacher.", cls=Resumable)
 @click.argument("teacher_run", type=PathTo("run"))
 @click.argument("student_runs", type=PathTo("run"), nargs=-1, required=True)
 @click.option(
@@ -84,7 +85,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int) -> 
     click.echo(table(executed("08_distill", teacher_run, "students", **given)["metrics"]))
 
 
-@world.command(short_help="Drive, correct, learn: does it drive better?")
+@world.command(short_help="Drive, correct, learn: does it drive better?", cls=Resumable)
 @click.argument("run_dir", type=PathTo("run"))
 @click.option("--rounds", type=click.IntRange(min=1), default=3, show_default=True)
 @click.option("--drives", type=click.IntRange(min=1), default=20, show_default=True, help="Drives in each round.")

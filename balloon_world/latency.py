@@ -40,7 +40,7 @@ def measure_latencies(
     """
     p, artifact = params(), Path(run_dir) / f"policy_{GATED}.pt"
     if not artifact.is_file():
-        raise TrainingError(f"{artifact}: not there", remedy="run notebooks 01 to 03, or `make demo`, first")
+        raise TrainingError(f"{artifact}: not there", remedy="rover run makes it")
     if not latencies_ms or worlds < 1:
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}

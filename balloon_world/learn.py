@@ -141,7 +141,7 @@ def run_experiment(
     run_dir, out_dir = Path(run_dir).resolve(), Path(out_dir).resolve()
     for name in (CHECKPOINT, EPISODES, ARTIFACT):
         if not (run_dir / name).exists():
-            raise TrainingError(f"{run_dir / name}: not there", remedy="`make demo` makes it")
+            raise TrainingError(f"{run_dir / name}: not there", remedy="rover run makes it")
     inputs = {CHECKPOINT: sha256_of(run_dir / CHECKPOINT), ARTIFACT: content_hash(run_dir / ARTIFACT)}
     how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
     given = plain(asdict(experiment) | how)

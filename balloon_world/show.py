@@ -43,7 +43,7 @@ Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and
 class Simulation:
     """Drives an artifact through balloon worlds, for a view; what was chosen on its page arrives by `ask`.
 
-    Whoever watches can push the car off its way. A drive with pushes counts for the pushes, not for the policy.
+    Whoever watches can push the car off its way. A drive with pushes is counted apart from the undisturbed ones.
 
     artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. title: the
     page's; "": the name of the artifact's folder. Raises what load_policy() raises.
@@ -62,8 +62,8 @@ class Simulation:
         self._wanted = next(name for name, path in self._paths.items() if path == artifact)
         self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
         self.car = self._policies[self._wanted].car
-        self._results = {name: [0, 0] for name in self._paths}  # hits, worlds
-        self._pushed = [0, 0]  # pushes that the policy recovered from, and all
+        self._results = {name: [0, 0] for name in self._paths}  # undisturbed drives: hits, all
+        self._pushed = [0, 0]  # drives in which somebody pushed the car: hits, all
         self._seed = SEED
         cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
@@ -121,9 +121,9 @@ class Simulation:
             outcome = car.drive(settings, car.log).outcome
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                counted, by = (self._pushed, car.pushes) if car.pushes else (self._results[name], 1)
-                counted[0] += by * car.world.hit
-                counted[1] += by
+                counted = self._pushed if car.pushes else self._results[name]
+                counted[0] += car.world.hit
+                counted[1] += 1
                 self._seed += 1
             self._wait(car, outcome, post)
 

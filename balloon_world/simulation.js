@@ -37,13 +37,13 @@ simulated = m => {
   }
   for (const name in w.results) {
     const b = $("drive " + name), [hits, worlds] = w.results[name];
-    b.textContent = name + (worlds ? ": hit " + hits + " of " + worlds : ": drive it");
+    b.textContent = name + (worlds ? ", undisturbed: hit " + hits + " of " + worlds : ": drive it");
     b.className = name === w.drives ? "on" : "";
   }
   put("next", "next world");
-  const [recovered, pushes] = w.pushed;
+  const [pushedHits, pushed] = w.pushed;
   put("hint", "Push the car: arrow keys, or tap a side of the picture."
-    + (pushes ? " Recovered from " + recovered + " of " + pushes + " pushes." : ""));
+    + (pushed ? " Pushed: hit " + pushedHits + " of " + pushed + "." : ""));
   // The map has the car's way from below.
   const g = $("map").getContext("2d"), ways = [...w.path, w.balloon];
   const most = Math.max(1.5, ...ways.map(p => Math.max(Math.abs(p[1]) * 2, p[0]))), scale = 200 / most;

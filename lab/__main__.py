@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from lab.debian import INSTALL
 from rover_lib.onboard.cli import FILE, Rover, drive_options, run_drive, show
 from rover_lib.onboard.policy.confine import AS_ROOT
 from rover_lib.workshop.progress import terminal_bar
@@ -15,8 +16,11 @@ from rover_lib.workshop.progress import terminal_bar
 
 @click.group("lab", cls=Rover, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error, not only its sentence.")
-def main(debug: bool) -> None:
+@click.option("--install", is_flag=True, help="As root, install the Debian packages that a command lacks.")
+def main(debug: bool, install: bool) -> None:
     """Prove what the rover project claims, with an emulated Arduino, faults, counted instructions and emulated Pis."""
+    if install:
+        os.environ[INSTALL] = "1"
     # Some of it needs root, and loads only artifacts that were made here.
     os.environ.setdefault(AS_ROOT, "1")
 
@@ -46,7 +50,7 @@ def arm(run_dir: Path) -> None:
     """Count the instructions that the artifacts of RUN_DIR execute on an emulated Cortex-A76.
 
     Leaves arm.json and the executed notebook 06 in RUN_DIR, and says which gates of lab/params.yml hold. Needs Debian
-    12 with qemu-user, mmdebstrap and gcc, which it installs if you are root.
+    12 with qemu-user, mmdebstrap and gcc, which `python -m lab --install arm` installs.
     """
     from lab.a76.count import count_run
     from lab.a76.report import table

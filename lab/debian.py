@@ -10,6 +10,7 @@ from pathlib import Path
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
+INSTALL = "ROVER_LAB_INSTALL"  # environment variable: 1 if missing packages may be installed, as --install says
 NO_DEBIAN = "use a Debian 12 or 13 with the network, in a container if need be"
 
 
@@ -24,12 +25,16 @@ def missing_packages(needs: Mapping[str, str]) -> list[str]:
 
 
 def install_packages(packages: Sequence[str], what: str) -> None:
-    """Install Debian packages, if there are any. what: the thing that needs them. Raises RoverError."""
+    """Install Debian packages, if there are any and the user asked for that. what: the thing that needs them.
+
+    Raises RoverError.
+    """
     if not packages:
         return
     command = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *packages]
-    if os.geteuid() != 0 or not shutil.which("apt-get"):
-        raise RoverError(f"{what} needs the Debian packages {' '.join(packages)}", remedy=f"sudo {' '.join(command)}")
+    if os.environ.get(INSTALL) != "1" or os.geteuid() != 0 or not shutil.which("apt-get"):
+        remedy = f"sudo {' '.join(command)}, or as root python -m lab --install"
+        raise RoverError(f"{what} needs the Debian packages {' '.join(packages)}", remedy=remedy)
     print(f"installing Debian packages: {' '.join(packages)}", file=sys.stderr)
     run("apt-get", "update", "--quiet", error=RoverError)
     run(*command, error=RoverError, env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"})

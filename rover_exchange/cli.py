@@ -45,12 +45,14 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
 
 def _print_export(report: dict[str, Any], out: Path, as_json: bool) -> None:
     from rover_exchange.export_dataset import CAR, DRIVEN_BY, REPORT, lerobot_train, lerobot_video
+    from rover_lib.workshop.installed import command_line
 
     for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY):
         del report[name]  # too long to print; the file has them
     show({"exported": report | {"report": str(out / REPORT)}}, as_json)
     if not as_json:
-        click.echo(f"next: rover train {out} best_model.pth\nor LeRobot's own: {lerobot_train(out)}")
+        click.echo(f"next: {command_line('rover', 'train', out, 'best_model.pth')}")
+        click.echo(f"or LeRobot's own: {lerobot_train(out)}")
         click.echo(f"on a GPU before that, which then trains on {out}-video: {lerobot_video(out)}")
 
 

@@ -6,6 +6,7 @@ If a policy drove in one of the recordings, `intervention` says where a human ha
 
 import json
 import os
+import shlex
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -198,7 +199,7 @@ def _row(episode: Episode, sample: Sample, frame: np.ndarray) -> dict[str, Any]:
 def lerobot_train(dataset: Path | str) -> str:
     """Return the command of LeRobot's own that trains an ACT on a LeRobotDataset."""
     return (
-        f"lerobot-train --dataset.repo_id=local/drives --dataset.root={dataset} --policy.type=act "
+        f"lerobot-train --dataset.repo_id=local/drives {shlex.quote(f'--dataset.root={dataset}')} --policy.type=act "
         "--policy.push_to_hub=false --policy.chunk_size=32 --policy.n_action_steps=32 --output_dir=trained"
     )
 
@@ -206,6 +207,6 @@ def lerobot_train(dataset: Path | str) -> str:
 def lerobot_video(dataset: Path | str) -> str:
     """Return the command of LeRobot's own that makes videos of a LeRobotDataset's pictures, in <dataset>-video."""
     return (
-        f"lerobot-edit-dataset --repo_id=local/drives --root={dataset} "
-        f"--operation.type=convert_image_to_video --operation.output_dir={dataset}-video"
+        f"lerobot-edit-dataset --repo_id=local/drives {shlex.quote(f'--root={dataset}')} "
+        f"--operation.type=convert_image_to_video {shlex.quote(f'--operation.output_dir={dataset}-video')}"
     )

@@ -8,13 +8,29 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.cli.prepare import CHECKPOINT, EPISODES, FACTS, THROTTLE, size_option, with_source
+from rover_lib.cli.prepare import CHECKPOINT, EPISODES, FACTS, THROTTLE, Resumable, size_option, with_source
 from rover_lib.onboard.cli import FILE
-from rover_lib.onboard.kinds import Number, Output
+from rover_lib.onboard.kinds import Number, Output, Preset
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
     from rover_lib.workshop.recordings.samples import Source
+
+
+def _by_recipe(value_of: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    """What makes an option show a recipe's value; of `rover train`, that of each size."""
+
+    def preset(p: dict[str, Any], command: str) -> object:
+        recipe = p[command]
+        if "small" in recipe:
+            return ", ".join(f"{value_of(recipe[size])} ({size})" for size in ("small", "full"))
+        return value_of(recipe)
+
+    return {"cls": Preset, "preset": preset}
+
+
+STEPS = _by_recipe(lambda recipe: sum(count for name, count in recipe.items() if name.endswith("_steps")))
+BATCH = _by_recipe(lambda recipe: recipe["batch"])
 
 
 def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
@@ -30,8 +46,8 @@ def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--amp/--no-amp", default=False, show_default=True, help="Mixed precision, in bfloat16."),
         click.option("--workers", type=click.IntRange(min=0), help="Threads that read ahead [default: all for a GPU]."),
         click.option("--device", metavar="cpu|cuda|cuda:N", help="[default: cuda where there is one]"),
-        click.option("--batch", type=click.IntRange(min=1), help="Samples in each step [default: params.yml]."),
-        click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml]."),
+        click.option("--batch", type=click.IntRange(min=1), help="Samples in a step [default: params.yml].", **BATCH),
+        click.option("--steps", type=click.IntRange(min=1), help="Steps of all phases [default: params.yml].", **STEPS),
     ):
         called = option(called)
     return called
@@ -42,7 +58,7 @@ def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
     for option in (
         of_a_training,
         click.option("--runs-dir", type=FILE, default="runs", show_default=True),
-        click.option("--name", required=True, help="The run's folder: <runs-dir>/<name>/."),
+        click.option("--name", required=True, help="Of the run's folder in <runs-dir>: letters, digits, _ - ."),
     ):
         command = option(command)
     return command
@@ -54,7 +70,7 @@ def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
     click.echo(f"{summary(read_stage(folder / f'{stage}.json', stage))}\ndone: {folder}")
 
 
-@click.command(short_help="Teach a smaller policy.")
+@click.command(short_help="Teach a smaller policy.", cls=Resumable)
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES)
 @click.option(
@@ -84,7 +100,7 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
     show_stage(folder, "distill", summary)
 
 
-@click.command(short_help="Train a policy further, from takeovers.")
+@click.command(short_help="Train a policy further, from takeovers.", cls=Resumable)
 @click.argument("checkpoint", type=CHECKPOINT)
 @click.argument("episodes", type=EPISODES, nargs=-1, required=True)
 @FACTS
@@ -107,7 +123,7 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, throttle:
     show_stage(folder, "finetune", summary)
 
 
-@click.command(short_help="Train a policy, LeRobot's ACT, on recordings.")
+@click.command(short_help="Train a policy, LeRobot's ACT, on recordings.", cls=Resumable)
 @click.argument("episodes", type=EPISODES)
 @click.argument("output", type=Output("checkpoint"))
 @click.option(
@@ -141,10 +157,12 @@ def train(episodes: "Source", output: Path, backbone: str, **options: Any) -> No
     from rover_learn.judges import not_learned
     from rover_learn.train import curves_of
     from rover_learn.train import train as train_policy
+    from rover_lib.workshop.installed import command_line
 
     options |= {"backbone": None if backbone == "none" else backbone}
     click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
     actions = read_actions(curves_of(output))
     if lacking := not_learned(actions):
         return click.echo("\n".join(lacking))
-    click.echo(f"next: rover run {shlex.quote(str(output))} {episodes.typed()} --name mine")
+    command = command_line("rover", "run", output, *shlex.split(episodes.typed()), "--name", "mine")
+    click.echo(f"next: {command}")

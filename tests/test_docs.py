@@ -32,6 +32,8 @@ def test_every_page_is_one_click_from_readme():
 
 SOURCES = [*ROOT.glob("rover_*/**/*.py"), *ROOT.glob("balloon_world/**/*.py"), *ROOT.glob("lerobot_robot_rover/*.py")]
 PLAYS = [*ROOT.glob("ansible/**/*.yml"), *ROOT.glob("ansible/**/*.j2")]
+FORMS = [*ROOT.glob(".github/*"), *ROOT.glob(".github/*/*.yml")]
+FORMS = [path for path in FORMS if path.is_file()]
 PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python3? -m [\w.]+"
 
 
@@ -122,10 +124,12 @@ def test_every_command_that_we_print_is_one():
     seen: Counter[str] = Counter()
     refused = []
     pages = [page for page in PAGES if page.name != "CHANGELOG.md"]
-    for path in [*pages, *SOURCES, *PLAYS, *ROOT.glob("notebooks/*.ipynb")]:
+    for path in [*pages, *SOURCES, *PLAYS, *FORMS, *ROOT.glob("notebooks/*.ipynb")]:
         for program, words, whole in commands(path):
             wrong, name = "", program.partition("-m ")[2] or program
-            if name in groups:
+            if name == "rover" and words[:1] == ["playbook"]:
+                wrong = refusal_of_playbook([f"ansible/{words[1]}.yml", *words[2:]] if words[1:] else [])
+            elif name in groups:
                 wrong = refusal_of(groups[name], words, whole)
             elif program == "make" and whole:
                 wrong = refusal_of_make(words)
@@ -137,7 +141,46 @@ def test_every_command_that_we_print_is_one():
             if wrong:
                 refused.append(f"{path.relative_to(ROOT)}: {program} {' '.join(words)}: {wrong}")
     assert not refused, "\n".join(refused)
-    assert all(seen[name] > 8 for name in ("rover", "make", "ansible", "python")), seen
+    assert all(seen[name] > 8 for name in ("rover", "make", "python")), seen
+
+
+QUOTED = re.compile(r"quote\(|command_line\(|typed\(|lerobot_(train|video)\(")
+
+
+def test_a_name_in_a_printed_command_is_quoted():
+    """A folder with a space in its name would be two words, wherever a program puts names into a command."""
+    from rover_lib.cli import main
+
+    begins = rf"(?:rover (?:{'|'.join(main.commands)})|make -C|make [a-z]+|lerobot-[a-z-]+|hf download) "
+    bare = []
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.JoinedStr):
+                continue
+            text = ""
+            for part in node.values:
+                text += part.value if isinstance(part, ast.Constant) else "{" + ast.unparse(part.value) + "}"
+            for command in re.findall(rf"(?:^|[`(:' ])({begins}[^`\n;]*)", text):
+                names = re.findall(r"\{(.*?)\}(?= |$|/)", command)
+                bare += [f"{path.name}: {command}" for name in names if not QUOTED.search(name)]
+    assert bare == []
+
+
+@pytest.mark.slow
+def test_what_the_forms_ask_for_can_be_typed():
+    """Each command of this program that .github asks people to type; `doctor` fails where there is no car."""
+    texts_ = "".join(path.read_text() for path in FORMS)
+    asked = {line for line in re.findall(r"`(rover [^`]*)`", texts_) if "--debug" not in line}
+    assert asked == {"rover --version", "rover doctor"}
+    for line in asked:
+        done = subprocess.run(
+            [Path(sys.executable).with_name("rover"), *line.split()[1:]], capture_output=True, text=True
+        )
+        assert done.returncode in (0, 1) and done.stdout, line
+    for job in (yaml.safe_load(path.read_text()) for path in FORMS if path.parent.name == "workflows"):
+        steps = [step["run"] for each in job["jobs"].values() for step in each["steps"] if "run" in step]
+        files = re.findall(r"tests/[\w/]+\.py|rover_lib/[\w/]+\.py|\.ci/run", " ".join(steps))
+        assert all((ROOT / file).is_file() for file in files)
 
 
 def test_the_pages_are_short():

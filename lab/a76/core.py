@@ -73,9 +73,9 @@ class Core:
 
 
 def prepare() -> Core:
-    """Return what counting needs, from the cache or made now, in half a minute. Raises RoverError if it cannot be had.
+    """Return what counting needs, from the cache or made now, in half a minute.
 
-    Missing Debian packages are installed if this runs as root.
+    Raises RoverError if it cannot be had, as for missing Debian packages, unless INSTALL is set (lab.debian).
     """
     install_packages(missing_packages(NEEDS), "counting")
     recipe = {"made": [GUEST_PACKAGES, PYTHON, PLATFORM, CPUINFO, CORES, RECIPE]}

@@ -54,8 +54,7 @@ class Built(NamedTuple):
 def build(human: str = "receiver") -> Built:
     """Return the firmware and the emulated Arduino, from the cache or built now, which takes some seconds.
 
-    human: as in `make -C firmware HUMAN=gamepad`. Missing Debian packages are installed if this runs as root; else
-    raises RoverError.
+    human: as in `make -C firmware HUMAN=gamepad`. Raises RoverError for missing Debian packages, unless INSTALL is set.
     """
     install_packages(missing_packages(NEEDS), "the emulated Arduino")
     sources = [EMULATOR, FIRMWARE / "Makefile", *sorted(p for p in (FIRMWARE / "rover").glob("*") if p.is_file())]

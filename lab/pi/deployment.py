@@ -252,5 +252,6 @@ def _environment(folder: Path) -> dict[str, str]:
     """Return Ansible's environment: without the user's own settings for it, and with its files in the folder."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith("ANSIBLE")}
     own = {"ANSIBLE_HOME": str(folder), "ANSIBLE_NOCOLOR": "1", "ANSIBLE_LOCAL_TEMP": str(folder / "local")}
+    own["PWD"] = str(REPOSITORY)  # below which the playbooks put wheels and logs
     own["ANSIBLE_TIMEOUT"] = "120"  # sudo, emulated on a busy machine, took more than the usual 10 s
     return {**kept, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}

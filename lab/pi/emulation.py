@@ -31,7 +31,7 @@ RIGHTS = "is this a container without rights?"
 
 
 def require() -> None:
-    """Make sure that this is root, and install what is missing for a Pi and its Arduino. Raises RoverError."""
+    """Make sure that this is root and nothing is missing for a Pi and its Arduino. Raises RoverError."""
     if os.geteuid() != 0:
         raise RoverError("an emulated Pi mounts file systems and starts a container", remedy="use sudo")
     install_packages(missing_packages(NEEDS | arduino.NEEDS), "an emulated Pi")

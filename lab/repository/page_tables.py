@@ -2,16 +2,19 @@
 
     python -m lab.repository.page_tables        # what `make notebooks` does at its end
 
-A table stands in README.md or in a page of docs/ between `<!-- table NAME, by page_tables -->` and `<!-- end -->`, each
-once. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is left out.
+A table stands once in README.md, a page of docs/ or the role's README.md, between `<!-- table NAME, by page_tables -->`
+and `<!-- end -->`. Nobody edits them by hand. A field without its JSON is empty, and a row without any measurement is
+left out.
 """
 
+import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import nbformat
+import yaml
 
 from balloon_world.learn import HOW
 from rover_lib.onboard.errors import RoverError
@@ -26,6 +29,7 @@ EXPLAINED = {  # the modes, in words that need no other page
     "mixed": "*mixed*: static, the most sensitive parts in FP32",
 }
 BEST = "static"
+ROLE = Path("ansible", "roles", "rover")
 PLACE = re.compile(r"(<!-- table (\w+), by page_tables -->\n)(.*?)(<!-- end -->)", re.S)
 
 Row = tuple[str, ...]
@@ -36,7 +40,8 @@ def changed_pages(root: Path = ROOT) -> dict[Path, str]:
 
     Raises RoverError unless the pages have each table once.
     """
-    texts = {path: path.read_text() for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))}
+    pages = (root / "README.md", root / ROLE / "README.md", *sorted((root / "docs").glob("*.md")))
+    texts = {path: path.read_text() for path in pages}
     names = [match[2] for text in texts.values() for match in PLACE.finditer(text)]
     if sorted(names) != sorted(TABLES):
         raise RoverError("the pages must have each table once", found=names or "none", remedy=f"mark {sorted(TABLES)}")
@@ -147,6 +152,17 @@ def _parameters(root: Path) -> list[Row]:
     return [("notebook", "question", "parameters to turn"), *rows]
 
 
+def _variables(root: Path) -> list[Row]:
+    """The role's variables, each once, as its argument specs describe them."""
+    specs = yaml.safe_load((root / ROLE / "meta" / "argument_specs.yml").read_text())["argument_specs"]
+    options = {name: option for spec in specs.values() for name, option in spec["options"].items()}
+    rows: list[Row] = []
+    for name, option in sorted(options.items()):
+        default = "needed" if option.get("required") else f"`{json.dumps(option['default'], ensure_ascii=False)}`"
+        rows.append((f"`{name}`", option["description"], default.replace("|", "\\|")))
+    return [("variable", "what it means", "default"), *rows]
+
+
 TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
@@ -155,6 +171,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "learning": _learning,
     "judging": _judging,
     "parameters": _parameters,
+    "variables": _variables,
 }
 
 

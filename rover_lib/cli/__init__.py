@@ -3,17 +3,22 @@
 Other packages of the same install add commands by the entry points `rover.<section>` of pyproject.toml.
 """
 
+import os
 from functools import partial
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, cast
 
 import click
 from click.core import ParameterSource
 
-from rover_lib.cli import prepare
+from rover_lib.cli import prepare, programs
 from rover_lib.onboard import cli as onboard
+from rover_lib.onboard.car.car import FILE_VARIABLE
 from rover_lib.onboard.cli import FROM_0, VERSION, Rover
 from rover_lib.onboard.kinds import Number
+from rover_lib.onboard.params import FOR_THIS_RUN
+from rover_lib.workshop.installed import IN_WHEEL
 
 
 @click.command(help=onboard.drive.help, short_help="Drive a car, or in the balloon world, with an artifact.")
@@ -37,12 +42,19 @@ def drive(ctx: click.Context, in_world: bool, latency_ms: float, seed: int, **op
 ROVERS = onboard.main.commands
 # What most people need, by what they do; below it all others. inspect, drive, view and log can do more here than there.
 SECTIONS: dict[str, list[click.Command]] = {
-    "Prepare a policy": [prepare.run, prepare.inspect, prepare.report, ROVERS["benchmark"], prepare.export],
+    "Prepare a policy": [
+        prepare.run,
+        prepare.inspect,
+        prepare.report,
+        programs.notebooks,
+        ROVERS["benchmark"],
+        prepare.export,
+    ],
     "Drive": [ROVERS["doctor"], ROVERS["calibrate"], ROVERS["record"], drive],
     "Look": [],
     "Teach": [],
     "Recordings": [],
-    "A rover's models, and arming it": [ROVERS["release"], ROVERS["arm-car"]],
+    "A rover's models, and arming it": [programs.playbook, ROVERS["release"], ROVERS["arm-car"]],
 }
 for title in ("Teach", "Look", "Recordings"):
     SECTIONS[title] += [entry.load() for entry in entry_points(group=f"rover.{title.lower()}")]
@@ -65,8 +77,12 @@ def main(debug: bool) -> None:
     """Put a learned driving policy on a small computer.
 
     A checkpoint (LeRobot ACT) and recordings go in; an INT8 artifact that a Raspberry Pi can run, an honest comparison
-    with the original and a benchmark come out. Start with `make demo`, or with `rover run` on your own files.
+    with the original and a benchmark come out. Start with `rover demo`, or with `rover run` on your own files.
     """
+    if IN_WHEEL:  # in a checkout these files stand at its top
+        for variable, name in ((FOR_THIS_RUN, "params.yml"), (FILE_VARIABLE, "car.yml")):
+            if Path(name).is_file():
+                os.environ.setdefault(variable, str(Path(name).resolve()))
 
 
 cast(click.Group, ROVERS["release"]).add_command(prepare.wheelhouse)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, show
+from rover_lib.onboard.cli import AS_JSON, FILE, FROM_0, FROM_1, notify, show
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.kinds import PathTo
+from rover_lib.onboard.kinds import Output, PathTo, Preset, check_kind, kinds_of
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
@@ -24,6 +24,22 @@ def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tup
     if (sizes := re.fullmatch(r"(\d+)x(\d+)", value)) is None:
         raise click.BadParameter("width and height in pixels are wanted, as in 320x180")
     return int(sizes[2]), int(sizes[1])
+
+
+SAMPLES: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["calibration"]["samples"]}
+ITERATIONS: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["benchmark"]["iterations"]}
+
+
+class Resumable(click.Command):
+    """A long command that, run again after Ctrl-C, goes on where it was."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run it."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            notify("\nrover: stopped; run the same command again to resume")
+            ctx.exit(130)
 
 
 Turned = tuple[tuple[str, str], ...]
@@ -53,18 +69,20 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     return called
 
 
-@click.command(short_help="Turn a checkpoint into artifacts and a verdict.")
+@click.command(short_help="Turn a checkpoint into artifacts and a verdict.", cls=Resumable)
 @click.argument("checkpoint", type=CHECKPOINT, required=False)
 @click.argument("episodes", type=EPISODES, required=False)
 @ACTION_NAMES
 @CAMERA
 @FACTS
 @THROTTLE
-@click.option("--name", default="mine", show_default=True, help="The run's folder: <runs-dir>/<name>/.")
+@click.option(
+    "--name", default="mine", show_default=True, help="Of the run's folder in <runs-dir>: letters, digits, _ - ."
+)
 @click.option("--runs-dir", type=FILE, default="runs", show_default=True)
-@click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].")
+@click.option("--samples", type=FROM_1, help="Calibration samples [default: params.yml].", **SAMPLES)
 @click.option("--worlds", type=FROM_0, help="Balloon worlds to drive in [default: 0].")
-@click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].")
+@click.option("--iterations", type=FROM_1, help="Timed inferences per mode [default: params.yml].", **ITERATIONS)
 @click.option("-p", "turned", type=(str, str), multiple=True, metavar="PARAMETER VALUE", help="May be repeated.")
 @click.option("--only", metavar="NOTEBOOK", help="Execute one notebook, such as 04, on the run again.")
 def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: str | None, **options: Any) -> None:
@@ -127,28 +145,40 @@ def inspect(episodes: "Source", as_json: bool) -> None:
     show(describe(episodes, terminal_bar()), as_json)
 
 
-@click.command(short_help="Write a run's policies for ONNX Runtime, or its model card.")
-@click.argument("run_dir", type=PathTo("run"))
-@click.option("--onnx", is_flag=True, help="policy_fp32.onnx.zip and policy_static.onnx.zip, beside the others.")
+@click.command(short_help="Write policies for ONNX Runtime, or a run's model card.")
+@click.argument("source", metavar="RUN_DIR|CHECKPOINT", type=FILE)
+@click.option("--onnx", is_flag=True, help="Of a run policy_fp32.onnx.zip and policy_static.onnx.zip.")
+@click.option("-o", "--output", type=Output(), help="Of a checkpoint: the graph [default: its name, here, with .onnx].")
+@FACTS
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--license", help="For the card, such as apache-2.0 [default: the checkpoint's, if it names one].")
 @click.option("--base-model", metavar="USER/NAME", help="For the card: the FP32 policy on the Hub [default: likewise].")
-def export(run_dir: Path, onnx: bool, card: bool, **about: str | None) -> None:
-    """Write the policies of the run in RUN_DIR for another engine, or for others to use.
+def export(source: Path, onnx: bool, output: Path | None, facts: str, card: bool, **about: str | None) -> None:
+    """Write the policies of a run for another engine, or for others to use; or one checkpoint as a graph in FP32.
 
-    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. --card: see docs/lerobot.md.
+    --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. Of a CHECKPOINT, which needs neither
+    recordings nor a run, the plain graph: docs/api.md has its contract. --card: see docs/lerobot.md.
     """
     if not (onnx or card):
         raise click.UsageError("for what? --onnx or --card")
+    if not card and not (source / "quantize.json").is_file() and {"checkpoint", "pretrained"} & {*kinds_of(source)}:
+        from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+        from rover_lib.workshop.run.pipeline import export_graph
+
+        written = export_graph(load_checkpoint(source, said=facts), output or Path(f"{source.resolve().stem}.onnx"))
+        return click.echo(f"{written}: {written.stat().st_size / 1e6:.1f} MB, FP32")
+    check_kind(source, "run")
+    if output or facts:
+        raise click.UsageError("--output and --facts belong to a checkpoint, not to a run")
     if card:
         from rover_lib.workshop.run.run_report import write_card
 
-        click.echo(f"written: {write_card(run_dir, **about)}")
+        click.echo(f"written: {write_card(source, **about)}")
     if onnx:
         from rover_lib.workshop.run.pipeline import export_onnx
 
-        for name, digest in export_onnx(run_dir, terminal_bar()).items():
-            path = run_dir / name
+        for name, digest in export_onnx(source, terminal_bar()).items():
+            path = source / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
 
 

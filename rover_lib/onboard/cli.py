@@ -16,9 +16,9 @@ from typing import Any
 
 import click
 
-from rover_lib.onboard.columns import align, benchmark_rows
+from rover_lib.onboard.columns import align, benchmark_rows, in_words
 from rover_lib.onboard.errors import RoverError, of_system, printable
-from rover_lib.onboard.kinds import Number, Output, PathTo, check_output
+from rover_lib.onboard.kinds import Number, Output, PathTo, Preset, check_output
 
 FILE = click.Path(path_type=Path)
 ARTIFACT = PathTo("artifact")
@@ -32,6 +32,7 @@ AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 PORT = click.option("--port", default="", help="The Arduino's serial port [default: the only one that is there].")
 LOG_DRIVE = click.option("--drive", type=int, default=-1, show_default=True, help="Of FILE: 0 the first, -1 the last.")
 POSITIVE = Number(min=0, min_open=True)
+LIMITED: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["drive"]["throttle_limit"]}
 FROM_0, FROM_1 = click.IntRange(min=0), click.IntRange(min=1)
 
 
@@ -53,11 +54,17 @@ class Rover(click.Group):
 
 def _sentence_of(error: Exception) -> object:
     if isinstance(error, ModuleNotFoundError):
-        remedy = "provision with -e rover_view=true" if error.name == "aiohttp" else "make demo sets a workstation up"
-        return f"this command needs {error.name}; {remedy}"
+        return f"this command needs {error.name}; {_how_to_get(error.name)}"
     if isinstance(error, OSError):
         return of_system(error)
     return printable(str(error)) if isinstance(error, RoverError) else "out of memory: end other programs, or use less"
+
+
+def _how_to_get(module: str | None) -> str:
+    extra = "view" if module == "aiohttp" else "workshop"
+    if find_spec("rover_lib.workshop") is None:  # a rover's own wheel
+        return "provision with -e rover_view=true" if extra == "view" else "it works on a workstation"
+    return f"pip install 'rover-policy[{extra}]', or in a checkout: make demo"
 
 
 def show(value: Any, as_json: bool) -> None:
@@ -131,7 +138,7 @@ drive_options = with_options(  # on the rover and in the balloon world
     click.option("--record-mb", type=Number(min=1), help="At most this many megabytes in that folder."),
     click.option("--max-seconds", type=POSITIVE, help="Longest duration of the drive."),
     click.option("--ticks", type=FROM_1, help="End after this number of commands."),
-    click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml]."),
+    click.option("--throttle-limit", type=Number(0, 1), help="Largest throttle [default: params.yml].", **LIMITED),
     click.option("--threads", type=click.IntRange(1, MOST_THREADS), help="Of the policy [default: all cores but one]."),
     click.option("--log", "log_file", type=LOG, help="Flight log [default: rover/flight.log in your state folder]."),
     click.option("--json", "json_file", type=Output(appended=True), help="Write a summary to this file; - prints it."),
@@ -182,7 +189,7 @@ def run_drive(json_file: Path | None, car: Any = None, **options: Any) -> int:
     if json_file and json_file != Path("-"):
         json_file.write_text(json.dumps(report.summary(), indent=2) + "\n")
     else:
-        show(report.summary(), bool(json_file))
+        show(report.summary() if json_file else in_words(report.summary()), bool(json_file))
     return code
 
 
@@ -370,7 +377,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
 @click.option("--sandboxed", is_flag=True, help="Run parity vectors in the service's sandbox.")
 @click.pass_context
 def release(ctx: click.Context, models: Path, sandboxed: bool, **expected: Any) -> None:
-    """Manage the rover's models, as `ansible-playbook ansible/deploy.yml` does it over a network."""
+    """Manage the rover's models, as `rover playbook deploy` does it over a network."""
     from rover_lib.onboard.artifact.acceptance import Expected
     from rover_lib.onboard.care.release import Releases, check_in_sandbox
 
@@ -495,6 +502,8 @@ def open_view(
         # The journal may have other readers than the token's file.
         click.echo(url.replace(token, "...") if token_file else url)
         sys.stdout.flush()
+        if not token_file:  # which a service has
+            notify("open this address in a browser; Ctrl-C ends")
         opened(url)
 
     asyncio.run(view.run(tell, shown and shown.show))
@@ -515,7 +524,7 @@ def sum_up(file: Path, drive: int, as_json: bool) -> Any:
 
     flight = read_log(file, drive)
     summary = flight.summary()
-    show(summary if as_json else {k: v for k, v in summary.items() if k != "events"}, as_json)
+    show(summary if as_json else in_words({k: v for k, v in summary.items() if k != "events"}), as_json)
     for event in () if as_json else flight.events:
         click.echo(f"{event.t_s:9.2f} s  {event.text}")
     return flight

@@ -4,6 +4,19 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+UNITS = {"mb": "MB", "ms": "ms", "s": "s", "pct": "%", "g": "10^9", "fps": "1/s", "hz": "Hz", "c": "Celsius"}
+
+
+def in_words(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Return figures for people: names in words with their unit, and without what was not measured."""
+    named = {}
+    for key, value in figures.items():
+        words, _, unit = key.rpartition("_")
+        name = f"{words}, {UNITS[unit]}" if words and unit in UNITS else key
+        if value is not None:
+            named[name.replace("_", " ")] = value
+    return named
+
 
 def align(rows: Sequence[Sequence[str]]) -> list[str]:
     """A line for each row, a header among them. Rows are of one length."""

@@ -9,7 +9,9 @@ A folder may be of several kinds, such as a run and a LeRobot checkpoint. A path
 import math
 import os
 import re
+import shlex
 import zipfile
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ import click
 
 from rover_lib.onboard.artifact.archive import DIRECTORY_BYTES, ONNX
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.params import params
 
 CALLED = {
     "artifact": "an artifact",
@@ -41,6 +44,7 @@ WANTED = {  # what a command takes: the kinds, and how to get one
     "run": (("run",), "give a folder that rover run has made, such as runs/mine"),
     "flight log": (("flight log",), "give the file that rover drive wrote, named by its --log"),
 }
+ON_HUB = {"checkpoint": (), "recordings": ("--repo-type", "dataset")}  # what LeRobot's Hub has, with hf's option for it
 POINTER = b"version https://git-lfs"  # how a Git LFS pointer begins
 EPISODE_FILES = ("episode_data.json", "control_data.csv", "frame_data.csv")
 POLICY_FILES = ("config.json", "adapter_config.json", "pretrained_model", "checkpoints", "last", "model.safetensors")
@@ -63,10 +67,19 @@ def check_kind(path: Path | str, wanted: str) -> None:
     found = kinds_of(path)
     takes, remedy = WANTED[wanted]
     if not Path(path).exists():
-        raise RoverError(f"{path}: not found", remedy=remedy)
+        raise RoverError(f"{path}: not found", remedy=_download(str(path), wanted) or remedy)
     if not found or set(found) & set(takes):
         return
     raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
+
+
+def _download(name: str, wanted: str) -> str:
+    """How to get what looks like a name on the Hub; "" for any other path."""
+    if wanted not in ON_HUB or not re.fullmatch(r"[\w.-]+/[\w.-]+", name) or Path(name).parent.exists():
+        return ""
+    folder = name.partition("/")[2]
+    command = shlex.join(["hf", "download", *ON_HUB[wanted], name, "--local-dir", folder])
+    return f"of the Hub? `{command}`, then give {folder}"
 
 
 def refuse_pointer(path: Path, error: type[RoverError]) -> None:
@@ -116,6 +129,25 @@ class Number(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number.", param, ctx)
         return number
+
+
+class Preset(click.Option):
+    """A command's option that params.yml presets: "params.yml" in its help becomes the value that holds now.
+
+    preset: finds it in params(). It is given the command's name too, whose section may be meant.
+    """
+
+    def __init__(self, *names: Any, preset: Callable[[dict[str, Any], str], object], **options: Any):
+        super().__init__(*names, **options)
+        self._preset = preset
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return the option's names and its help."""
+        record = super().get_help_record(ctx)
+        with suppress(RoverError, KeyError):  # of a bad params.yml; the command itself says that
+            value = self._preset(params(), ctx.command.name or "")
+            return record and (record[0], record[1].replace("params.yml]", f"{value}, by params.yml]"))
+        return record
 
 
 class PathTo(click.Path):

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.wheel_version import ONBOARD, wheel_version
+from rover_lib.onboard.wheel_version import ONBOARD, PACKAGE, wheel_version
+from rover_lib.workshop.installed import SHIPPED
 from rover_lib.workshop.run_program import run
 
-REPOSITORY = Path(__file__).parents[2]
-PINS, ONNX_PINS = REPOSITORY / "requirements_pi.txt", REPOSITORY / "requirements_pi_onnxruntime.txt"
+PINS, ONNX_PINS = SHIPPED / "requirements_pi.txt", SHIPPED / "requirements_pi_onnxruntime.txt"
 REQUIREMENTS = {"torch": PINS, "onnxruntime": ONNX_PINS}  # by engine
-VIEW = REPOSITORY / "requirements_pi_view.txt"  # with either, for `rover view`
+VIEW = SHIPPED / "requirements_pi_view.txt"  # with either, for `rover view`
 PYTHONS = ("3.11", "3.13")  # of Debian 12 and 13, and of Raspberry Pi OS, which follows them
 # The newest glibc that a wheel may ask for is Debian 12's 2.36; pip takes a list, not "at most".
 PLATFORMS = [f"manylinux_2_{minor}_aarch64" for minor in range(17, 37)] + ["manylinux2014_aarch64"]
@@ -60,7 +60,13 @@ def _build(folder: Path) -> tuple[Path, str]:
         # The same files make the same bytes: the zip has this date, whatever the user's environment says.
         environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800"}
         command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", built]
-        run(*command, cwd=ONBOARD, env=environment, error=RoverError, remedy="is this a checkout of the project?")
+        # As in a checkout, wherever this is installed: an installed package has no LICENSE above it.
+        sources = Path(built, "sources")
+        copied = sources / "rover_lib" / ONBOARD.name
+        shutil.copytree(ONBOARD, copied, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(PACKAGE, copied.parent)
+        shutil.copy(SHIPPED / "LICENSE", sources)
+        run(*command, cwd=copied, env=environment, error=RoverError)
         for old in folder.glob("rover_policy-*.whl"):
             old.unlink()
         shutil.move(Path(built, wheel.name), wheel)

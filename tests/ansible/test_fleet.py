@@ -7,6 +7,8 @@ What systemd and the service would say comes from a script in their place; model
 import json
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +19,7 @@ from test_playbooks import programs
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import Releases
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.judge.advice import Names, list_next
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("canary", "second", "third")
@@ -57,15 +60,22 @@ class Fleet:
             releases.switch(releases.stage(artifact).name)
 
     def play(self, book: str, *options: str, **variables: object) -> subprocess.CompletedProcess:
+        book = shlex.join(
+            [str(BINARY / "ansible-playbook"), "-i", "inventory.ini", f"{ROOT}/ansible/{book}.yml", *options]
+        )
+        return self.type(book, self.folder, **variables)
+
+    def type(self, line: str, folder: Path, **variables: object) -> subprocess.CompletedProcess:
+        """Type a line in a folder, in which the inventory lies."""
         shared = ["[rovers:vars]", "ansible_connection=local", "ansible_become=false"]
-        (self.folder / "inventory.ini").write_text("\n".join(["[rovers]", *self.lines.values(), *shared]) + "\n")
+        (folder / "inventory.ini").write_text("\n".join(["[rovers]", *self.lines.values(), *shared]) + "\n")
         own = {"ansible_python_interpreter": sys.executable, "rover_home": str(self.folder / "home")}
         given = json.dumps({**own, "rover_ready_s": 2, **variables})
         env = {k: v for k, v in os.environ.items() if not k.startswith(("ANSIBLE", "COV"))}
         env |= {"PATH": f"{self.folder}/bin:{BINARY}:{os.environ['PATH']}", "ANSIBLE_NOCOLOR": "1"}
         env["ANSIBLE_HOME"] = str(self.folder / "ansible")
-        command = [BINARY / "ansible-playbook", "-i", self.folder / "inventory.ini", ROOT / "ansible" / f"{book}.yml"]
-        return subprocess.run([*map(str, command), *options, "-e", given], capture_output=True, text=True, env=env)
+        line = f"{line} -e {shlex.quote(given)}"
+        return subprocess.run(line, shell=True, cwd=folder, capture_output=True, text=True, env=env)
 
     def deploy(self, artifact: Path, *options: str, **variables: object) -> subprocess.CompletedProcess:
         return self.play("deploy", *options, rover_artifact=str(artifact), **variables)
@@ -74,6 +84,22 @@ class Fleet:
 @pytest.fixture
 def fleet(tmp_path) -> Fleet:
     return Fleet(tmp_path)
+
+
+def test_next_as_it_is_printed_deploys(fleet, artifacts):
+    """Typed in a folder outside of a clone; Ansible splits name=value at spaces."""
+    folder, run = fleet.folder / "a folder", Path("my runs", "it's mine")
+    (folder / run).mkdir(parents=True)
+    shutil.copy(artifacts["static"], folder / run)
+    judged: dict = {"failed": [], "refused": {"mode": "m"}, "deploy": "static"}
+    steps = list_next(judged, "static", {"compare": {"fp32": {"trials": None}}}, Names(str(run), "a.pth", "b"))
+    deploy, benchmark, drive = (step["command"] for step in steps)
+    done = fleet.type(deploy, folder)
+    assert done.stdout.count(": deployed") == len(NAMES), done.stdout + done.stderr
+    assert fleet.releases("third").current == content_hash(artifacts["static"])
+    for line in (benchmark, drive.replace("rover1", "third")):
+        done = fleet.type(f"{line} --list-tasks", folder)
+        assert done.returncode == 0 and "play #1" in done.stdout, done.stderr
 
 
 def row_of(table: subprocess.CompletedProcess, name: str) -> str:

@@ -77,6 +77,14 @@ def test_the_defaults_are_those_of_the_specs():
     assert (DEFAULTS["rover_start_at_boot"], DEFAULTS["rover_while_driving"]) == (False, "refuse")
 
 
+def test_a_users_path_begins_where_it_is_typed():
+    """Ansible looks beside the playbook: `-e rover_car=car.yml` was not found from the folder above."""
+    tasks = "".join(path.read_text() for path in (ROLE / "tasks").glob("*.yml"))
+    for name in ("rover_artifact", "rover_car", "rover_firmware", "rover_params"):
+        assert f"[lookup('ansible.builtin.env', 'PWD'), {name} | expanduser] | path_join" in tasks, name
+        assert not re.search(rf"src: \"{{{{ {name} ", tasks)
+
+
 PI = {
     "architecture": "aarch64", "os_family": "Debian", "distribution": "Debian", "distribution_version": "12.9",
     "distribution_major_version": "12", "python_version": "3.11.2", "memtotal_mb": 7900,

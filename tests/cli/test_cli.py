@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 from command import rover
 
+from rover_lib.cli import main
+from rover_lib.cli.prepare import Resumable
 from rover_lib.onboard.cli import show
+from rover_lib.onboard.columns import in_words
+from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage
 
 
@@ -32,6 +36,43 @@ def test_one_notebook_is_executed_again_with_what_is_turned(tmp_path, monkeypatc
     result = rover("run", "--only", "03", "--name", "try1", "--runs-dir", tmp_path, "-p", "modes", "[static]")
     assert result.exit_code == 0, result.output
     assert asked == [(("03", tmp_path / "try1"), {"modes": ["static"]})]
+
+
+def test_help_shows_what_params_yml_presets(set_params):
+    set_params("calibration: {samples: 77}")
+    assert "[default: 77, by params.yml]" in rover("run", "--help").output
+    recipes = params()["train"].values()
+    small, full = (sum(v for key, v in recipe.items() if key.endswith("_steps")) for recipe in list(recipes)[:2])
+    assert f"{small} (small), {full}" in " ".join(rover("train", "--help").output.split())
+    set_params("calibration: [")
+    assert "[default: params.yml]" in rover("run", "--help").output
+    set_params("")
+
+
+def test_a_stopped_command_says_that_it_resumes(tmp_path, monkeypatch):
+    def stopped(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("rover_lib.workshop.run.run.run", stopped)
+    result = rover("run", __file__, tmp_path)
+    assert result.exit_code == 130 and "run the same command again to resume" in result.output
+    long = ["run", "train", "distill", "finetune"]
+    assert all(isinstance(main.commands[name], Resumable) for name in long)
+
+
+def test_figures_of_a_drive_are_told_in_words():
+    figures = {"seconds": 2.0, "plan_age_p95_ms": 12.0, "missed": None, "damaged_lines": 0}
+    assert in_words(figures) == {"seconds": 2.0, "plan age p95, ms": 12.0, "damaged lines": 0}
+
+
+@pytest.mark.parametrize(("module", "words"), [("aiohttp", "[view]'"), ("torch", "[workshop]'")])
+def test_a_missing_package_names_the_extra(module, words, monkeypatch):
+    def missing(*args):
+        raise ModuleNotFoundError(name=module)
+
+    monkeypatch.setattr("rover_lib.workshop.run.describe.describe", missing)
+    assert (result := rover("inspect", "a")).exit_code == 1
+    assert f"this command needs {module}; pip install 'rover-policy{words}" in result.output
 
 
 def test_a_systems_error_is_a_sentence_with_its_file(tmp_path, monkeypatch):

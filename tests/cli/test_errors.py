@@ -31,6 +31,12 @@ WRONG = [
     # wrong kind or order
     ("run noise.bin episodes", "noise.bin: an unknown kind of file, not a checkpoint"),
     ("run noise.bin", "EPISODES"),
+    ("run lerobot/act_x episodes", "hf download lerobot/act_x --local-dir act_x"),
+    ("run pretrained_model lerobot/pusht", "hf download --repo-type dataset lerobot/pusht --local-dir pusht"),
+    ("run pretrained_model episodes --name a/b", "use letters, digits, _, - and ."),
+    ("playbook fly", "known are benchmark, deploy"),
+    ("notebooks runs/mine", "runs/mine: no notebooks in it"),
+    ("export noise.bin --card", "noise.bin"),
     ("run --only 04 --name nothing", "nothing"),
     ("run nothing.pth episodes", "nothing.pth: not found"),
     ("run noise.bin episodes -p worlds many", "worlds must be a whole number"),

@@ -33,7 +33,7 @@ def test_a_simulation_on_a_phone(demo_run):
         page = browser.new_page(**PHONE)
         page.goto(shown.stdout.readline().strip())
         phase, said = page.locator("#phase"), page.locator("#missing")
-        expect(page.get_by_role("button", name=re.compile(r"^INT8: hit \d+ of [1-9]"))).to_be_visible()
+        expect(page.get_by_role("button", name=re.compile(r"^INT8, undisturbed: hit \d+ of [1-9]"))).to_be_visible()
         boxes = [element.bounding_box() for element in page.locator("body *:visible").all()]
         assert len(boxes) > 20 and all(box["x"] >= -1 and box["x"] + box["width"] <= 391 for box in boxes)
         page.get_by_role("button", name="FP32").click()
@@ -44,7 +44,7 @@ def test_a_simulation_on_a_phone(demo_run):
         page.get_by_role("button", name="next world").click()
         expect(phase).to_have_text("driving")
         page.keyboard.press("ArrowLeft")
-        expect(page.locator("#hint")).to_contain_text("Recovered from")
+        expect(page.locator("#hint")).to_contain_text("Pushed: hit")
         shown.send_signal(signal.SIGINT)
         expect(phase).to_contain_text("no news for")
         page.get_by_role("button", name="STOP").click()

@@ -5,7 +5,8 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, smooth_frame
+from command import rover
+from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, saved_normalised, smooth_frame
 from torch import nn
 
 from rover_exchange.onnx_graph import onnx_model, stack_stem
@@ -100,3 +101,28 @@ def test_part_with_two_outputs():
     assert np.array_equal(turned, x.transpose(1, 2).numpy()) and np.array_equal(twice, 2 * x.numpy())
     with pytest.raises(ArtifactError, match="Tanh has no form in ONNX"):
         onnx_model(graph_of(nn.Sequential(nn.Tanh())), {"x": torch.zeros(1, 2)}, ("y",))
+
+
+def test_a_checkpoint_alone_becomes_a_graph_that_computes_what_lerobot_does(tmp_path, monkeypatch):
+    """The contract in export_graph's docstring: names, shapes, RGB bytes in, actions out; no recordings, no run."""
+    monkeypatch.chdir(tmp_path)
+    policy = lerobot_policy(**TINY)
+    inner, outer = saved_normalised(policy, tmp_path / "my policy")
+    assert (done := rover("export", "my policy", "--onnx")).exit_code == 0, done.output
+    session = onnxruntime.InferenceSession("my policy.onnx")
+    shapes = {each.name: (each.type, each.shape) for each in (*session.get_inputs(), *session.get_outputs())}
+    frame_name = "frame_cam_front"
+    wanted = {"state": ("tensor(float)", [1, 2]), frame_name: ("tensor(uint8)", [72, 128, 3])}
+    assert shapes == wanted | {"chunk": ("tensor(float)", [1, 32, 2])}
+    known = session.get_modelmeta().custom_metadata_map
+    assert known["guessed"] == "actions,rate" and known["actions"] == "steering,throttle"
+    rgb, state = smooth_frame(np.random.default_rng(1), 72, 128), np.float32([[0.3, 0.1]])
+    picture = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
+    seen = inner({"observation.images.cam_front": picture, "observation.state": torch.from_numpy(state[0])})
+    with torch.inference_mode():
+        expected = outer(policy.predict_action_chunk(seen)[0]).numpy()[None]
+    (chunk,) = session.run(None, {"state": state, frame_name: rgb})
+    assert expected.std() > 1e-3 and np.abs(chunk - expected).max() < 1e-5
+    (turned,) = session.run(None, {"state": state, frame_name: rgb[..., ::-1].copy()})
+    assert np.abs(turned - expected).max() > 1e-4  # BGR would be another picture
+    assert rover("export", "my policy", "--card").exit_code == 1  # which is of a run

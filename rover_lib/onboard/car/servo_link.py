@@ -9,6 +9,7 @@ import fcntl
 import logging
 import math
 import os
+import shlex
 import termios
 import threading
 import time
@@ -152,7 +153,8 @@ class ServoLink:
         while not (hello := self._await(lambda: self.hello, REPEAT_S)):
             now, running = self._clock(), self._telemetry
             if now - opened > BOOT_S:
-                remedy = f"is it the rover's, and is the firmware on it (make -C firmware flash PORT={self.port})?"
+                flash = f"make -C firmware flash PORT={shlex.quote(str(self.port))}"
+                remedy = f"is it the rover's, and is the firmware on it ({flash})?"
                 raise LinkError(f"{self.port}: no hello from an Arduino within {BOOT_S:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else BOOT_S / 2

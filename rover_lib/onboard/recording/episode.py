@@ -14,6 +14,7 @@ import errno
 import json
 import math
 import os
+import shlex
 import shutil
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -134,7 +135,7 @@ class EpisodeWriter:
                 self._lock = lock_folder(part)
         if self._lock is None:
             what = f"{self.folder}: is being recorded, or was when its program was killed"
-            remedy = f"name another folder; `rover record {self.folder.parent} --finish` keeps what was recorded"
+            remedy = f"name another folder; {_finish_by(self.folder.parent)}"
             raise EpisodeError(what, remedy=remedy, kind="exists")
         self._part = part
         try:
@@ -293,7 +294,7 @@ class EpisodeWriter:
         try:
             yield
         except OSError as e:
-            remedy = f"make room; `rover record {self.folder.parent} --finish` keeps what was recorded"
+            remedy = f"make room; {_finish_by(self.folder.parent)}"
             raise EpisodeError(f"{self.folder}: cannot be written ({e.strerror or e})", remedy=remedy) from e
 
     def _check_time(self, t_s: float) -> None:
@@ -351,6 +352,10 @@ class EpisodeWriter:
                 table = csv.DictWriter(f, names, extrasaction="ignore")
                 table.writeheader()
                 table.writerows(self._whole_rows(part, kind))
+
+
+def _finish_by(folder: Path) -> str:
+    return f"`rover record {shlex.quote(str(folder))} --finish` keeps what was recorded"
 
 
 def find_killed(folder: Path) -> list[Path]:

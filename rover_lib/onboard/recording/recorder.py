@@ -129,7 +129,7 @@ class Recorder:
         folder, rows = self.folder.parent, ROW_BYTES * (self._writer.controls + self._writer.frames)
         if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
             what = f"{folder}: no room is left of what episodes may take here"
-            raise EpisodeError(what, remedy="fetch them with ansible/drive.yml, or delete some")
+            raise EpisodeError(what, remedy="fetch them by `rover playbook drive`, or delete some")
         disk = os.statvfs(folder)
         if (free := disk.f_bavail * disk.f_frsize) < (needed := SPARE_BYTES + rows):
             found = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} are kept in reserve"

@@ -96,6 +96,14 @@ class Onnx:
         named = {name: x.numpy() for name, x in zip(self.names, inputs, strict=True)}
         return [torch.from_numpy(y) for y in self.session.run(None, named)]
 
+    def note(self, facts: Mapping[str, str]) -> None:
+        """Write facts into the graph's own metadata."""
+        import onnx
+
+        model = onnx.load_from_string(self.model)
+        onnx.helper.set_model_props(model, dict(facts))
+        self.model = model.SerializeToString(deterministic=True)
+
     def save(self, path: Path | str, manifest: dict[str, Any], vectors: dict[str, np.ndarray]) -> str:
         return artifact.save_onnx(path, self.model, manifest, vectors)
 

@@ -1,6 +1,7 @@
 """Say what to do about what failed in a run, what weakens its verdict, and what to type next."""
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,11 +11,11 @@ from typing import Any
 from jinja2 import ChainableUndefined, Environment, FileSystemLoader
 
 from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
+from rover_lib.onboard.columns import UNITS
 from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
-UNITS = {"mb": "MB", "ms": "ms", "pct": "%", "g": "10^9", "fps": "1/s", "hz": "Hz", "c": "Celsius"}
 NEXT_COMMANDS, MOST_CAUTIONS = 3, 5
 MOST_EPISODES = 3  # a remedy names at most this many
 
@@ -119,17 +120,25 @@ def list_cautions(
 def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names) -> list[dict[str, str]]:
     """Return at most three commands to type next, with the reason for each: next.txt."""
     failed = [row["gate"] for row in judged["failed"] if row["gate"].startswith(GATED)]
-    allow = json.dumps({"rover_allow": sorted(judged["refused"])}) if judged["refused"] else ""
+    artifact = names.artifact(judged["deploy"] or best)
     lines = fill_in(
         "next.txt",
         judged=judged,
         compare=stages["compare"],
         load=stages.get("load", {}),
         names=names,
-        artifact=names.artifact(judged["deploy"] or best),
+        artifact=artifact,
+        deployed=_deployed(artifact, sorted(judged["refused"])),
         other_robot=set(judged["refused"]) - set(MAY_DIFFER),
-        allow=f" -e '{allow}'" if allow else "",
         failed=failed,
     )
     steps = [line.rpartition("  # ") for line in lines[:NEXT_COMMANDS]]
     return [{"command": command, "why": why} for command, _, why in steps]
+
+
+def _deployed(artifact: str, allow: Sequence[str]) -> str:
+    """What deploy.yml is told by -e. Ansible splits name=value at spaces, and reads JSON as it is."""
+    if not allow and re.fullmatch(r"[\w./-]+", artifact):
+        return f"rover_artifact={artifact}"
+    told: dict[str, Any] = {"rover_artifact": artifact}
+    return json.dumps(told | ({"rover_allow": list(allow)} if allow else {}), ensure_ascii=False)

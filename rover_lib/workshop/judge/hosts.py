@@ -12,11 +12,12 @@ from typing import Any
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage
+from rover_lib.workshop.installed import SHIPPED
 from rover_lib.workshop.notebook_table import Table
 
 THIS = "this machine"  # instead of the host's name, which a committed figure need not show
-NO_ROVER = "no rover's benchmark is here; ansible-playbook -i inventory.ini ansible/benchmark.yml fetches them"
-CLOCK = Path(__file__).parents[3] / "results" / "clock" / "clock.json"  # its program: commit 545214c
+NO_ROVER = "no rover's benchmark is here; rover playbook benchmark fetches them"
+CLOCK = SHIPPED / "results" / "clock" / "clock.json"  # its program: commit 545214c
 
 
 @dataclass(frozen=True)

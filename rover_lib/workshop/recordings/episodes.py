@@ -13,6 +13,7 @@ sample, because its state would be invented.
 
 import csv
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -115,7 +116,7 @@ def load_recordings(
     except OSError as e:
         words, remedy = (name_stranger(root) if root.is_file() else None) or ("no folder of episodes", FOLDER)
         raise EpisodeError(f"{root}: {words} ({e.strerror})", remedy=remedy) from None
-    finish = f"`rover record {root} --finish` makes an episode of it"
+    finish = f"`rover record {shlex.quote(str(root))} --finish` makes an episode of it"
     killed = written.find_killed(root)
     if not folders:
         inside = quote_all(sorted(p.name for p in root.iterdir())) or None

@@ -16,7 +16,7 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.recordings.turning import measure_sides
 
-FIRST = "make demo, or rover run, makes the first"
+FIRST = "rover run makes the first; in a clone, make demo too"
 
 
 def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
@@ -77,6 +77,6 @@ def verdict_of(run_dir: Path) -> str:
         if all(sha256_of(path) == sha256 for path, sha256 in there.items()):
             return str(judged["metrics"]["headline"])
     if (run_dir / "compare.json").is_file():
-        return f"no verdict of its files: rover report {run_dir}"
+        return f"no verdict of its files: rover report {shlex.quote(str(run_dir))}"
     made = next((p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT")
     return f"no run yet: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"

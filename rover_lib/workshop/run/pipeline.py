@@ -14,13 +14,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX, content_hash
 from rover_lib.onboard.errors import ArtifactError
-from rover_lib.onboard.stage import read_stage, sha256_of
+from rover_lib.onboard.params import params
+from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of
 from rover_lib.workshop.act import ACT
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
+from rover_lib.workshop.checkpoint.facts import GUESS
 from rover_lib.workshop.int8.choose import Chooser
-from rover_lib.workshop.int8.export import Exporter
+from rover_lib.workshop.int8.export import Exporter, Onnx
 from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.int8.frames import odd_samples, odd_share
 from rover_lib.workshop.int8.observe import Calibration, calibrate
@@ -35,6 +40,7 @@ from rover_lib.workshop.run.session import Opened, open_run
 DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared
 # Ranges and blocks chosen on 16 frames were up to twice as bad on others. The 64 also tell what share is odd.
 CHOOSING_FRAMES = 64
+CHECKED_OBSERVATIONS = 3  # of an ONNX graph without recordings
 EXPORT_FRAMES = 16  # of these check an export
 
 
@@ -135,3 +141,43 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
         written[path.name], _ = exporter.export(policy, path, calibration if name == "static" else None, drives)
         forget_graphs()
     return written
+
+
+@torch.inference_mode()
+def export_graph(checkpoint: Checkpoint, path: Path | str) -> Path:
+    """Write FP32 as a plain ONNX graph, for which neither a run nor recordings are needed; return its path.
+
+    `rover export best_model.pth --onnx` does it. `rover export runs/mine --onnx` writes artifacts, FP32 and INT8, whose
+    zip holds the same graph as `archive/model.onnx`. Opset 17, static shapes, one file:
+
+    | name | type and shape | content |
+    |---|---|---|
+    | in: `state` | float32 (1, S) | as recorded, such as steering and throttle of the frame before |
+    | in: `frame_<camera>`, one each | uint8 (height, width, 3) | **RGB**, resized to the policy's size by the caller |
+    | out: `chunk` | float32 (1, steps, A) | actions as recorded, not clipped |
+    | out: `embedding`, of artifacts that know their way | float32 (1, D) | what tells how familiar a picture is |
+
+    Inside are the picture's scaling to [0, 1] and its normalisation, those of state and actions, and the VAE's latent
+    of zeros. Metadata: `states`, `actions` (their order), `rate_hz`, `checkpoint` (SHA-256), and `guessed`, which of
+    these nothing says.
+
+    Raises ArtifactError, and writes nothing, if ONNX Runtime computes something else than the policy does for random
+    observations.
+    """
+    config, rng = checkpoint.config, np.random.default_rng(0)
+    policy = ACT(config, checkpoint.weights)
+    form = Onnx(policy, config)
+    for _ in range(CHECKED_OBSERVATIONS):
+        state = torch.from_numpy(rng.uniform(-1, 1, (1, len(config.state_names))).astype(np.float32))
+        frames = [torch.from_numpy(rng.integers(0, 256, (*size, 3), np.uint8)) for size in config.image_sizes]
+        wanted, found = policy(state, *frames), form.run((state, *frames))[0]
+        gap, most = (found - wanted).abs().max(), params()["parity"]["fp32"] * wanted.abs().max().clamp(min=1)
+        if not gap <= most:  # written so that NaN fails
+            raise ArtifactError(f"{path}: the written graph differs by {gap:.3g}; nothing was written")
+    facts = {"rate_hz": config.rate_hz, "states": ",".join(config.state_names), "checkpoint": checkpoint.sha256}
+    guessed = [fact for fact in ("actions", "rate") if checkpoint.facts.source(fact) == GUESS]
+    facts |= {"actions": ",".join(config.action_names), "guessed": ",".join(guessed)}
+    form.note({name: str(fact) for name, fact in facts.items()})
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(form.model)
+    return Path(path)

@@ -29,11 +29,12 @@ from rover_lib.onboard.errors import RoverError, of_system
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.confine import refuse_root
 from rover_lib.onboard.stage import atomic_path, read_stage
+from rover_lib.workshop.installed import SHIPPED
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.parameters import check_parameters
 
-NOTEBOOKS = Path(__file__).parents[3] / "notebooks"
+NOTEBOOKS = SHIPPED / "notebooks"
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Notebooks for a finished run, which `make count`, `rover run --only 07`, `rover world students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
@@ -53,6 +54,7 @@ KERNEL_ENVIRONMENT = {
     "PYTHONWARNINGS": "ignore:Currently,ignore:IProgress not found",
     "TORCH_CPP_LOG_LEVEL": "ERROR",
 }
+START_S = 600  # papermill's 60 did not suffice on a machine with seven busy programs for each core
 LINE = re.compile(r"^(\w+) *= *(.*?) *(?:# *(.*))?$", re.M)  # of a parameters cell
 
 
@@ -156,7 +158,7 @@ def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
 def _refuse_senseless(notebooks: list[Path], given: Mapping[str, Any]) -> None:
     """Raise RoverError for parameters that none of the notebooks has, impossible values, and missing notebooks."""
     if missing := [path for path in notebooks if not path.is_file()]:
-        raise RoverError(f"{missing[0]}: not found", remedy="run from a checkout of the project")
+        raise RoverError(f"{missing[0]}: not found", remedy="install the project again")
     known = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
     if unknown := sorted(given.keys() - known):
         raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(known)}")
@@ -170,12 +172,15 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
-    how = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "kernel_manager_class": ThisPython}
+    how: dict[str, Any] = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "start_timeout": START_S}
+    how |= {"kernel_manager_class": ThisPython}
     with patch.dict(os.environ, KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
             papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
         except papermill.PapermillExecutionError as e:
+            if e.ename == "KeyboardInterrupt":  # Ctrl-C reaches the kernel too
+                raise KeyboardInterrupt from e
             raise RoverError(f"{source.name}, cell {e.cell_index + 1}: {_sentence(e)}") from e
         except DeadKernelError as e:
             raise RoverError(f"{source.name}: its kernel died", remedy="is there enough memory?") from e

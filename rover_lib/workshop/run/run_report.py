@@ -4,9 +4,6 @@ content = write("runs/mine")        # run.json, from the JSON that its stages le
 print(text(content["metrics"]))
 """
 
-import os
-import shutil
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +17,7 @@ from rover_lib.onboard.columns import align, number
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage, sha256_of, write_stage
+from rover_lib.workshop.installed import relative, typed
 from rover_lib.workshop.judge.advice import CALLED, Names, against
 from rover_lib.workshop.judge.hosts import benchmark_of, is_of
 from rover_lib.workshop.judge.verdict import headline, verdict
@@ -46,7 +44,7 @@ def write(run_dir: Path | str) -> dict[str, Any]:
         files["benchmark"] = timed
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
         given = contents["load"]["params"]
-        names = Names(*(_relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
+        names = Names(*(relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
         there = {mode: path for mode in made if (path := folder / f"policy_{mode}.pt").is_file()}
         refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
         judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
@@ -78,19 +76,6 @@ def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Ma
         if path.is_file() and (found := content_hash(path)) != made["content_hash"]:
             contents = f"content {found[:12]} instead of {made['content_hash'][:12]}"
             raise RoverError(f"{path}: not the artifact that this run made", found=contents, remedy=AGAIN)
-
-
-def _relative(path: Path | str) -> str:
-    """A path as it would be typed here: relative where it is below this folder."""
-    path = Path(path)
-    return os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
-
-
-def typed(command: str) -> str:
-    """A command as it works in this shell: a program of this environment that is not on PATH gets its folder."""
-    program, space, rest = command.partition(" ")
-    beside = Path(sys.executable).with_name(program)
-    return command if shutil.which(program) or not beside.is_file() else f"{_relative(beside)}{space}{rest}"
 
 
 def text(judged: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,7 @@ def test_figures_of_another_artifact_are_no_verdict(run_dir, artifacts):
 
 
 DRIVES = re.compile(
-    r"ansible-playbook|deploy\.yml|drive\.yml|rover (?:drive|view|release)|lerobot_robot_rover |one to deploy"
+    r"ansible-playbook|rover (?:drive|view|release|playbook d)|lerobot_robot_rover |one to deploy"
     r"|[Vv]erdict: deploy|put it on the rover|first metres"
 )
 
@@ -86,7 +87,7 @@ def test_commands_work_as_they_are_printed(run_dir, monkeypatch):
     programs = run_dir.parents[1] / ".venv" / "bin"
     programs.mkdir(parents=True)
     (programs / "rover").touch(0o755)
-    monkeypatch.setattr(report.sys, "executable", str(programs / "python"))
+    monkeypatch.setattr(sys, "executable", str(programs / "python"))
     monkeypatch.setenv("PATH", "/usr/bin")
     assert report.typed("rover doctor") == ".venv/bin/rover doctor" and report.typed("make watch") == "make watch"
     assert "\n  .venv/bin/rover view runs/mine" in report.text(report.write(run_dir)["metrics"])
