@@ -334,6 +334,8 @@ def _train(
             training = replace(training, data=data, judging=frames)
             optimizer, scheduler = _train_together(training, "at full size", recipe.carry_steps)
         plans = training.plans()
+        if _hold(policy, judges, judges.errors_pct(plans), np.median(actions, axis=0), say):
+            plans = training.plans()
     errors = judges.errors_pct(plans)
     say(f"on recordings that it did not learn from: {judges.words(errors)}")
     checkpoint = {
@@ -344,6 +346,24 @@ def _train(
         "best_val_loss": np.float64(np.abs(plans - judges.chunks)[~judges.is_pad].mean()),
     }
     return checkpoint, judges.summary(errors)
+
+
+def _hold(
+    policy: "ACTPolicy", judges: Judges, errors: np.ndarray, usual: np.ndarray, say: Callable[[str], object]
+) -> bool:
+    """Plan the usual value of each action that hardly varies and was not learned; return whether there was one.
+
+    A throttle that was held in each session has nothing to do with the picture, and would be guessed from its light.
+    errors: by action, (A,), in % of the range. usual: (A,), in the action's unit.
+    """
+    held = np.flatnonzero(~judges.varies & (errors >= judges.blind_pct))
+    head = policy.model.action_head
+    with torch.no_grad():
+        for i in held.tolist():
+            head.weight[i] = 0
+            head.bias[i] = float(usual[i])
+            say(f"{judges.names[i]} hardly varies, and is held at {usual[i]:.3f}")
+    return bool(len(held))
 
 
 def _train_backbone(training: _Training, model: PlanFromFeatures) -> None:

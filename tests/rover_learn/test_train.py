@@ -30,7 +30,8 @@ CHECKPOINT_KEYS = [
 ]  # fmt: skip
 
 # The full size's phases on a handful of small frames: trained at a quarter of the pixels, and carried to its own.
-CARRIED = "train: {small: {backbone_steps: 2, transformer_steps: 3, together_steps: 2, carry_steps: 2, batch: 4, "
+CARRIED = "train: {small: {backbone_steps: 2, backbone_rounds: 2, transformer_steps: 3, together_steps: 2, "
+CARRIED += "together_rounds: 1, carry_steps: 2, batch: 4, "
 CARRIED += "transformer_batch: 4, together_batch: 2, samples: 40, feature_samples: 12, judged: 8, at: [36, 64]}}"
 
 
@@ -76,7 +77,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path / "cache"))
     torch.rand(3)  # the state of the global generator must not matter, nor change
     before, out = torch.get_rng_state(), tmp_path / "killed.pth"
-    for kill_at in (2, 4, 6):  # in the second of backbone's steps, then of the transformer's and of all together's
+    for kill_at in (2, 4, 4, 3):  # in each round of the backbone's, in the transformer's steps, and in all together's
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             interrupt(patch, training_module, "descend", kill_at)
             train(drives, out, machine=READING_AHEAD)
@@ -89,7 +90,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     assert killed["optimizer_state_dict"]["state"][0]["step"] == 2
     assert not list((tmp_path / "cache").glob("training-*")), "what was saved on the way is of no use any more"
     curves = json.loads((tmp_path / "killed_curves/curves.json").read_text())
-    assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [2, 3, 2]
+    assert [len(curves["losses"][name]) for name in ("backbone", "transformer", "at full size")] == [4, 3, 2]
     assert list(curves["actions"]) == ["steering", "throttle"] and len(curves["errors"]["backbone"][0]) == 3
     assert curves["errors"]["at full size"][0][0] == 0 and (tmp_path / "killed_curves/curves.png").stat().st_size > 1000
     lerobots = ACTPolicy.from_pretrained(tmp_path / "killed_pretrained_model").state_dict()
@@ -217,7 +218,7 @@ def test_rounds_go_on_while_the_error_falls(errors, fits, learned, kept):
 
 
 @pytest.mark.parametrize(
-    ("steering", "says"), [(7.1, "next: rover run 'my policy.pth' "), (15.6, "steering was not learned: 15.6 % off")]
+    ("steering", "says"), [(7.1, "rover run 'my policy.pth' "), (15.6, "steering was not learned: 15.6 % off")]
 )
 def test_a_command_to_go_on_is_printed_only_for_what_was_learned(drives, tmp_path, monkeypatch, steering, says):
     found = {"error_pct": steering, "blind_pct": 15.6, "varies": True, "learned": steering < 15}
@@ -233,3 +234,21 @@ def test_a_command_to_go_on_is_printed_only_for_what_was_learned(drives, tmp_pat
     result = rover("train", drives, "my policy.pth", "--backbone", "none")
     assert result.exit_code == 0 and says in result.output, result.output
     assert ("next:" in result.output) == (steering < 15)
+
+
+@pytest.mark.parametrize(
+    ("varies", "errors", "is_held"), [(False, [1.0, 9.0], True), (False, [1.0, 2.0], False), (True, [1.0, 9.0], False)]
+)
+def test_a_throttle_that_hardly_varies_and_was_not_learned_is_held(varies, errors, is_held):
+    head = torch.nn.Linear(3, 2)
+    policy = SimpleNamespace(model=SimpleNamespace(action_head=head))
+    judges = SimpleNamespace(
+        varies=np.array([True, varies]), blind_pct=np.array([8.0, 5.0]), names=["steering", "throttle"]
+    )
+    said = []
+    train_module._hold(policy, judges, np.array(errors), np.array([0.1, 0.4], np.float32), said.append)
+    planned = head(torch.rand(5, 3))
+    assert torch.allclose(planned[:, 1], torch.tensor(0.4)) == is_held and not torch.allclose(
+        planned[:, 0], torch.tensor(0.1)
+    )
+    assert said == (["throttle hardly varies, and is held at 0.400"] if is_held else [])
