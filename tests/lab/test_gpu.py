@@ -10,7 +10,8 @@ from lab import gpu
 from lab.__main__ import main
 
 TINY = "train: {small: {backbone_steps: 2, backbone_rounds: 1, transformer_steps: 3, together_steps: 2, "
-TINY += "together_rounds: 1, batch: 4, transformer_batch: 4, together_batch: 2, samples: 40, feature_samples: 12, judged: 8}}"
+TINY += "together_rounds: 1, batch: 4, transformer_batch: 4, together_batch: 2, samples: 40, feature_samples: 12, "
+TINY += "judged: 8}}"
 
 
 @pytest.mark.slow
