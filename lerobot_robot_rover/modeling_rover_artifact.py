@@ -32,7 +32,7 @@ _log = logging.getLogger("rover")
 
 class RoverArtifactPolicy(PreTrainedPolicy):
     """Runs an artifact. Raises ParamsError or PolicyError for one that is missing, damaged or made for other actions,
-    and for a dataset whose rate is not the artifact's.
+    and for a dataset whose rate is not the artifact's; CarError for one that would steer this car mirrored.
     """
 
     config_class = RoverArtifactConfig

@@ -241,9 +241,10 @@ def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
         open_gamepad().close()
         found = ", ".join(map(str, list_gamepads()))
         yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
-    if manifest and not (meant := car_of(manifest)).drives_like(this):
+    if manifest and (unlike := (meant := car_of(manifest)).unlike(this)):
         remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
-        yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
+        state = "warning" if meant.positive == this.positive else "fail"
+        yield Check("car", state, f"the artifact was calibrated for another car: {unlike}", remedy)
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
