@@ -380,7 +380,13 @@ def test_a_supply_that_stays_low_ends_a_drive_and_heat_is_told():
     now[0] = 11
     with pytest.raises(DriveFault, match="under-voltage for 3 s"):
         list(health())
-    now[0] = 30
+    for now[0], bits in ((12, "0x0"), (13, "0x6"), (17, "0x6"), (18, "0x1"), (19, None), (20, None)):
+        log.machine = {"t_s": now[0], "throttled": bits}
+        list(health())  # hot for long, and then low for a moment
+    now[0], log.machine = 21, {"t_s": 21, "throttled": "0x1"}
+    with pytest.raises(DriveFault, match="for 3 s"):  # what was not read for a moment is not good again
+        list(health())
+    now[0] = 32
     assert list(health()) == [NOT_REPORTED]  # what was read long ago is not known
 
 
