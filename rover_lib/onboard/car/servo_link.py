@@ -22,7 +22,7 @@ import serial
 
 from rover_lib.onboard.car.car import DEFAULT_NUMBERS, PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
 from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
-from rover_lib.onboard.car.ports import find_port
+from rover_lib.onboard.car.ports import find_port, other_ports
 from rover_lib.onboard.car.protocol import (
     LINE_MAX,
     MISSING,
@@ -153,6 +153,7 @@ class ServoLink:
             now, running = self._clock(), self._telemetry
             if now - opened > BOOT_S:
                 remedy = f"is it the rover's, and is the firmware on it (make -C firmware flash PORT={self.port})?"
+                remedy = other_ports(self.port) or remedy
                 raise LinkError(f"{self.port}: no hello from an Arduino within {BOOT_S:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else BOOT_S / 2
