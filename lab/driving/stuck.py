@@ -33,7 +33,7 @@ LIGHTS: dict[str, Light] = {
     **{f"flickers by {share:.0%}": (None, 2.0, share) for share in (0.05, 0.1, 0.2, 0.3)},
     "mean 25, noise 8, flickers by 10%": (25, 8.0, 0.1),
 }
-ROWS_S, STAND_PICTURES = 0.025, 40  # time in which a camera reads its rows; 4 s
+ROWS_S, STAND_PICTURES = 0.025, 20  # time in which a camera reads its rows; 2 s
 
 
 class _Walled(World):
@@ -98,7 +98,7 @@ def in_light(image: np.ndarray, light: Light, at_s: float, rng: Any) -> np.ndarr
 
 
 def watch_in_light(samples: Sequence[Sample], light: Light) -> tuple[float, float]:
-    """Return the largest difference that a standing car sees in 4 s, and the least that a driving one sees in 0.5 s."""
+    """Return the largest difference that a standing car sees in 2 s, and the least that a driving one sees in 0.5 s."""
     rng, times_s = np.random.default_rng(0), [sample.time_s for sample in samples]
     at_s = np.arange(times_s[0], times_s[-1], EVERY_S)[:STAND_PICTURES].tolist()
     seen = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]

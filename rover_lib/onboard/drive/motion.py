@@ -14,7 +14,7 @@ ACROSS, DOWN = 2, 3  # blocks of a half in a cell
 # How far two pictures differ, of a mean of 100, if the car has moved between them. Those of a standing car differ by up
 # to 2 in the dark and under lamps that flicker by a fifth, those of a driving one by more than 5 within half a second
 # (results/lab/stuck.json).
-MOVED = 3.5
+MOVED = 2.5
 
 
 class Motion:
