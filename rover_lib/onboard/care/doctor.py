@@ -256,7 +256,7 @@ def stops(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
     off += [f"{name}: 0" for name in ("stuck_s", "undervoltage_s") if not getattr(settings, name)]
     off += [f"{name}: {value:g}" for name in ("black_level", "flat_level") if (value := getattr(settings, name)) <= 0]
     off += [f"{name}: {value}" for name, most in LATEST.items() if (value := getattr(settings, name)) > most]
-    if manifest and "familiar" not in manifest:
+    if manifest is not None and "familiar" not in manifest:
         off.append("unfamiliar: this artifact knows no limit")
     found = f"off or late: {', '.join(off)}" if off else "all that params.yml may switch off are on"
     yield warn_unless(not off, "stops", found, "see drive in params.yml, and docs/safety.md for what each prevents")
