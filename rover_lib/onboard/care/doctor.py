@@ -245,8 +245,8 @@ def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
         yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
     if manifest and (unlike := (meant := car_of(manifest)).unlike(this)):
         remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
-        state = "warning" if meant.positive == this.positive else "fail"
-        yield Check("car", state, f"the artifact was calibrated for another car: {unlike}", remedy)
+        found = f"the artifact was calibrated for another car: {unlike}"
+        yield Check("car", "warning" if meant.positive == this.positive else "fail", found, remedy)
 
 
 def stops(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
