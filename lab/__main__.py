@@ -102,21 +102,31 @@ def measure_gpu(ctx: click.Context, output: Path, episodes: Path | None, device:
 
 @main.command("mutants")
 @click.argument("output", type=FILE, required=False)
-@click.option("--only", multiple=True, metavar="NAME", help="Only this mutant; several times for more.")
-@click.option("--drives", is_flag=True, help="Random drives, too, must notice those that an invariant is about.")
+@click.option("--count", type=click.IntRange(min=0), default=300, show_default=True, help="How many slips.")
+@click.option("--first", type=click.IntRange(min=0), default=0, show_default=True, help="Leave out those before it.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Other seeds draw other slips.")
+@click.option("--fast", is_flag=True, help="Leave out slow tests.")
+@click.option("--drives", is_flag=True, help="Also the lines of planted.yml, of which random drives notice some.")
 @click.option("--jobs", type=click.IntRange(min=1), default=2, show_default=True)
 @click.pass_context
-def plant_mutants(ctx: click.Context, output: Path | None, only: tuple[str, ...], drives: bool, jobs: int) -> None:
-    """Break single lines, each in a copy, and see that a named test fails. The exit code is 1 if one survives."""
-    from lab.repository.mutants import read_mutants, try_mutants
+def plant_mutants(
+    ctx: click.Context, output: Path | None, count: int, first: int, seed: int, fast: bool, drives: bool, jobs: int
+) -> None:
+    """Plant slips in drawn lines, each in a copy, and see that a test fails.
+
+    The exit code is 1 if less than 97 % are caught, or a line of planted.yml survives.
+    """
+    from lab.repository.mutants import draw_slips, read_mutants, try_mutants, try_slips
     from rover_lib.onboard.stage import write_stage
 
-    chosen = [mutant for mutant in read_mutants() if not only or mutant.name in only]
-    metrics = try_mutants(chosen, jobs, drives, click.echo)
+    params = {"count": count, "first": first, "seed": seed, "fast": fast, "drives": drives}
+    metrics = try_slips(draw_slips(first + count, seed)[first:], jobs, not fast, click.echo) if count else {}
+    if drives:
+        metrics |= {"planted": try_mutants(read_mutants(), jobs, drives, click.echo)}
     if output:
-        write_stage(output, "mutants", params={"drives": drives}, metrics=metrics)
+        write_stage(output, "mutants", params=params, metrics=metrics)
     show(metrics, False)
-    ctx.exit(1 if metrics["survived"] else 0)
+    ctx.exit(1 if metrics.get("caught_pct", 100) < 97 or metrics.get("planted", {}).get("survived") else 0)
 
 
 @main.command("random")

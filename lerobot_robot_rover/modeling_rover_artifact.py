@@ -23,7 +23,7 @@ from rover_lib.onboard.car.host import boottime
 from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import RECORD_HERE, unfamiliar
-from rover_lib.onboard.drive.plan import STOP, Plan, Settings, Smoother, is_unfamiliar
+from rover_lib.onboard.drive.plan import STOP, WARN, Plan, Settings, Smoother, is_unfamiliar
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError
 from rover_lib.onboard.params import params
 
@@ -32,7 +32,7 @@ _log = logging.getLogger("rover")
 
 class RoverArtifactPolicy(PreTrainedPolicy):
     """Runs an artifact. Raises ParamsError or PolicyError for one that is missing, damaged or made for other actions,
-    and for a dataset whose rate is not the artifact's.
+    and for a dataset whose rate is not the artifact's; CarError for one that would steer this car mirrored.
     """
 
     config_class = RoverArtifactConfig
@@ -43,7 +43,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         self.config: RoverArtifactConfig = config
         self._limits, self._settings = this_car().limits, Settings.of(params()["drive"])
         self._queue: deque[Tensor] = deque()
-        self._smoother = Smoother()
+        self._smoother, self._warned = Smoother(), False
         self._planned_s, self._plans = 0.0, 0  # when the queue was filled
         self._process = PolicyProcess(config.file)
         weakref.finalize(self, self._process.close)  # at the program's end too, and if _check() refuses it
@@ -60,13 +60,13 @@ class RoverArtifactPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Prepare for an episode: wait for the human's gesture, which is not part of it, if a rover is connected."""
         self._queue.clear()
-        self._smoother = Smoother()
+        self._smoother, self._warned = Smoother(), False
         wait_for_humans()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the chunk's next action, (B, 2) [steering, throttle]; after n_action_steps or stop_s, a new one's.
 
-        Raises DriveFault where the policy has seen nothing like its pictures, unless params.yml has it otherwise.
+        Raises as predict_action_chunk().
         """
         if boottime() - self._planned_s > self._settings.stop_s:
             self._queue.clear()
@@ -74,21 +74,23 @@ class RoverArtifactPolicy(PreTrainedPolicy):
             self._planned_s = boottime()
             chunk = self.predict_action_chunk(batch)[:, : self.config.n_action_steps]
             self._queue.extend(chunk.transpose(0, 1))
-            self._check_familiar()
         return self._queue.popleft()
 
     def _check_familiar(self) -> None:
-        if self._process.strange is None or self._settings.unfamiliar != STOP:
+        if self._process.strange is None or not is_unfamiliar(strange := self._smoother.add(self._process.strange)):
             return
-        if is_unfamiliar(strange := self._smoother.add(self._process.strange)):
-            self._queue.clear()
+        if self._settings.unfamiliar == STOP:
             raise DriveFault(unfamiliar(strange), remedy=RECORD_HERE)
+        if self._settings.unfamiliar == WARN and not self._warned:
+            self._warned = True
+            _log.warning(unfamiliar(strange))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return (B, chunk, 2) float32 [steering, throttle], clipped as `rover drive` clips it.
 
         batch: has `observation.images.<camera>`, (B, 3, h, w) float in [0, 1] RGB, and `observation.state`, (B, 2).
-        Raises PolicyError if one of them is missing, and for a prediction that is not finite or far out of range.
+        Raises PolicyError if one of them is missing, and for a prediction that is not finite or far out of range;
+        DriveFault where the policy has seen nothing like its pictures, unless params.yml has it otherwise.
         """
         camera = f"{OBS_IMAGES}.{self._camera}"
         if not {camera, OBS_STATE} <= set(batch):
@@ -100,6 +102,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         for picture, state in zip(pictures.permute(0, 2, 3, 1).numpy(), states, strict=True):
             actions = self._process.predict(np.ascontiguousarray(picture[..., ::-1]), state)
             self._plans += 1
+            self._check_familiar()
             chunks.append(Plan(self._plans, 0.0, 0.0, actions, self._limits).actions)
         return torch.from_numpy(np.stack(chunks).astype(np.float32))
 

@@ -193,8 +193,8 @@ def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
             what, found = "another camera", f"{width}x{height} beside {shapes[0][0]}x{shapes[0][1]}"
         for episode in recordings.episodes:
             rate_hz = recorded.frame_rate_hz(episode.samples)
-            if not episode.samples[0].car.drives_like(read[0].episodes[0].samples[0].car):
-                what, found = "another car", episode.id
+            if unlike := episode.samples[0].car.unlike(read[0].episodes[0].samples[0].car):
+                what, found = "another car", f"{episode.id}: {unlike}"
             elif recorded.is_another_rate(rate_hz, plans_hz):
                 what, found = "another rate", f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan"
         if what:

@@ -1,7 +1,7 @@
-"""Is a stuck car stopped, and no other? `python -m lab.driving.stuck OUTPUT RUN [RECORDINGS]`.
+"""Is a stuck car stopped, and no other? `python -m lab.driving.stuck OUTPUT RUN_OR_ARTIFACT [RECORDINGS]`.
 
 The loop of `rover drive`, in virtual time, drives a policy through unseen balloon worlds: freely, and against a wall.
-Recordings are watched as they were driven.
+Recordings are watched as they were driven, and in kinds of light: driving, and standing at one of their pictures.
 """
 
 import sys
@@ -16,7 +16,7 @@ import numpy as np
 from balloon_world.drives import NoLog, TimedCar, everywhere
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
-from rover_lib.onboard.drive.motion import EVERY_S, MOVED, Motion
+from rover_lib.onboard.drive.motion import EVERY_S, MOVED, Motion, cells_of, difference
 from rover_lib.onboard.drive.plan import OFF, Settings
 from rover_lib.onboard.errors import DriveFault
 from rover_lib.onboard.params import params
@@ -27,6 +27,13 @@ from rover_lib.workshop.recordings.samples import Sample
 
 SEED, LATENCY_S, WITHIN_S = 40_000, 0.15, 2.0
 NOISE = 3  # grey levels of the camera's, as balloon_world/car.py has
+Light = tuple[float | None, float, float]  # a picture's mean (None: as it is), its noise, and a lamp's flicker
+LIGHTS: dict[str, Light] = {
+    **{f"mean {mean}, noise {noise}": (mean, noise, 0.0) for mean in (180, 60, 40, 25, 16, 10) for noise in (2, 4, 8)},
+    **{f"flickers by {share:.0%}": (None, 2.0, share) for share in (0.05, 0.1, 0.2, 0.3)},
+    "mean 25, noise 8, flickers by 10%": (25, 8.0, 0.1),
+}
+ROWS_S, STAND_PICTURES = 0.025, 20  # time in which a camera reads its rows; 2 s
 
 
 class _Walled(World):
@@ -78,6 +85,29 @@ def watch_recording(samples: Sequence[Sample], stuck_s: float) -> dict[str, Any]
     return {"stopped": False, "longest_still_s": round(longest_s, 2)}
 
 
+def in_light(image: np.ndarray, light: Light, at_s: float, rng: Any) -> np.ndarray:
+    """Return a picture of 640x480 as a camera would give it in that light, (480, 640, 3) uint8, after JPEG."""
+    mean, noise, flicker = light
+    shown = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    shown *= mean / max(float(shown.mean()), 1.0) if mean else 1.0
+    row_s = at_s + np.arange(480) / 480 * ROWS_S
+    shown *= (1 + flicker * np.sin(2 * np.pi * 100 * row_s))[:, None, None].astype(np.float32)
+    shown += noise * rng.standard_normal(shown.shape, np.float32)
+    packed = cv2.imencode(".jpg", np.clip(shown, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
+
+
+def watch_in_light(samples: Sequence[Sample], light: Light) -> tuple[float, float]:
+    """Return the largest difference that a standing car sees in 2 s, and the least that a driving one sees in 0.5 s."""
+    rng, times_s = np.random.default_rng(0), [sample.time_s for sample in samples]
+    at_s = np.arange(times_s[0], times_s[-1], EVERY_S)[:STAND_PICTURES].tolist()
+    seen = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]
+    drives = [cells_of(in_light(image, light, 1.003 * t, rng)) for t, image in zip(at_s, seen, strict=True)]
+    stands = [cells_of(in_light(seen[len(seen) // 2], light, 1.003 * t, rng)) for t in at_s]
+    moved = [max(difference(now, drives[i]) for now in drives[i + 1 : i + 6]) for i in range(len(drives) - 5)]
+    return max(difference(now, stands[0]) for now in stands[1:]), min(moved)
+
+
 def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 200) -> dict[str, Any]:
     """Return the metrics of stage `stuck`. artifact: drives. recordings: a folder of recordings, or None."""
     cv2.setNumThreads(1)
@@ -95,10 +125,16 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
         "moved_limit": MOVED,
     }
     episodes, stuck_s = load_recordings(recordings).episodes if recordings else (), params()["drive"]["stuck_s"]
-    return metrics | {episode.path.name: watch_recording(episode.samples, stuck_s) for episode in episodes}
+    metrics |= {episode.path.name: watch_recording(episode.samples, stuck_s) for episode in episodes}
+    if episodes:
+        metrics["lights"] = {}
+        for name, light in LIGHTS.items():
+            stands, drives = zip(*(watch_in_light(e.samples, light) for e in episodes), strict=True)
+            metrics["lights"][name] = {"standing_most": round(max(stands), 2), "driving_least": round(min(drives), 2)}
+    return metrics
 
 
 if __name__ == "__main__":
     output, run_dir, *more = map(Path, sys.argv[1:])
-    found = study(run_dir / "policy_static.pt", more[0] if more else None)
+    found = study(run_dir if run_dir.is_file() else run_dir / "policy_static.pt", more[0] if more else None)
     write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=found)

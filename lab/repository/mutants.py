@@ -1,23 +1,31 @@
-"""Break single lines, each in a copy, and see that a named test fails: `make mutants`.
+"""Plant slips, each in a copy, and see that a test fails: `make mutants`.
 
-The lines are in planted/*.yml, a file for each subject. A row has a `name`, a `file`, the `good` text that stands in it
-once, the `bad` text that takes its place, and the `test` file whose tests that match `words` (pytest's -k) must fail;
-with `random: true`, random drives must notice it too. To add lines of another subject, add a file.
+A program draws lines of the judging, quantizing, recording, learning and driving code, each file in proportion to its
+lines, and plants a slip in each: a `<` becomes a `<=`, a 3 a 4, an `and` an `or`. cosmic-ray finds and makes the slips
+(mutmut, tried too, rewrites each function for a process that forks, which our tests' own processes and threads do not
+survive). The tests that run are those of the file's name, of its room, and those that import it; a slip is caught if
+one fails, or hangs. What survives needs a test, or a reason in survivors.yml.
 
-A line that can be broken unnoticed is a line that no test holds.
+What cosmic-ray cannot do stands in planted.yml: lines of the firmware, and lines that random drives must notice. A row
+has a `name`, a `file`, the `good` text that stands in it once, the `bad` text that takes its place, and the `test` file
+whose tests that match `words` (pytest's -k) must fail; with `random: true`, random drives must notice it too.
 """
 
 import os
+import random
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
+from typing import Any
 
 import yaml
 
@@ -32,12 +40,98 @@ from lab.driving.random_drives import random_drives
 raise SystemExit({NOTICED} * any(random_drives(range(i, i + 100))["broken"] for i in range(0, {RANDOM_DRIVES}, 100)))
 """
 PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
-PLANTED = Path(__file__).with_name("planted")
+FAST, SLOW = "not slow and not release and not emulated", "slow and not release"
+HANGS_S = 900.0  # a slip may make a loop endless; then it is caught
+HERE = Path(__file__).parent
+ROOMS = (
+    *(f"rover_lib/workshop/{room}" for room in ("judge", "int8", "checkpoint", "recordings", "run")),
+    *(f"rover_lib/onboard/{room}" for room in ("drive", "car", "policy", "artifact", "recording")),
+    "rover_lib/onboard/care/release.py",
+    "rover_learn",
+    "rover_exchange",
+)
+# Slips that a person makes. Others of cosmic-ray fail at once: a decorator that is gone, or a + that becomes >>.
+SLIPS = re.compile(
+    r"core/(AddNot|NumberReplacer|ZeroIterationForLoop|Replace(TrueWithFalse|FalseWithTrue|AndWithOr|OrWithAnd"
+    r"|BreakWithContinue|ContinueWithBreak|BinaryOperator_(Add_Sub|Sub_Add|Mul_Div|Div_Mul|FloorDiv_Div|Mod_FloorDiv"
+    r"|Pow_Mul|BitAnd_BitXor|LShift_RShift|RShift_LShift)|UnaryOperator_(USub_UAdd|Delete_Not|Delete_USub)"
+    r"|ComparisonOperator_(Lt_LtE|Lt_GtE|LtE_Lt|LtE_Gt|Gt_GtE|Gt_LtE|GtE_Gt|GtE_Lt|Eq_NotEq|NotEq_Eq|Is_IsNot|IsNot_Is)))"
+)
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A line that cosmic-ray can break. occurrence: of the operator in the file."""
+
+    file: str
+    line: int
+    operator: str
+    occurrence: int
+
+    def plant(self, good: str) -> str:
+        """Return the file's text with the slip in it."""
+        from cosmic_ray import mutating, plugins
+
+        return mutating.mutate_code(good, plugins.get_operator(self.operator)(), self.occurrence) or good
+
+    def told(self, good: str) -> str:
+        """Say what becomes of the line."""
+        before, after = (text.splitlines()[self.line - 1].strip() for text in (good, self.plant(good)))
+        return f"{self.file}:{self.line}: {before}  ->  {after}"
+
+
+def slips_in(file: str) -> list[Slip]:
+    """Return all slips that may be planted in a file."""
+    from cosmic_ray import ast, plugins
+
+    nodes, found = list(ast.ast_nodes(ast.get_ast((REPOSITORY / file).read_text()))), []
+    for name in filter(SLIPS.fullmatch, plugins.operator_names()):
+        operator = plugins.get_operator(name)()
+        lines = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
+        found += [Slip(file, line, name, occurrence) for occurrence, line in enumerate(lines)]
+    return found
+
+
+def draw_slips(count: int, seed: int) -> list[Slip]:
+    """Draw slips, files in proportion to their lines, one on a line. The first of a longer draw are the same."""
+    paths = [path for room in ROOMS for path in sorted((REPOSITORY / room).rglob("*.py")) or [REPOSITORY / room]]
+    files = [path.relative_to(REPOSITORY).as_posix() for path in paths]
+    sizes = [len(path.read_text().splitlines()) for path in paths]
+    there = {file: slips_in(file) for file in files}
+    chance, drawn = random.Random(seed), dict[tuple[str, int], Slip]()
+    while len(drawn) < count:
+        (file,) = chance.choices(files, sizes)
+        if lines := sorted({slip.line for slip in there[file]}):
+            line = chance.choice(lines)
+            slip = chance.choice([slip for slip in there[file] if slip.line == line])
+            if _compiles(slip.plant((REPOSITORY / file).read_text())):
+                drawn.setdefault((file, line), slip)
+    return list(drawn.values())
+
+
+def _compiles(text: str) -> bool:
+    try:
+        compile(text, "a slip", "exec")
+    except SyntaxError:
+        return False
+    return True
+
+
+def tests_of(file: str) -> list[str]:
+    """Return the tests that may notice a slip in a file: of its name, of its room, and those that import it."""
+    path = Path(file)
+    tests, module = REPOSITORY / "tests", file.removesuffix(".py").replace("/", ".")
+    room = tests / path.parent.as_posix().removeprefix("rover_lib/")
+    package, _, stem = module.rpartition(".")
+    imported = re.compile(rf"(from|import) {re.escape(module)}\b|from {re.escape(package)} import .*\b{stem}\b")
+    named = sorted(tests.rglob(f"test_{path.stem}.py"))
+    others = [t for t in sorted(tests.rglob("test_*.py")) if t.parent == room or imported.search(t.read_text())]
+    return [test.relative_to(REPOSITORY).as_posix() for test in dict.fromkeys((*named, *others))]
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A line that is broken: a row of planted/*.yml."""
+    """A line that is broken by hand: a row of planted.yml."""
 
     name: str
     file: str
@@ -49,9 +143,8 @@ class Mutant:
 
 
 def read_mutants() -> list[Mutant]:
-    """Read the tables of mutants, in the order of their files' names."""
-    tables = [yaml.safe_load(path.read_text()) for path in sorted(PLANTED.glob("*.yml"))]
-    return [Mutant(**row) for table in tables for row in table]
+    """Read the table of mutants."""
+    return [Mutant(**row) for row in yaml.safe_load((HERE / "planted.yml").read_text())]
 
 
 def make_copy(folder: Path) -> None:
@@ -63,14 +156,76 @@ def make_copy(folder: Path) -> None:
 
 
 def exit_code(folder: Path, *arguments: str) -> int:
-    """Run Python in a copy; return its exit code. Raises RoverError if what was planted cannot be compiled."""
+    """Run Python in a copy; return its exit code, 1 if it hangs. Raises RoverError if C cannot be compiled."""
     env = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": str(folder / ".cache")}
-    done = subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=os.environ | env, capture_output=True, text=True, errors="replace"
-    )
+    options: dict[str, Any] = {"cwd": folder, "env": os.environ | env, "capture_output": True, "timeout": HANGS_S}
+    try:
+        done = subprocess.run([sys.executable, *arguments], text=True, errors="replace", **options)
+    except subprocess.TimeoutExpired:
+        return 1
     if "gcc failed" in (said := done.stdout + done.stderr):
         raise RoverError("what was planted cannot be compiled", found=said[-2000:])
     return done.returncode
+
+
+class Copies:
+    """Copies of the repository, one for each job, in which lines are broken."""
+
+    def __init__(self, scratch: Path, jobs: int):
+        self._free: Queue[Path] = Queue()
+        for job in range(jobs):
+            make_copy(scratch / str(job))
+            self._free.put(scratch / str(job))
+
+    @contextmanager
+    def broken(self, file: str, change: Callable[[str], str]) -> Iterator[Path]:
+        """Yield a copy in which a file is changed."""
+        copy = self._free.get()
+        path = copy / file
+        good = path.read_text()
+        try:
+            path.write_text(change(good))
+            yield copy
+        finally:
+            path.write_text(good)
+            self._free.put(copy)
+
+
+def try_slips(slips: Sequence[Slip], jobs: int, slow: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """Plant each slip and see whether a test fails. Returns how many were caught, and what survived.
+
+    slow: run the room's slow tests too, on what the others did not notice. Raises RoverError if the tests fail without
+    slips. A survivor that survivors.yml gives a reason is not counted.
+    """
+    reasons = {row["slip"]: row["why"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
+    with tempfile.TemporaryDirectory(prefix="rover-slips-") as scratch, ThreadPoolExecutor(jobs) as pool:
+        copies = Copies(Path(scratch), jobs)
+
+        def attempt(slip: Slip) -> bool:
+            begin_s, tests = time.monotonic(), tests_of(slip.file)
+            with copies.broken(slip.file, slip.plant) as copy:
+                caught = bool(tests) and exit_code(copy, *PYTEST, "-m", FAST, *tests) not in (0, 5)
+                if not caught and slow:
+                    caught = exit_code(copy, *PYTEST, "-m", SLOW, *tests) not in (0, 5)
+            told = slip.told((REPOSITORY / slip.file).read_text())
+            outcome = "caught" if caught else "has a reason" if _key(told) in reasons else "SURVIVED"
+            say(f"{outcome}: {told} ({time.monotonic() - begin_s:.0f} s)")
+            return caught
+
+        whole = sorted({test for slip in slips for test in tests_of(slip.file)})
+        with copies.broken(slips[0].file, str) as copy:
+            if exit_code(copy, *PYTEST, "-m", FAST, *whole):
+                raise RoverError("tests fail without slips", remedy="run make test-fast")
+        caught = list(pool.map(attempt, slips))
+    told = [slip.told((REPOSITORY / slip.file).read_text()) for slip, c in zip(slips, caught, strict=True) if not c]
+    survived = [text for text in told if _key(text) not in reasons]
+    counted = sum(caught) + len(survived)
+    return {"slips": len(slips), "caught_pct": 100 * sum(caught) / max(counted, 1), "survived": survived}
+
+
+def _key(told: str) -> str:
+    """Return what survivors.yml calls a slip: without its line's number, which changes."""
+    return re.sub(r":\d+:", ":", told, count=1)
 
 
 def try_mutants(
@@ -85,25 +240,17 @@ def try_mutants(
         if (count := (REPOSITORY / mutant.file).read_text().count(mutant.good)) != 1:
             raise RoverError(f"{mutant.file}: {mutant.good!r} is there {count} times", remedy=f"mend {mutant.name!r}")
     with tempfile.TemporaryDirectory(prefix="rover-mutants-") as scratch, ThreadPoolExecutor(jobs) as pool:
-        copies: Queue[Path] = Queue()
-        for job in range(jobs):
-            make_copy(Path(scratch, str(job)))
-            copies.put(Path(scratch, str(job)))
+        copies = Copies(Path(scratch), jobs)
         words = " or ".join(sorted({m.words for m in mutants}))
-        if exit_code(copies.queue[0], *PYTEST, "-k", words, *sorted({m.test for m in mutants})):
-            raise RoverError("the named tests fail without mutants", remedy="run them")
+        with copies.broken(mutants[0].file, str) as copy:
+            if exit_code(copy, *PYTEST, "-k", words, *sorted({m.test for m in mutants})):
+                raise RoverError("the named tests fail without mutants", remedy="run them")
 
         def attempt(mutant: Mutant) -> tuple[bool, bool | None]:
-            copy, begin_s = copies.get(), time.monotonic()
-            path = copy / mutant.file
-            good = path.read_text()
-            try:
-                path.write_text(good.replace(mutant.good, mutant.bad))
+            begin_s = time.monotonic()
+            with copies.broken(mutant.file, lambda good: good.replace(mutant.good, mutant.bad)) as copy:
                 caught = exit_code(copy, *PYTEST, "-k", mutant.words, mutant.test) == 1  # 5: no test has that name
                 noticed = exit_code(copy, "-c", DRIVE) == NOTICED if drives and mutant.random else None
-            finally:
-                path.write_text(good)
-                copies.put(copy)
             by_drives = {None: "", True: ", noticed by random drives", False: ", NOT noticed by random drives"}[noticed]
             seconds = time.monotonic() - begin_s
             say(f"{'caught' if caught else 'SURVIVED'}{by_drives}: {mutant.name} ({seconds:.0f} s)")

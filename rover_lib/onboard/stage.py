@@ -105,10 +105,12 @@ def read_plain(path: Path | str, most_bytes: int = FILE_BYTES) -> bytes:
 
 
 def private_lock(path: Path | str) -> FileLock:
-    """Return a lock that no other user can open, and so hold. Older versions left some that anybody could."""
-    with contextlib.suppress(FileNotFoundError):
-        if Path(path).stat().st_mode & 0o077:
-            Path(path).unlink()
+    """Return a lock that no other user can open, and so hold. Older versions left some that anybody could.
+
+    It is never removed: on exFAT and mounted Windows folders each file shows rights for others, and it may be held.
+    """
+    with contextlib.suppress(OSError):
+        Path(path).chmod(0o600)
     return FileLock(path, timeout=0, mode=0o600, thread_local=False)
 
 

@@ -1,6 +1,7 @@
 """An artifact as a policy of LeRobot: the same actions as by our own loader, from LeRobot's own factories."""
 
 import importlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -14,6 +15,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot_robot_rover import RoverArtifactConfig, modeling_rover_artifact
 from lerobot_robot_rover.__main__ import main, pack
 from lerobot_robot_rover.line import ENDING
+from rover_lib.onboard.drive.pilot import unfamiliar
 from rover_lib.onboard.errors import DriveFault, ParamsError, PolicyError
 from rover_lib.onboard.policy.load import load_policy
 
@@ -42,7 +44,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_it_gives_what_our_own_loader_gives(artifacts, monkeypatch):
+def test_it_gives_what_our_own_loader_gives(artifacts, monkeypatch, caplog):
     """Of the tiny policy, through LeRobot's whole path from a robot's observation to an action."""
     now = [1000.0]
     monkeypatch.setattr(modeling_rover_artifact, "boottime", lambda: now[0])
@@ -74,8 +76,15 @@ def test_it_gives_what_our_own_loader_gives(artifacts, monkeypatch):
     np.testing.assert_allclose(act(pictures[3]), chunks[1][0], atol=1e-6)
     policy.reset()
     policy._process = SimpleNamespace(predict=policy._process.predict, strange=1.01)
-    with pytest.raises(DriveFault, match="seen nothing like these pictures"):
-        act(pictures[0])
+    batch = {f"observation.images.{ours.cameras[0]}": torch.zeros(1, 3, height, width)}
+    batch["observation.state"] = torch.zeros(1, 2)
+    for ask in (lambda: act(pictures[0]), lambda: policy.predict_action_chunk(batch)):
+        with pytest.raises(DriveFault, match="seen nothing like these pictures"):
+            ask()
+    policy._settings = replace(policy._settings, unfamiliar="warn")
+    for _ in range(2):
+        policy.predict_action_chunk(batch)
+    assert [r.message for r in caplog.records if "seen nothing like" in r.message] == [unfamiliar(1.01)]
 
 
 @pytest.mark.slow

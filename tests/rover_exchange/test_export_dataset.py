@@ -5,7 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from command import rover
 from recorded import record_there_and_back
 from test_episodes import burst, edit, load, record, redrawn
 
-from rover_exchange.export_dataset import export_dataset, lerobot_video
+from rover_exchange.export_dataset import _parts, export_dataset, lerobot_video
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
@@ -206,3 +208,15 @@ def test_a_dataset_of_another_car_is_read_as_its_own(tmp_path, monkeypatch):
         with pytest.raises(EpisodeError, match=word):
             export_dataset(tmp_path / folder, tmp_path / "new")
         assert not (tmp_path / "new").exists()
+
+
+def test_a_part_ends_at_a_gap_and_where_a_plan_does():
+    def sample(row, ends=False):
+        return SimpleNamespace(row=row, is_pad=[False, ends], driver="human", frame_bgr=lambda: PICTURE)
+
+    rows = [sample(0), sample(1), sample(2), sample(5), sample(6, ends=True), sample(7)]
+    parts = _parts(SimpleNamespace(samples=rows), None, PICTURE.shape, Counter())
+    assert [[sample.row for sample, _ in part] for part in parts] == [[0, 1, 2], [5, 6], [7]]
+
+
+PICTURE = np.zeros((18, 32, 3), np.uint8)

@@ -134,6 +134,7 @@ def shifted():
         ("another camera", {"size": (64, 64)}),
         ("another rate", {"rate_hz": 15}),  # a plan has 30 steps a second: the car would do all in half the time
         ("another car", {"car": shifted()}),
+        ("another car, found episode_9.: steering .1 turns", {"car": replace(Car(), positive="left")}),
     ],
 )
 def test_recordings_that_do_not_belong_to_the_old_ones_are_refused(says, options, car_policy, old, tmp_path):

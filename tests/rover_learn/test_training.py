@@ -10,8 +10,21 @@ from policies import normalise
 from torch import nn
 
 from rover_learn import training
-from rover_learn.augment import GAIN
-from rover_learn.training import Best, Machine, Phase, RepeatablePool, Resumable, RowFile, normalised
+from rover_learn.augment import GAIN, Augmentation
+from rover_learn.training import (
+    ACTION,
+    IMAGE,
+    STATE,
+    Best,
+    Frames,
+    Machine,
+    Phase,
+    RepeatablePool,
+    Resumable,
+    RowFile,
+    batch_of,
+    normalised,
+)
 from rover_lib.onboard.errors import TrainingError
 
 STEPS, CPU = 6, Machine(torch.device("cpu"))
@@ -188,3 +201,17 @@ def test_a_device_is_chosen_or_refused(monkeypatch, asked, gpus, gives):
     else:
         machine = Machine.of(asked)
         assert str(machine.device) == gives and (machine.workers > 0) == (machine.device.type == "cuda")
+
+
+def test_a_mirrored_sample_is_mirrored_whole():
+    """Picture, state and actions: a state that kept its side would tell the policy the wrong one."""
+    pictures = np.random.default_rng(0).integers(0, 256, (32, 2, 3, 3), np.uint8)
+    states, chunks = np.tile(np.float32([0.5, 0]), (32, 1)), np.tile(np.float32([0.25, 0.1]), (32, 4, 1))
+    kept = dict(enumerate(pictures))
+    data = Frames((None,) * 32, (2, 3), states, chunks, np.zeros((32, 4), bool), None, kept)
+    batch = batch_of(data, np.arange(32), np.random.default_rng(0), CPU.device, Augmentation(), 0.5)
+    for i, image in enumerate(batch[IMAGE].numpy()):
+        side = 1 if np.array_equal(image, pictures[i]) else -1
+        assert np.array_equal(image, pictures[i][:, ::side])
+        assert batch[STATE][i].tolist() == [side * 0.5, 0]
+        assert np.array_equal(batch[ACTION][i], np.tile(np.float32([side * 0.25, 0.1]), (4, 1)))

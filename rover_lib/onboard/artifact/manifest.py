@@ -46,6 +46,7 @@ MOST_VECTORS = 16
 LARGEST_TOLERANCE = {"fp32": 1e-3, "int8": 0.3}
 CAR_ACTIONS = ("steering", "throttle")
 MOST_SIZE = 4096  # of an embedding
+DIVISORS = ("familiar_spread", "familiar_limits")  # with a negative one nothing would be unfamiliar
 
 
 def _are_names(values: Any) -> bool:
@@ -206,6 +207,8 @@ class Artifact:
                 raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
             if not np.isfinite(found).all():
                 raise refused(self.path, "its parity vectors are not finite", name)
+            if name in DIVISORS and not (found > 0).all():
+                raise refused(self.path, f"its {name} must be above 0", f"{found.min():g}")
         return vectors
 
     @property

@@ -44,14 +44,14 @@ def measure(
     *,
     notify: Callable[[str], None] = lambda text: None,
     sleep: Callable[[float], None] = time.sleep,
-    positive: str | None = None,
+    positive: str = "right",
     **more: Any,
 ) -> Car:
     """Lead a human through the ends and centres of steering and throttle; return the measured car.
 
     ask: tells the human what to do, and returns when it is done. notify: is told what was measured. positive: the side
-    that positive steering turns to; None: that of the longer pulse. more: `name`, `camera` and `wheelbase_m` of
-    car.yml. Raises CarError if the values do not make a car; LinkError like the link.
+    that positive steering turns to, by default as on the recorded car, however the servo is mounted. more: `name`,
+    `camera` and `wheelbase_m` of car.yml. Raises CarError if the values do not make a car; LinkError like the link.
     """
     Car.of({**DEFAULT, **more}, "what was given")  # so that mistakes in it are reported before the human does anything
     ask("Take the wheels off the ground and unplug the motor. Switch the transmitter on, and let go of it.")
@@ -77,7 +77,7 @@ def measure(
         "left_us": ends["left"],
         "neutral_us": steering_us,
         "right_us": ends["right"],
-        "positive": positive or ("right" if ends["right"] > ends["left"] else "left"),
+        "positive": positive,
     }
     throttle = {"period_us": periods_us[1], "neutral_us": throttle_us, "forward_us": ends["forward"]}
     if abs(ends["back"] - throttle_us) > RETURNS_US and not fast:

@@ -125,9 +125,15 @@ class Car:
         return round(WIDTH_PX / 2 / math.tan(math.radians(self.field_of_view_deg) / 2), 2)
 
     def drives_like(self, other: "Car") -> bool:
-        """Whether both are equal but for the name, the cap, the human, and which side is called left."""
+        """Whether both are equal but for the name, the cap and the human."""
+        return not self.unlike(other)
+
+    def unlike(self, other: "Car") -> str:
+        """Say in which way another car drives otherwise with the same actions; "" if it does not."""
+        if self.positive != other.positive:
+            return f"steering +1 turns {self.name!r} {self.positive} and {other.name!r} {other.positive}"
         mine, others = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
-        return mine == others
+        return "" if mine == others else f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
 
     @property
     def pulses_us(self) -> tuple[int, ...]:

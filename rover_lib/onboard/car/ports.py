@@ -15,6 +15,14 @@ def list_ports(dev: Path = DEV) -> dict[Path, str]:
     return {port: names.get(port.resolve(), "") for kind in KINDS for port in sorted(dev.glob(kind))}
 
 
+def other_ports(port: str, dev: Path = DEV) -> str:
+    """Say which other USB serial ports there are, "" if none: udev gives two that are alike the Arduino's one name."""
+    asked = Path(port).resolve()
+    others = [f"{path} ({name})" if name else str(path) for path, name in list_ports(dev).items()]
+    others = [text for text in others if text.split()[0] != str(asked)]
+    return f"{asked} was asked, and there is also {', '.join(others)}: unplug it, or try --port" if others else ""
+
+
 def find_port(dev: Path = DEV) -> str:
     """Return the port of the only Arduino: the provisioned name, else the only USB serial port.
 

@@ -23,7 +23,7 @@ import serial
 
 from rover_lib.onboard.car.car import DEFAULT_NUMBERS, PERIOD_MIN_US, PULSE_MIN_US, Car, this_car
 from rover_lib.onboard.car.gamepad import Gamepad, open_gamepad
-from rover_lib.onboard.car.ports import find_port
+from rover_lib.onboard.car.ports import find_port, other_ports
 from rover_lib.onboard.car.protocol import (
     LINE_MAX,
     MISSING,
@@ -155,6 +155,7 @@ class ServoLink:
             if now - opened > BOOT_S:
                 flash = f"make -C firmware flash PORT={shlex.quote(str(self.port))}"
                 remedy = f"is it the rover's, and is the firmware on it ({flash})?"
+                remedy = other_ports(self.port) or remedy
                 raise LinkError(f"{self.port}: no hello from an Arduino within {BOOT_S:g} s", remedy=remedy)
             # If it goes on talking, opening the port did not reset it. A boot loader must not be talked to.
             due = SILENT_S if running and running.host_s - opened > SILENT_S / 2 else BOOT_S / 2

@@ -29,13 +29,14 @@ from rover_lib.onboard.car.servo_link import PROTOCOL_VERSION, ServoLink, Teleme
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import blank, frozen
-from rover_lib.onboard.drive.plan import Settings
+from rover_lib.onboard.drive.plan import STOP, Settings
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.params import params
 
 NAME_WIDTH = 15
 RATE_SHARE = 0.9  # of the requested frame rate must be reached
 SETTLE_S, MEASURE_S = 0.5, 1.0  # a camera first has to find its exposure
+LATEST = {"frozen_frames": 30, "black_frames": 30, "stuck_s": 10, "undervoltage_s": 60}  # more is as good as off
 ROUND_TRIPS = 20
 SLOW_MS = 20.0  # an answer takes 3 to 8 ms: 40 bytes at 115200 baud and the USB adapter's 1 ms
 SIGNAL_S = 1.0
@@ -93,6 +94,7 @@ def examine(
         "Arduino": lambda: arduino(port or find_port()),
         "ModemManager": lambda: modem_manager(host.proc_root),
         "car": lambda: car(manifest),
+        "stops": lambda: stops(manifest),
         "artifact": lambda: policy(artifact),
         "power": lambda: power(host),
         "governor": lambda: governor(host.sys_root),
@@ -241,9 +243,23 @@ def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
         open_gamepad().close()
         found = ", ".join(map(str, list_gamepads()))
         yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
-    if manifest and not (meant := car_of(manifest)).drives_like(this):
+    if manifest and (unlike := (meant := car_of(manifest)).unlike(this)):
         remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
-        yield Check("car", "warning", f"the artifact was calibrated for {meant.name!r}", remedy)
+        found = f"the artifact was calibrated for another car: {unlike}"
+        yield Check("car", "warning" if meant.positive == this.positive else "fail", found, remedy)
+
+
+def stops(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
+    """Name the stops that params.yml switches off, or delays by so much that they are. manifest: the artifact's."""
+    settings = Settings.of(params()["drive"])
+    off = [] if settings.unfamiliar == STOP else [f"unfamiliar: {settings.unfamiliar}"]
+    off += [f"{name}: 0" for name in ("stuck_s", "undervoltage_s") if not getattr(settings, name)]
+    off += [f"{name}: {value:g}" for name in ("black_level", "flat_level") if (value := getattr(settings, name)) <= 0]
+    off += [f"{name}: {value}" for name, most in LATEST.items() if (value := getattr(settings, name)) > most]
+    if manifest is not None and "familiar" not in manifest:
+        off.append("unfamiliar: this artifact knows no limit")
+    found = f"off or late: {', '.join(off)}" if off else "all that params.yml may switch off are on"
+    yield warn_unless(not off, "stops", found, "see drive in params.yml, and docs/safety.md for what each prevents")
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:

@@ -129,7 +129,7 @@ class Releases:
     def verify(self, name: str = "current", confined: bool = False) -> None:
         """Check that a release's bytes are intact, and that it computes correctly here (parity vectors).
 
-        confined: give up every right that no inference needs before, for good. Raises RoverError.
+        confined: in a process that has given up every right that no inference needs. Raises RoverError.
         """
         path = self.path_of(name)
         if not path.exists():
@@ -137,9 +137,9 @@ class Releases:
         if wrong := self.wrong_with(path.parent.resolve().name):
             raise RoverError(f"{path}: {wrong}", remedy="deploy it again")
         if confined:
-            from rover_lib.onboard.policy.confined import load_confined
+            from rover_lib.onboard.policy.confined import run_confined
 
-            load_confined({name: path}, threads=os.cpu_count() or 1)
+            run_confined(load_only, path=str(path))
         else:
             from rover_lib.onboard.policy.load import load_policy
 
@@ -309,6 +309,13 @@ class Releases:
         names = sorted(p.name for p in self.releases.glob("*") if NAME.fullmatch(p.name))
         used = dict.fromkeys([self.current, *reversed(self._history())])
         return [n for n in used if n in names] + [n for n in names if n not in used]
+
+
+def load_only(path: str) -> None:
+    """Load an artifact in a process that confines itself: for run_confined()."""
+    from rover_lib.onboard.policy.confined import load_confined
+
+    load_confined({"artifact": path}, threads=os.cpu_count() or 1)
 
 
 def check_in_sandbox(name: str) -> None:

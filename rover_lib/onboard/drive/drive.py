@@ -25,10 +25,12 @@ from rover_lib.onboard.drive.plan import Commanded, Settings
 from rover_lib.onboard.drive.service import Service
 from rover_lib.onboard.drive.session import DriveOptions, Session
 from rover_lib.onboard.drive.watch import exit_if_hung, stop_on_signals
+from rover_lib.onboard.errors import CarError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.signal_event import SignalEvent
 from rover_lib.onboard.status_line import StatusLine
 
+MIRRORED = "calibrate with recordings of this car, or LeRobot's where its car.yml is; see docs/build.md"
 REST_S = 1.0  # between plans while the car is not driving
 
 
@@ -45,6 +47,7 @@ def drive_car(
         # Resolved: `current` may point to another one later. Opened first: it may be missing, or no artifact.
         artifact = stack.enter_context(Artifact(options.artifact.resolve()))
         seen = seen_size(artifact.manifest)
+        warning = another_car(artifact.manifest, this_car())
         log = stack.enter_context(open_flight_log(options, settings, report))
         most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
         log.event(f"one picture drives the car for {most_m:.1f} m at most, at throttle {settings.throttle_limit:g}")
@@ -67,8 +70,8 @@ def drive_car(
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)
-        if sentence := another_car(policy.manifest, this_car()):
-            log.event(sentence, level=logging.WARNING)
+        if warning:
+            log.event(warning, level=logging.WARNING)
         commanded = Commanded()
         planner = Planner(
             camera, policy, commanded,
@@ -85,8 +88,13 @@ def drive_car(
 
 
 def another_car(manifest: dict[str, Any], this: Car) -> str:
-    """Return a warning if an artifact was calibrated for another car, else "". It may drive all the same."""
+    """Return a warning if an artifact was calibrated for another car, else "". It may drive all the same.
+
+    Raises CarError if positive steering turns the other car to the other side, so that this one would steer mirrored.
+    """
     meant = car_of(manifest)
+    if meant.positive != this.positive:
+        raise CarError(f"this policy would steer mirrored: {meant.unlike(this)}", remedy=MIRRORED)
     if meant.drives_like(this):
         return ""
     return f"this policy was calibrated for {meant.name!r}, and this car is {this.name!r}: see that the way is free"

@@ -116,16 +116,19 @@ class FlightLog:
         start = {"start": datetime.now().astimezone().isoformat(), "start_monotonic_s": self.start_s}
         self._header = {"schema": SCHEMA, "kind": "header", **start, "columns": Tick._fields, "drive": header}
         self._max_bytes, self._keep, self._clock, self._host = max_bytes, keep, clock, host or Host()
-        self._rows: deque[Tick | Event] = deque(maxlen=QUEUE_ROWS)
+        self._rows: deque[Tick | Event | dict[str, Any]] = deque(maxlen=QUEUE_ROWS)
         self._lock: BaseFileLock | None = None
         self._closing = threading.Event()
         self._writer = threading.Thread(target=self._write, name="flight log", daemon=True)
+        # Another one, because a low supply must stop the car on a full or stuck disk too.
+        self._reader = threading.Thread(target=self._read_machine, name="supply and heat", daemon=True)
         # Only the writing thread uses these, once it runs:
         self._file: FileIO | None = None
         self._lines: deque[bytes] = deque()  # not written yet
 
     def __enter__(self) -> "FlightLog":
         self._take_lock()
+        self._reader.start()
         self._writer.start()
         return self
 
@@ -166,6 +169,8 @@ class FlightLog:
         closing = failed = False
         while not closing:
             closing = self._closing.wait(RETRY_S if failed else SYNC_S)
+            if closing:
+                self._reader.join(CLOSE_S / 4)  # for its last row
             try:
                 if not self._lines:  # while the disk takes nothing, the queue drops the oldest
                     self._collect()
@@ -180,13 +185,19 @@ class FlightLog:
                 self._close_file()
         self._close_file()
 
+    def _read_machine(self) -> None:
+        """Read the machine's state about once a second."""
+        while True:
+            now_s = self._clock() - self.start_s
+            vcgencmd = shutil.which(self._host.vcgencmd)  # never start a program that is not there
+            bits = self._host.throttled() if vcgencmd else None
+            self.machine = {"t_s": now_s, "temperature_c": self._host.temperature_c(), "throttled": bits}
+            self._rows.append({"kind": "machine", **self.machine})
+            if self._closing.wait(SYNC_S):
+                return
+
     def _collect(self) -> None:
-        """Make lines of the machine's state, and of the rows that have come."""
-        now_s = self._clock() - self.start_s
-        vcgencmd = shutil.which(self._host.vcgencmd)  # never start a program that is not there
-        bits = self._host.throttled() if vcgencmd else None
-        self.machine = {"t_s": now_s, "temperature_c": self._host.temperature_c(), "throttled": bits}
-        self._lines.append(_line({"kind": "machine", **self.machine}))
+        """Make lines of the rows that have come."""
         for _ in range(len(self._rows)):
             self._lines.append(_line(self._rows.popleft()))
 

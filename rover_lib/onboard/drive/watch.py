@@ -76,8 +76,8 @@ def stop_on_signals(stop: SignalEvent | threading.Event, log: FlightLog) -> Iter
     """Inside the context, a signal sets `stop`; the second time, it does what it did before. For the main thread."""
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()  # before anything that might wait
         log.event(f"{signal.Signals(number).name}: stopping")
-        stop.set()
         signal.signal(number, before[number])
 
     with signals(on_signal) as before:
@@ -114,8 +114,8 @@ def exit_if_hung(report: Report, log: FlightLog) -> Iterator[None]:
 class HealthWatch:
     """A source of warnings, for loop.Hooks: a sentence for each thing that was unusual since the last call.
 
-    log: its thread reads the supply and the heat, for the loop must not wait for that. undervoltage_s: after this time
-    a supply that is too low raises DriveFault; 0: never.
+    log: one of its threads reads the supply and the heat, for the loop must not wait for that. undervoltage_s: after
+    this time a supply that is too low raises DriveFault; 0: never.
     """
 
     def __init__(
@@ -153,7 +153,9 @@ class HealthWatch:
         if said and said != self._said:
             yield said
         self._said = said
-        if not now or UNDER_VOLTAGE not in now:
+        if now is None:
+            return  # unknown: neither low nor good again
+        if UNDER_VOLTAGE not in now:
             self._low_s = None
             return
         self._low_s = self._clock() if self._low_s is None else self._low_s

@@ -6,7 +6,6 @@ policies = load_confined(paths, threads=3)                                      
 
 import importlib
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -19,8 +18,6 @@ from rover_lib.onboard.errors import PolicyError, RoverError
 from rover_lib.onboard.policy.confine import confine, memory_mb
 from rover_lib.onboard.policy.load import Policy, import_engine, load_policy
 from rover_lib.onboard.stage import plain
-
-_log = logging.getLogger("rover")
 
 
 def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None, **arguments: Any) -> Any:
@@ -49,17 +46,25 @@ def load_confined(
     paths: Mapping[str, Path | str],
     *,
     threads: int,
-    notify: Callable[[str], object] = lambda reason: _log.warning("not confined: %s", reason),
+    notify: Callable[[str], object] | None = None,
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 
-    notify: told why, if the process is not confined.
+    From then on nothing that this process prints is seen: an artifact could write what it likes on a terminal. notify:
+    told why, if the process is not confined; None: standard error is.
     """
     artifacts = {name: Artifact(path) for name, path in paths.items()}
     for artifact in artifacts.values():
         import_engine(artifact)
+    errors, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    for standard in (1, 2):
+        os.dup2(nowhere, standard)
     if reason := confine(sum(memory_mb(path, threads) for path in paths.values())):
-        notify(reason)
+        if notify:
+            notify(reason)
+        else:
+            os.write(errors, f"rover: not confined: {reason}\n".encode())
+    os.close(errors)
     return {name: load_policy(artifact, threads=threads) for name, artifact in artifacts.items()}, artifacts
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 # How far `strange` may differ from that of a parity vector: FP32 by the order of sums, INT8 by flipped roundings
 TOLERANCE = {False: 0.02, True: 0.25}
+# Recorded pictures have at least this share of each limit: the limits are the largest scores of other recorded ones.
+LEAST_SHARE = 0.01
 
 
 class Familiar:

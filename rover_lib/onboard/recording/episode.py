@@ -468,7 +468,10 @@ def read_car_of(folder: Path | str) -> Car:
 def car_in(metadata: Any, folder: Path | str) -> Car:
     """Return the car that an episode's metadata describe, or the default. Raises CarError for no car."""
     described = metadata.get("car") if isinstance(metadata, dict) else None
-    return Car() if described is None else Car.of(described, f"{folder}: its car")
+    if described is None:  # the balloon world once noted a mirrored car by its side alone
+        left = isinstance(metadata, dict) and metadata.get("steering_positive") == "left"
+        return Car(positive="left") if left else Car()
+    return Car.of(described, f"{folder}: its car")
 
 
 def _data_of(path: Path) -> bytes:

@@ -41,7 +41,10 @@ from rover_lib.onboard.view.path_overlay import CarShape
 
 PORT = 8470
 MESSAGE_BYTES = 1 << 20  # no message of a drive is larger (MOST_BYTES in feed.py)
+# Connections that have not shown the token yet: each is a file, of the unit's 256, which a page and a drive need too.
+MOST_STRANGERS, STRANGER_S = 32, 3.0
 BEAT_S = 5.0  # between two pings; a page that does not answer one is gone
+AGAIN_S = 0.1
 GONE = "gone"
 PAGE = Path(__file__).with_name("view.html")
 ASKED = re.compile(r"ask ([\w. ]{1,60})", re.ASCII)  # by the page of a simulation
@@ -113,6 +116,7 @@ class View:
         self._head: dict[str, Any] = {"phase": "no drive", "text": "no drive has come yet"}
         self._picture = b""
         self._news = asyncio.Event()
+        self._strangers: dict[Any, None] = {}  # connections without a token, the oldest first
         self._html = PAGE.read_bytes().replace(b"</script>", script + b"</script>")
 
     async def run(
@@ -154,7 +158,9 @@ class View:
             stack.push_async_callback(_end, asyncio.create_task(self._accept(drives)))
         await runner.setup()
         stack.push_async_callback(runner.cleanup)
-        await web.SockSite(runner, wire).start()
+        loop = asyncio.get_running_loop()
+        listening = await loop.create_server(lambda: self._meet(runner), sock=wire, backlog=64)
+        stack.callback(listening.close)
         name = f"{socket.gethostname()}.local" if self._address.interface else "127.0.0.1"
         return f"http://{name}:{wire.getsockname()[1]}/?token={self._token}"
 
@@ -213,7 +219,11 @@ class View:
     async def _accept(self, wire: socket.socket) -> None:
         loop, tasks = asyncio.get_running_loop(), set()
         while True:
-            drive, _ = await loop.sock_accept(wire)
+            try:
+                drive, _ = await loop.sock_accept(wire)
+            except OSError:  # no file is left for it now
+                await asyncio.sleep(AGAIN_S)
+                continue
             _, uid, _ = struct.unpack("3i", drive.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
             if uid not in self._users:
                 drive.close()
@@ -244,10 +254,28 @@ class View:
 
     # ---- browsers
 
+    def _meet(self, runner: web.AppRunner) -> asyncio.Protocol:
+        """Return a new connection's handler; without a token it has to leave soon, or as soon as many others come."""
+        assert runner.server, "it was set up"
+        loop, stranger = asyncio.get_running_loop(), runner.server()
+        self._strangers[stranger] = None
+        loop.call_later(STRANGER_S, self._part, stranger)
+        if len(self._strangers) > MOST_STRANGERS:
+            oldest = next(iter(self._strangers))
+            del self._strangers[oldest]
+            loop.call_soon(oldest.force_close)  # not now: it may not be connected yet
+        return stranger
+
+    def _part(self, stranger: web.RequestHandler) -> None:
+        if stranger in self._strangers:
+            del self._strangers[stranger]
+            stranger.force_close()
+
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         if not hmac.compare_digest(request.query.get("token", "").encode(), self._token.encode()):
             return web.Response(status=403, text="this page needs its token: use the URL that `rover view` printed\n")
+        self._strangers.pop(request.protocol, None)
         return await handler(request)
 
     async def _give_page(self, request: web.Request) -> web.Response:

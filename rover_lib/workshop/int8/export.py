@@ -226,8 +226,7 @@ class Exporter:
             {"name": n, "height": h, "width": w} | self.recorded[n]
             for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
         ]
-        other = not self.car.drives_like(Car()) or self.car.positive != Car().positive
-        names_car = other and bool({*config.action_names} & {*ACTION_NAMES})
+        names_car = not self.car.drives_like(Car()) and bool({*config.action_names} & {*ACTION_NAMES})
         return {
             "schema": artifact.SCHEMA,
             "mode": mode,

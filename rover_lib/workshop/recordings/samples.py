@@ -168,8 +168,8 @@ def car_of(samples: Iterable[Any]) -> Car:
         if not any(car.drives_like(other) for other in cars):
             cars.append(car)
     if len(cars) > 1:
-        names = ", ".join(sorted(car.name for car in cars))
-        raise EpisodeError("the recordings are of several cars", found=names, remedy="use those of one car")
+        found = cars[0].unlike(cars[1])
+        raise EpisodeError("the recordings are of several cars", found=found, remedy="use those of one car")
     return cars[0] if cars else Car()
 
 

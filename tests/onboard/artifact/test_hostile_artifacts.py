@@ -15,6 +15,7 @@ from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX
 from rover_lib.onboard.artifact.manifest import Artifact, content_hash
 from rover_lib.onboard.care.benchmark import peak_memory_alone_mb
+from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
 
 HARM = "harm"  # the file that a hostile program writes into the working folder
@@ -97,6 +98,8 @@ def test_no_impossible_manifest_is_believed(artifacts, tmp_path):
 def test_no_other_parity_vectors_are_read(artifacts, tmp_path):
     for change, message in (
         (lambda v: v["chunk"].fill(np.nan), "not finite"),
+        (lambda v: v["chunk"].put(5, np.nan), "not finite"),  # one alone
+        (lambda v: v["state"].put(1, np.inf), "not finite"),
         (lambda v: v.update(frame_cam_front=v["frame_cam_front"][:, :9]), "another shape"),
         (lambda v: v.update(state=v["state"].astype(float)), "another shape"),
         (lambda v: v.pop("state"), "not readable"),
@@ -139,6 +142,18 @@ def test_a_program_that_writes_a_file_cannot_do_so_confined(artifacts, tmp_path,
     load = "import sys; from rover_lib.onboard import load_policy; load_policy(sys.argv[1])"
     subprocess.run([sys.executable, "-c", load, path], check=True)
     assert Path(HARM).exists()  # so the confinement prevented it
+
+
+def test_what_a_program_prints_reaches_no_terminal(artifacts, tmp_path, capfd):
+    said = "\\x1b[2J stopped, the human has the car"
+    path = hostile(artifacts, tmp_path, {".py": line_before_end(f'print("{said}")')})
+    with PolicyProcess(path, threads=1) as process:
+        cameras = process.manifest["cameras"]
+        process.predict(np.zeros((cameras[0]["height"], cameras[0]["width"], 3), np.uint8), np.zeros(2))
+    assert peak_memory_alone_mb(path, threads=1) > 0
+    assert capfd.readouterr() == ("", "")
+    load_policy(path)  # by whoever made it
+    assert "the human has the car" in capfd.readouterr().out
 
 
 def test_an_answer_is_what_the_manifest_says(artifacts, tmp_path):

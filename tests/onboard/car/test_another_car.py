@@ -12,10 +12,11 @@ from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.drive.drive import another_car
 from rover_lib.onboard.drive.plan import Follower, Plan, Settings
 from rover_lib.onboard.drive.session import arm_capped
-from rover_lib.onboard.errors import ArtifactError, CarError
+from rover_lib.onboard.errors import ArtifactError, CarError, EpisodeError
 from rover_lib.onboard.policy.load import action_limits
-from rover_lib.onboard.recording.episode import read_car_of
+from rover_lib.onboard.recording.episode import car_in, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import car_of as recorded_car_of
 
 CRAWLER = read_car(Path(__file__).parents[3] / "lab" / "cars" / "crawler.yml")
 
@@ -39,13 +40,29 @@ def test_a_recording_of_no_car_is_left_out_and_said(tmp_path):
         read_car_of(bad)
 
 
+def test_a_mirrored_car_is_another_one(tmp_path):
+    """Same pulses, and +1 turns it to the other side: the first car's policy would steer it mirrored."""
+    ours, mirrored = Car(), Car(name="hers", positive="left")
+    assert read_car_of(record_there_and_back(tmp_path / "hers/episode_0", mirrored)).positive == "left"
+    assert car_in({"steering_positive": "left"}, "older").positive == "left" and car_in({}, "oldest") == ours
+    assert "turns 'hers' left and \"the recordings' car\" right" in mirrored.unlike(ours)
+    record_there_and_back(tmp_path / "ours/episode_1", ours)
+    mixed = [sample for root in ("hers", "ours") for sample in load_recordings(tmp_path / root).samples]
+    with pytest.raises(EpisodeError, match="of several cars, found steering"):
+        recorded_car_of(mixed)
+    for manifest, this in (({"car": mirrored.description()}, ours), ({}, mirrored)):
+        with pytest.raises(CarError, match=r"would steer mirrored: steering \+1 turns"):
+            another_car(manifest, this)
+    assert another_car({"car": mirrored.description()}, mirrored) == ""
+
+
 def test_an_artifact_says_whose_it_is():
     manifest = {"car": CRAWLER.description()}
     assert car_of(manifest) == CRAWLER
     assert car_of({}) == Car()
     with pytest.raises(ArtifactError, match="steering must be a mapping, found nothing"):
         car_of({"car": {"throttle": {}}})
-    assert "calibrated for 'crawler', and this car is" in another_car(manifest, Car())
+    assert "calibrated for 'crawler', and this car is" in another_car(manifest, Car(positive="left"))
     assert another_car(manifest, CRAWLER) == another_car({}, Car()) == ""
     assert action_limits(["throttle", "wrist"], CRAWLER).tolist() == [[-1, -np.inf], [1, np.inf]]
 

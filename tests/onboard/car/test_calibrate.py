@@ -58,12 +58,13 @@ class Desk:
 
 
 def test_an_inverted_transmitter():
-    """Positive steering is the longer pulse's side, as on the recorded car, or what an earlier car.yml said."""
-    desk = Desk(CRAWLER | {"left": 1012, "right": 1996, "forward": 1004, "back": 1990})
-    for positive, found in ((None, "right"), ("left", "left")):
-        car = desk.measure(positive=positive)
-        ends = car.pwm.pulses(car.left, 1), car.pwm.pulses(-car.left, -1)
-        assert car.positive == found and ends == (Pulses(1012, 1004), Pulses(1996, 1990))
+    """Positive steering is right, however the servo is mounted, or what an earlier car.yml said."""
+    for left, right in ((1012, 1996), (1996, 1012)):
+        desk = Desk(CRAWLER | {"left": left, "right": right, "forward": 1004, "back": 1990})
+        for given, found in (({}, "right"), ({"positive": "left"}, "left")):
+            car = desk.measure(**given)
+            ends = car.pwm.pulses(car.left, 1), car.pwm.pulses(-car.left, -1)
+            assert car.positive == found and ends == (Pulses(left, 1004), Pulses(right, 1990))
 
 
 @pytest.mark.parametrize("periods_us", [(3100, 3300), (20000, 9000), (21316, 1016)])

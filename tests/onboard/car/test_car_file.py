@@ -102,4 +102,4 @@ def test_which_side_is_positive_is_said_and_changes_no_pulse():
     for content in (ours.description(), before):
         assert Car.of(content) == ours and Car.of(content).pwm.pulses(1, 0).steering_us == 2012
     left = Car.of(before | {"steering": before["steering"] | {"positive": "left"}})
-    assert (left.positive, left.left, ours.left) == ("left", 1, -1) and left.drives_like(ours)
+    assert (left.positive, left.left, ours.left) == ("left", 1, -1) and not left.drives_like(ours)

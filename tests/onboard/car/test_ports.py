@@ -2,7 +2,7 @@
 
 import pytest
 
-from rover_lib.onboard.car.ports import find_port
+from rover_lib.onboard.car.ports import find_port, other_ports
 from rover_lib.onboard.errors import RoverError
 
 
@@ -20,3 +20,14 @@ def test_the_only_one_is_found_and_the_provisioned_name_goes_first(tmp_path):
         find_port(tmp_path)
     (tmp_path / "rover-arduino").symlink_to("ttyUSB0")
     assert find_port(tmp_path) == str(tmp_path / "rover-arduino")
+
+
+def test_of_two_that_are_alike_the_other_one_is_named(tmp_path):
+    """Two CH340 have no serial number, and udev gives both the provisioned name."""
+    (tmp_path / "ttyUSB0").touch()
+    (tmp_path / "rover-arduino").symlink_to("ttyUSB0")
+    assert other_ports(str(tmp_path / "rover-arduino"), tmp_path) == ""
+    (tmp_path / "ttyUSB1").touch()
+    assert other_ports(str(tmp_path / "rover-arduino"), tmp_path).startswith(
+        f"{tmp_path}/ttyUSB0 was asked, and there is also {tmp_path}/ttyUSB1"
+    )

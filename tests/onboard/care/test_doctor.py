@@ -215,6 +215,25 @@ def test_a_pi_that_is_well_and_one_that_is_not(pi_host, bare_host, proc, monkeyp
         assert only(check).verdict == "ok"
 
 
+def test_stops_that_are_off_are_named(set_params):
+    set_params("{}")
+    assert only(doctor.stops({"familiar": {}})).verdict == "ok"
+    set_params(
+        "drive: {unfamiliar: off, stuck_s: 0, undervoltage_s: 0, black_level: -255, flat_level: 0, frozen_frames: 1000}"
+    )
+    found = only(doctor.stops({"familiar": {}}))
+    wanted = "unfamiliar: off, stuck_s: 0, undervoltage_s: 0, black_level: -255, flat_level: 0, frozen_frames: 1000"
+    assert (found.verdict, found.found) == ("warning", f"off or late: {wanted}")
+    set_params("drive: {undervoltage_s: 61}")
+    assert only(doctor.stops({})).found == "off or late: undervoltage_s: 61, unfamiliar: this artifact knows no limit"
+
+
+def test_a_policy_that_steers_mirrored_is_a_fail():
+    mirrored = {"car": Car(positive="left").description()}
+    assert [check.verdict for check in doctor.car(mirrored)] == ["ok", "fail"]
+    assert [check.verdict for check in doctor.car({"car": Car().description()})] == ["ok"]
+
+
 # ---- all together
 
 

@@ -276,6 +276,16 @@ def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, third):
     assert releases.prune(1) == [] and releases.path_of("current").exists()
 
 
+def test_a_damaged_release_takes_no_other_ones_place(releases, two, third):
+    first, never = releases.current, content_hash(third)
+    second = releases.stage(two[1]).name
+    releases.switch(second)
+    releases.rollback()
+    damage(releases.path_of(second))
+    assert releases.prune(2) == [second]
+    assert releases.current == first and releases.path_of(never).exists()
+
+
 @pytest.mark.parametrize("spoiled", ["damaged", "gone", "elsewhere"])
 def test_what_is_wrong_with_the_release_in_use_is_seen_and_healed(releases, two, spoiled):
     if spoiled == "damaged":
@@ -304,7 +314,7 @@ def test_a_broken_history_a_wrong_clock_and_a_full_disk(releases, two, monkeypat
 
 
 def test_of_two_at_once_one_is_refused_and_tidies_nothing_up(releases, two):
-    """And nobody else can hold the lock, as the one that older versions left."""
+    """Whatever rights the lock shows; and nobody else can open it later, as the one that older versions left."""
     half, lock = releases.releases / ".new", releases.models / ".lock"
     half.mkdir()
     with lock.open() as other:
@@ -312,9 +322,10 @@ def test_of_two_at_once_one_is_refused_and_tidies_nothing_up(releases, two):
         for command in (lambda: releases.stage(two[1]), releases.rollback, lambda: releases.prune(1)):
             with pytest.raises(RoverError):
                 command()
+            lock.chmod(0o644)
         assert half.exists() and releases.status()["healthy"]
-        lock.chmod(0o644)
-        assert_drives(releases, {deploy(releases, two[1])})
+    lock.chmod(0o644)
+    assert_drives(releases, {deploy(releases, two[1])})
     assert not half.exists() and stat.S_IMODE(lock.stat().st_mode) == 0o600
 
 

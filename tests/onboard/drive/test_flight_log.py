@@ -5,6 +5,7 @@ import logging
 import os
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from needs import until
 
 from rover_lib.onboard.drive import flight_log as module
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
-from rover_lib.onboard.errors import ParamsError, RoverError
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.watch import HealthWatch
+from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError
 
 LIMITS = {"max_bytes": 1_000_000, "keep": 2}
 HEADER = {"hz": 30, "fade_s": 0.5, "stop_s": 1.0}
@@ -215,6 +218,28 @@ def test_a_full_disk_is_said_once_and_logging_goes_on_when_it_has_room(path, cap
     assert flight.ticks["frame"].tolist() == list(range(21))
     said = [r.message for r in caplog.records]
     assert len(said) == 2 and "No space left" in said[0] and "written again" in said[1]
+
+
+@pytest.mark.parametrize("disk", ["full", "stuck"])
+def test_a_low_supply_is_seen_whatever_the_disk_does(path, monkeypatch, quick, disk):
+    go_on = threading.Event()
+    if disk == "full":
+        path.symlink_to("/dev/full")
+    monkeypatch.setattr(module.os, "fsync", lambda file: go_on.wait(10))
+    bits = ["0x0"]
+    host = SimpleNamespace(vcgencmd="sh", throttled=lambda: bits[0], temperature_c=lambda: 50.0)
+    with FlightLog(path, header=HEADER, **LIMITS, host=host) as log:
+        log.tick(tick(0))
+        time.sleep(0.1)  # the disk takes nothing now
+        health = HealthWatch(Report(), None, log, 0.1)
+        assert list(health()) == []
+        bits[0] = "0x1"
+        until(lambda: log.machine["throttled"] == "0x1")
+        assert list(health()) == ["under-voltage"]
+        time.sleep(0.11)
+        with pytest.raises(DriveFault, match="under-voltage"):
+            list(health())
+        go_on.set()
 
 
 @pytest.mark.parametrize("taken", [0, -1])

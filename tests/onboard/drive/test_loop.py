@@ -307,8 +307,11 @@ def test_a_picture_without_anything_on_it(pilot, seen, fault):
 SCENE = np.random.default_rng(0).integers(30, 220, (9, 16, 3), np.uint8).repeat(20, 0).repeat(20, 1)
 
 
-def noisy(dimmer=1.0, moved_px=0):
-    shown = np.roll(SCENE, moved_px, 1) * dimmer + np.random.default_rng().normal(0, 6, SCENE.shape)
+def noisy(dimmer=1.0, moved_px=0, noise=6, flicker=0.0, at_s=0.0):
+    """flicker: of lamps at 100 Hz, a share of their light, through a camera that reads its rows in 25 ms."""
+    row_s = at_s + np.arange(180)[:, None, None] / 180 * 0.025
+    lamp = dimmer * (1 + flicker * np.sin(2 * np.pi * 100 * row_s))
+    shown = np.roll(SCENE, moved_px, 1) * lamp + np.random.default_rng().normal(0, noise, SCENE.shape)
     return np.clip(shown, 0, 255).astype(np.uint8)
 
 
@@ -317,6 +320,11 @@ def noisy(dimmer=1.0, moved_px=0):
     [
         (lambda s: 0.1, lambda s: noisy(), 1.7),
         (lambda s: -0.1, lambda s: noisy(1 - 0.1 * s), 1.7),  # dimmer light is no motion
+        (lambda s: 0.1, lambda s: noisy(flicker=0.05, at_s=1.03 * s), 1.7),
+        (lambda s: 0.1, lambda s: noisy(flicker=0.2, at_s=1.03 * s), 1.7),
+        (lambda s: 0.1, lambda s: noisy(0.2, noise=8), 1.7),  # in the dark, at a mean of 25
+        (lambda s: 0.1, lambda s: noisy(0.13, noise=4), 1.7),
+        (lambda s: 0.1, lambda s: noisy(0.2, round(30 * s), 8, 0.2, 1.03 * s), None),  # drives in both
         (lambda s: 0.1 * (s % 0.9 < 0.6), lambda s: noisy(), 2.6),  # it brakes in between
         (lambda s: 0.1, lambda s: noisy(moved_px=round(3 * s)), None),  # it creeps: half a degree a second
         (lambda s: 0.1, lambda s: noisy(moved_px=round(50 * max(0.0, s - 1.3))), None),  # it starts slowly
@@ -380,7 +388,13 @@ def test_a_supply_that_stays_low_ends_a_drive_and_heat_is_told():
     now[0] = 11
     with pytest.raises(DriveFault, match="under-voltage for 3 s"):
         list(health())
-    now[0] = 30
+    for now[0], bits in ((12, "0x0"), (13, "0x6"), (17, "0x6"), (18, "0x1"), (19, None), (20, None)):
+        log.machine = {"t_s": now[0], "throttled": bits}
+        list(health())  # hot for long, and then low for a moment
+    now[0], log.machine = 21, {"t_s": 21, "throttled": "0x1"}
+    with pytest.raises(DriveFault, match="for 3 s"):  # what was not read for a moment is not good again
+        list(health())
+    now[0] = 32
     assert list(health()) == [NOT_REPORTED]  # what was read long ago is not known
 
 

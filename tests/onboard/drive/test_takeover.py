@@ -2,11 +2,15 @@
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import LinkError, State, Telemetry
+from rover_lib.onboard.drive.feed import TAKEN
+from rover_lib.onboard.drive.loop import Report
+from rover_lib.onboard.drive.session import Session
 from rover_lib.onboard.drive.takeover import TakeoverRecorder, driver_by
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 
@@ -132,3 +136,13 @@ def test_a_command_that_was_not_taken_is_not_written(result, at_s, kept):
     policy = [(row, columns) for row, columns in human.rows if columns["driver"] == POLICY]
     assert policy == [(row, {"mode": "static", "driver": POLICY, "plan_age_ms": 80.0}) for row in COMMANDS[:kept]]
     assert human.rows[kept][0][0] == at_s and human.rows[kept][1] == {"driver": HUMAN}
+
+
+def test_the_view_ends_the_recording_of_a_human():
+    """Its stop is heard then too; and the service's watchdog is fed meanwhile."""
+    asked, shown, alive = ["stopped from the view", None], [], []
+    feed = SimpleNamespace(over=asked.pop, show=lambda phase, *rest: shown.append(phase))
+    service = SimpleNamespace(alive=lambda: alive.append(True))
+    session = SimpleNamespace(service=service, report=Report(), feed=feed, camera=None, link=None)
+    assert [Session._human_over(session) for _ in range(2)] == [None, "stopped from the view"]
+    assert shown == [TAKEN, TAKEN] and alive == [True, True] and session.report.status

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -168,6 +169,43 @@ async def test_a_stop_from_each_page_reaches_each_drive_and_the_newest_is_shown(
         pass
     await page.send_str("stop")
     assert "no drive" in (await asyncio.wait_for(page.receive(), 5)).data
+
+
+@on_a_bench
+async def test_idle_connections_cost_no_page_and_no_drive_its_file(bench):
+    """376 of them, which never show a token, took all files: no page opened, and no stop was heard."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    host, _, port = bench.base.removeprefix("http://").partition(":")
+    page = await bench.page()
+    taken = len([*Path("/proc/self/fd").iterdir()])
+    idle = [socket.socket() for _ in range(120)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (taken + 120 + 100, limits[1]))
+    try:
+        for wire in idle:
+            wire.setblocking(False)
+            wire.connect_ex((host, int(port)))
+        most = taken + 120 + v.MOST_STRANGERS + 5
+        async with asyncio.timeout(10):
+            while len(bench.view._strangers) < v.MOST_STRANGERS or len([*Path("/proc/self/fd").iterdir()]) > most:
+                await asyncio.sleep(0.05)
+        drive, later = bench.drive(), await bench.page()
+        drive.send()
+        for each in (page, later):
+            await driving(each)
+            await each.send_str("stop")
+            assert (await drive.asked()).startswith(b"stop ")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        for wire in idle:
+            wire.close()
+
+
+@on_a_bench
+async def test_who_shows_no_token_has_to_leave(bench):
+    host, _, port = bench.base.removeprefix("http://").partition(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    assert await asyncio.wait_for(reader.read(), 5) == b""
+    writer.close()
 
 
 @on_a_bench

@@ -11,6 +11,7 @@ from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.manifest import Artifact
 from rover_lib.onboard.drive.inference import UNTOLD, PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
+from rover_lib.onboard.policy.familiar import Familiar
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.act import ACT, inputs_of
 from rover_lib.workshop.int8.export import Exporter, TorchScript
@@ -111,7 +112,15 @@ def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
         assert process.strange == UNTOLD  # stops, and JSON takes it
 
 
-@pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes", "unclaimed"])
+WIDE = {
+    "wide": [1e30, 1e30],
+    "one": [1.0, 1e30],
+    "negative": [-1.0, -1.0],
+    "zero": [0.0, 1.0],
+}
+
+
+@pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes", "unclaimed", "spread", *WIDE])
 def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatch, change):
     with Artifact(made / "policy_fp32.onnx.zip") as whole:
         manifest, vectors, model = dict(whole.manifest), dict(whole.parity), whole.record(artifact.ONNX)
@@ -120,6 +129,8 @@ def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatc
         "mean": {"familiar_mean": np.full_like(vectors["familiar_mean"], np.nan)},
         "limits": {"familiar_limits": np.ones(3, np.float32)},
         "shape": {"familiar_directions": vectors["familiar_directions"].T},
+        "spread": {"familiar_spread": -vectors["familiar_spread"]},
+        **{name: {"familiar_limits": np.array(limits, np.float32)} for name, limits in WIDE.items()},
     }
     if change == "sizes":
         monkeypatch.setattr(artifact, "check_manifest", lambda *args: None)
@@ -129,5 +140,27 @@ def test_a_false_claim_of_what_is_familiar_is_refused(made, tmp_path, monkeypatc
         vectors = {name: vectors[name] for name in vectors if name != "embedding" and "familiar" not in name}
     artifact.save_onnx(tmp_path / "p.zip", model, manifest, vectors | changed.get(change, {}))
     monkeypatch.undo()
-    with pytest.raises(ArtifactError, match=r"unfamiliar|parity vector|sizes|another embedding"):
+    with pytest.raises(ArtifactError, match=r"unfamiliar|parity vector|sizes|another embedding|above 0"):
         load_policy(tmp_path / "p.zip")
+
+
+def test_scores_by_hand():
+    """Limits and scores are written and read by the same code; a slip in it would make the stop blind everywhere."""
+    mean, directions = np.float32([1, 1, 0]), np.float32([[1, 0, 0], [0, 1, 0]])
+    familiar = Familiar(mean, directions, np.float32([0.5, 2]), np.float32([4, 10]))
+    embedding = np.float32([[4, 9, 12]])  # from the mean 3, 8 and 12: 6 and 4 standard deviations, and 12 left over
+    assert familiar.scores(embedding) == pytest.approx(np.array([[np.sqrt((36 + 16) / 2), 12.0]]))
+    assert familiar.strange(embedding) == pytest.approx([np.sqrt(26) / 4])  # 1.27 of the first limit, 1.2 of the other
+
+
+def test_a_fit_by_hand():
+    """Two known pictures 3 apart, and held-out drives of one picture each that lie ever farther away."""
+    drives = drives_of(memory_samples(1) * 31, each=1)
+    embeddings = [3.0 * (i % 2) for i in range(12)] + [1.5 + 0.3 * k for k in range(1, 20)]
+    at = dict(zip(drives.samples, embeddings, strict=True))
+    familiar, found = fit(drives, lambda sample: np.float32([at[sample], 0]))
+    assert familiar.mean == pytest.approx([1.5, 0]) and np.abs(familiar.directions) == pytest.approx(np.eye(1, 2))
+    assert familiar.spread == pytest.approx([1.5])  # standard deviation of 0 and 3
+    # The farthest drive, 19, is 5.7 from the mean, 3.8 standard deviations; a tenth more is the limit.
+    assert familiar.limits[0] == pytest.approx(1.1 * 3.8)
+    assert found["largest"]["21"] == pytest.approx(2.0 / 4.18) and found["drives"] == 19

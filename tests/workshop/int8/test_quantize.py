@@ -23,7 +23,13 @@ from rover_lib.workshop.int8.choose import Chooser, best_of, float_costs_pct, ma
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.int8.observe import Calibration, RangeObserver, calibrate, restore_observed
 from rover_lib.workshop.int8.quantize import quantize
-from rover_lib.workshop.int8.scales import apply_channel_scales, channel_maxima, projections
+from rover_lib.workshop.int8.scales import (
+    _input_scale,
+    _output_scale,
+    apply_channel_scales,
+    channel_maxima,
+    projections,
+)
 from rover_lib.workshop.int8.scheme import ENGINE, OBSERVERS, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.recordings.episodes import load_recordings
 
@@ -342,3 +348,16 @@ def test_a_badly_written_graph_sets_no_tolerance_for_itself(tiny, calibration, t
     with pytest.raises(ArtifactError, match="throttle of the written graph differs"):
         Exporter(tiny, memory_samples(2)).export(off_by(tiny, 0.1, 0.0), tmp_path / "a.pt", calibration)
     assert not (tmp_path / "a.pt").exists()
+
+
+def test_scales_by_hand():
+    """The same code writes and reads them, so that a wrong one would still be exact in float."""
+    assert _output_scale(torch.tensor([2.0, 1.0, 0.0])).tolist() == [1.0, 0.5, 1 / 64]
+    # w^(1-a) / x^a, times what leaves the largest input, 4, as it was
+    for smooth, wanted in ((0.0, [1.0, 1.0]), (0.5, [1.0, 2.0]), (1.0, [1.0, 4.0])):
+        found = _input_scale(torch.tensor([4.0, 1.0]), [torch.tensor([[1.0, -1.0], [0.5, 0.5]])], smooth)
+        assert found.tolist() == pytest.approx(wanted)
+    observer = RangeObserver(choice="minmax")
+    observer(torch.tensor([-1.0, 0.5, 3.0]))
+    scale, zero_point = observer.calculate_qparams()
+    assert scale.item() == pytest.approx(4 / 255) and zero_point.item() == -64  # -128 + 63.75, rounded

@@ -82,6 +82,8 @@ FP32 = row("fp32", 30.0, 0.0, 80.0)
         ([FP32, row("static", 10.5, 0.1), row("mixed", 10, 0.1)], "static"),  # as fast: the simplest
         ([FP32, row("static", 10.5, 0.9), row("mixed", 10, 0.1)], "mixed"),  # as fast, and truer
         ([FP32, row("static", size_mb=30.0), row("dynamic")], "dynamic"),  # as fast and as true: the smaller
+        ([FP32, row("static", 10, 4.0), row("mixed", 10, 3.95)], "static"),  # truer by points, not by shares
+        ([FP32, row("static", 10, 0.09), row("mixed", 10, 0.01)], "static"),
         ([FP32, row("static", missed=["a gate"]), row("dynamic", 20)], "dynamic"),
     ],
 )

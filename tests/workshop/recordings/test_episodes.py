@@ -3,6 +3,7 @@
 import math
 import os
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,6 +17,7 @@ from recorded import edit_json, real_recordings
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.workshop.recordings.controls import _refuse_other_pulses
 from rover_lib.workshop.recordings.episodes import choose_calibration, load_recordings, split
 
 CHUNK = 8
@@ -595,3 +597,11 @@ def test_fewer_than_asked_is_said(many):
         choose_calibration((), 10)
     same = tuple(replace(many.samples[0]) for _ in range(30))
     assert len({id(s) for s in choose_calibration(same, 10)[0]}) == 10, "none is taken twice"
+
+
+@pytest.mark.parametrize(("far", "refused"), [(20, False), (21, True), (39, True)])
+def test_pulses_of_another_car_are_refused_if_most_are(far, refused):
+    """Of 40: not only if each is. The recorded car's steering reaches from 900 to 2012 us."""
+    pulses = {i: 9000.0 if i < far else 1456.0 for i in range(40)}
+    with pytest.raises(EpisodeError, match=f"{far} of 40") if refused else nullcontext():
+        _refuse_other_pulses(PwmCalibration().steering, pulses)
