@@ -1,1 +1,1 @@
-"""What other programs read and write: LeRobotDatasets, donkeycar tubs, ONNX, films and figures of drives."""
+"""What other programs read: LeRobotDatasets, ONNX, films and figures of drives."""

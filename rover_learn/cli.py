@@ -130,4 +130,4 @@ def train(episodes: "Source", output: Path, **options: Any) -> None:
     from rover_learn.train import train as train_policy
 
     click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
-    click.echo(f"next: rover run {output} {episodes.path} --name mine")
+    click.echo(f"next: rover run {output} {episodes.typed()} --name mine")

@@ -41,7 +41,7 @@ from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, pct_
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, pick_evenly
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of, pick_evenly
 
 SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = TAUGHT = ("demonstrations", "new_demonstrations", "corrections")
@@ -161,8 +161,8 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
         parts = split(replace(read[0], episodes=tuple(old)), p["held_out_share"], p["seed"])
         taught.append((DEMONSTRATIONS, _driven_by_humans(parts.calibration, old)))
         judging = (*parts.choosing, *parts.held_out)
-        for name in dict.fromkeys(s.episode for s in judging):
-            held_out.append((name, OLD, _driven_by_humans([s for s in judging if s.episode == name], old)))
+        for name in dict.fromkeys(map(block_of, judging)):
+            held_out.append((name, OLD, _driven_by_humans([s for s in judging if block_of(s) == name], old)))
     count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
     judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
     held_out += [(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]

@@ -102,6 +102,11 @@ def test_only_files_in_the_folder_or_in_the_hubs_cache_are_read(tmp_path):
             check_inside(root, root / name)
 
 
+def with_catalog(tub: Path) -> Path:
+    (tub / "catalog_0.catalog").touch()
+    return tub
+
+
 READERS = {
     "run.json": lambda path: read_stage(path, "run"),
     "car.yml": read_car,
@@ -109,7 +114,7 @@ READERS = {
     "episode_data.json": lambda path: load_recordings(path.parent, 8),
     "best_model.pth": load_checkpoint,
     "calibration.pt": Calibration.load,
-    "manifest.json": lambda path: load_recordings(path.parent),
+    "manifest.json": lambda path: load_recordings(with_catalog(path.parent)),
 }
 
 

@@ -204,7 +204,8 @@ class Checkpoint:
         said = ", ".join(f"{w}x{h} for pictures of {width}x{height}" for (h, w), (height, width) in pairs)
         if self.facts.source("size") != SIZE_OF_BASE or self.report["written_here"] or not layout.image_sizes:
             note = f"{GUESS}, that pictures were squeezed in training too: {said}"
-            return self._told(c, {"size": (c.image_sizes[0], note)}, [note]) if squeezed else self
+            guessed = squeezed and not self.report["written_here"]  # our trainings squeeze theirs to this size
+            return self._told(c, {"size": (c.image_sizes[0], note)}, [note]) if guessed else self
         if sizes == c.image_sizes:
             return self
         config = replace(c, image_sizes=sizes)

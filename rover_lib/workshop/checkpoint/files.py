@@ -43,6 +43,8 @@ KL_WEIGHT = 10.0
 WEIGHT_DECAY = 1e-4
 BETAS = (0.9, 0.999)
 GRAD_CLIP = 1.0
+# In a config that we wrote, as no trainer of theirs has them together.
+OURS = {"num_epochs": 1, "train_split": 0.75, "log_freq": 1, "save_freq": 1, "num_workers": 0}
 KNOWN = {"epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_dict", "best_val_loss", "config"}
 OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file must deny
 # Files beside a checkpoint that may say how it was trained: those that are read, and those that are not.
@@ -145,6 +147,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
             if isinstance(said, dict) and "input_features" not in said:  # that is LeRobot's, of another format
                 facts.read({k: v for k, v in said.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
     extra = {
+        "written_here": "origin" in raw or OURS.items() <= raw.items(),
         "epoch": plain(content.get("epoch")),
         "best_val_loss": loss,
         "optimizer_mb": tensor_bytes(content.get("optimizer_state_dict")) / 1e6,
@@ -251,10 +254,7 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
         "dropout": DROPOUT, "kl_weight": KL_WEIGHT, "vision_encoder": size.backbone,
         "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
     }  # fmt: skip
-    training = {
-        "weight_decay": WEIGHT_DECAY, "betas": BETAS, "grad_clip": GRAD_CLIP, "num_epochs": 1, "train_split": 0.75,
-        "log_freq": 1, "save_freq": 1, "num_workers": 0,
-    }  # fmt: skip
+    training = {"weight_decay": WEIGHT_DECAY, "betas": BETAS, "grad_clip": GRAD_CLIP} | OURS
     return shape | training | known | ({} if rate_hz == RATE_HZ else {"rate_hz": rate_hz})
 
 

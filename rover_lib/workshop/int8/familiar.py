@@ -5,7 +5,7 @@
 
 The threshold is split conformal prediction: the largest score, smoothed as on the rover, of n drives that neither
 trained the policy nor fitted the scores. Of new drives like them, one in n + 1 goes beyond it, whatever the scores are;
-with the MARGIN fewer do.
+with the MARGIN fewer do. Where blocks of long drives are held out, stretches of these are counted.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ import numpy as np
 from rover_lib.onboard.drive.plan import Smoother
 from rover_lib.onboard.policy.familiar import Familiar
 from rover_lib.workshop.recordings.episodes import Split
-from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz, pick_evenly
 
 DIRECTIONS = 64  # the demo's drives that failed were stopped a little more often than with 32
 KNOWN_FRAMES = 640  # ten for each direction
@@ -27,6 +27,7 @@ MOST_DRIVES = 39  # one in 40; more would only raise the threshold
 # The largest of 20 drives is partly chance: of draws from 200 recorded ones of the demo, 16 % let more than 5 % of good
 # drives go beyond it, with this margin 9 %; all failing drives that were stopped still are.
 MARGIN = 1.1
+LEAST_STRETCH = 4  # pictures in a stretch of a block
 EVERY_S = 0.1  # between the pictures of a drive, as between a Pi's plans
 SHOWN = 6  # pictures
 BETWEEN = 0.95  # of the interval of a rate
@@ -36,23 +37,27 @@ BETWEEN = 0.95  # of the interval of a rate
 class Drives:
     """What familiarity is fitted on: pictures of the drives that calibrate, and whole drives of the other two parts.
 
-    warnings: why there is no threshold; [] if there is one.
+    each: what the unseen are, in words. warnings: why there is no threshold; [] if there is one.
     """
 
     known: tuple[Sample, ...]
     unseen: dict[str, tuple[Sample, ...]]
+    each: str = "drives"
 
     @classmethod
     def of(cls, parts: Split) -> "Drives":
         """Take some frames of the calibration part, and every EVERY_S a frame of the others' whole drives."""
-        names, drives = {s.episode for s in parts.calibration}, dict[str, list[Sample]]()
+        names, drives, each = {block_of(s) for s in parts.calibration}, dict[str, list[Sample]](), "drives"
         for sample in (*parts.choosing, *parts.held_out):
-            if sample.episode not in names:  # else a part of a drive, where few were parted along time
-                drives.setdefault(sample.episode, []).append(sample)
+            if block_of(sample) not in names:  # else a part of a drive, where few were parted along time
+                drives.setdefault(block_of(sample), []).append(sample)
+        if any(of[0].block for of in drives.values()):
+            drives = _stretches(drives)
+            lengths_s = [len(of) / _rate_hz(of) for of in drives.values()]
+            each = f"stretches of {np.median(lengths_s):.2g} s, of the same track and hour,"
         chosen = {name: drives[name] for name in pick_evenly(list(drives), MOST_DRIVES)}
-        every = {name: max(1, round((frame_rate_hz(of) or 1) * EVERY_S)) for name, of in chosen.items()}
-        unseen = {name: tuple(of[:: every[name]]) for name, of in chosen.items()}
-        return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen)
+        unseen = {name: tuple(of[:: max(1, round(_rate_hz(of) * EVERY_S))]) for name, of in chosen.items()}
+        return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen, each)
 
     @property
     def samples(self) -> tuple[Sample, ...]:
@@ -62,8 +67,24 @@ class Drives:
     def warnings(self) -> list[str]:
         if len(self.unseen) >= FEWEST_DRIVES:
             return []
-        what = f"{len(self.unseen)} drives are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
+        what = f"{len(self.unseen)} {self.each} are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
         return [f"{what}: nothing stops this policy where it has seen nothing like it"]
+
+
+def _rate_hz(samples: list[Sample]) -> float:
+    """The frames per second of the first of the episodes in a drive or a stretch."""
+    return frame_rate_hz([s for s in samples if s.episode == samples[0].episode]) or 1.0
+
+
+def _stretches(blocks: dict[str, list[Sample]]) -> dict[str, list[Sample]]:
+    """Cut each block into equally many stretches, as many as are needed, and none of too few pictures."""
+    count = -(-FEWEST_DRIVES // len(blocks))
+    stretches = {}
+    for name, of in blocks.items():
+        each = max(1, min(count, len(of) // LEAST_STRETCH))
+        for i, rows in enumerate(np.array_split(np.arange(len(of)), each)):
+            stretches[f"{name}, part {i + 1}"] = [of[k] for k in rows]
+    return stretches
 
 
 def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar, dict[str, Any]]:
@@ -90,9 +111,11 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     least = []
     for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
         sample = drives.unseen[name][int(scores[name].argmax())]
-        least.append({"episode": name, "row": sample.row, "frame": sample.frame_name, "strange": shares[name]})
+        least.append(
+            {"episode": sample.episode, "row": sample.row, "frame": sample.frame_name, "strange": shares[name]}
+        )
     rate = {"stopped_pct": 100 / (len(shares) + 1), "stopped_low_pct": 100 * low, "stopped_high_pct": 100 * high}
-    return familiar, {"drives": len(shares), **rate, "largest": shares, "least": least}
+    return familiar, {"drives": len(shares), "each": drives.each, **rate, "largest": shares, "least": least}
 
 
 def largest_smoothed(scores: np.ndarray) -> float:

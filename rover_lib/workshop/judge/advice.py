@@ -124,6 +124,7 @@ def list_next(judged: Mapping[str, Any], best: str, stages: Stages, names: Names
         "next.txt",
         judged=judged,
         compare=stages["compare"],
+        load=stages.get("load", {}),
         names=names,
         artifact=names.artifact(judged["deploy"] or best),
         other_robot=set(judged["refused"]) - set(MAY_DIFFER),

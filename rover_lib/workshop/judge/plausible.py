@@ -26,6 +26,7 @@ MOST_BEYOND_PCT = 5.0
 LEAST_SPREAD = 0.1  # a policy whose predictions vary by less than this share of the recorded spread does not drive
 LARGEST_STATE = 10.0  # standard deviations; in wrong units there are hundreds
 REMEDY = "are these the recordings, and the statistics, that it was trained with?"
+OURS = "it was trained here and has learned too little of it: train longer, on more recordings"  # with its statistics
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Fit:
     recorded: range by action. actions: {predicted: [least, most], beyond_pct, spread} by action: the percentage of
     predicted values that lie outside the recorded range by more than BEYOND of it, and their spread divided by the
     recorded one. largest_state: by name, the largest normalised recorded state. plans_hz: steps per second of the
-    policy's plans. other_rates_hz: frames per second of each episode that has another rate.
+    policy's plans. other_rates_hz: frames per second of each episode that has another rate. remedy: for numbers that do
+    not fit.
     """
 
     frames: int
@@ -44,6 +46,7 @@ class Fit:
     largest_state: dict[str, float]
     plans_hz: float
     other_rates_hz: dict[str, float]
+    remedy: str = REMEDY
 
     def table(self) -> Table:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
@@ -60,13 +63,15 @@ class Fit:
         for name, found in self.actions.items():
             if found["beyond_pct"] > MOST_BEYOND_PCT:
                 what = f"{found['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
-                warnings.append(f"{name}: {what}; {REMEDY}")
+                warnings.append(f"{name}: {what}; {self.remedy}")
             elif found["spread"] < LEAST_SPREAD:
                 what = f"its predictions vary {100 * found['spread']:.0f} % as much as what was recorded"
-                warnings.append(f"{name}: {what}; {REMEDY}")
+                warnings.append(f"{name}: {what}; {self.remedy}")
         for name, largest in self.largest_state.items():
             if not largest <= LARGEST_STATE:
-                warnings.append(f"state {name}: the policy is told up to {largest:.3g} standard deviations; {REMEDY}")
+                warnings.append(
+                    f"state {name}: the policy is told up to {largest:.3g} standard deviations; {self.remedy}"
+                )
         for episode, found_hz in list(self.other_rates_hz.items())[:1]:
             what = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
             warnings.append(f"{what}: the car would drive at another speed than the human did")
@@ -107,4 +112,5 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
         found_hz = frame_rate_hz(list(episode))
         if found_hz is not None and is_another_rate(found_hz, config.rate_hz):
             others_hz[name] = found_hz
-    return Fit(len(few), action_range, actions, largest, config.rate_hz, others_hz)
+    remedy = OURS if checkpoint.report.get("written_here") else REMEDY
+    return Fit(len(few), action_range, actions, largest, config.rate_hz, others_hz, remedy)

@@ -1,1 +1,1 @@
-"""Recordings in, as samples: episode folders and LeRobotDatasets; and out again, as a LeRobotDataset."""
+"""Recordings in, as samples: episode folders, LeRobotDatasets and donkeycar tubs."""

@@ -81,7 +81,7 @@ def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dic
     ranks = np.array([PARTS.index(drawn.get(s.block, PARTS[0])) for _, s in every])
     kept = np.ones(len(every), bool)
     chunk = len(every[0][1].chunk)
-    plan_s = chunk / usual_rate_hz(episodes)
+    plan_s = chunk / (usual_rate_hz(episodes) or 1.0)
 
     def is_near(e: Episode, s: Sample, other: Episode, o: Sample) -> bool:
         """Whether two samples lie less than a plan apart."""

@@ -2,10 +2,13 @@
 
 Their actions say which two may be the same, and some of their pictures whether they are. So a copy is found that was
 encoded anew, renamed, cut or lacks some rows; and drives of a keyboard, whose actions repeat, are told apart.
+Pieces of one session at different times are never the same, and what cannot differ shows nothing: nearly black pictures
+agree with all others like them, and those of a standing car with each other.
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -20,12 +23,14 @@ DIGITS = 2  # of an action; somebody may have rounded them
 SHARED = 0.3  # the share of an episode's runs that makes it a suspect, and of its compared pictures that differ
 COMPARED, SEEN = 8, (16, 9)  # pictures of a suspect, and the size to which they are scaled down
 ALIKE = 4.0  # grey levels, on average over a picture; encoding anew changes less, and a car that moves more
+OF_CONTRAST = 0.1  # at most this share of the mean distance from a picture's mean
 CORRELATED = 0.98  # or so similar, whatever their brightness: a car that moved for five frames has 0.72 to 0.975
 MOST_ALIKE = 50  # episodes with the same run; it then tells nothing
 
 
 def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
     """Return the episodes without those that are the same drive as another, of which the longest is kept."""
+    scaled = lru_cache(1000)(_scaled)
     having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
     kept = set()
     for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
@@ -34,10 +39,14 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         for run, k in runs.items():
             for other, there in having[run]:
                 shared[other].append((k, there))
-        suspects = [other for other, pairs in shared.items() if len(pairs) >= SHARED * len(runs)]
-        same = next((other for other in suspects if _look_alike(episodes[i], episodes[other], shared[other])), None)
+        suspects = [
+            (episodes[other], pairs)
+            for other, pairs in shared.items()
+            if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other])
+        ]
+        same = next((other for other, pairs in suspects if _look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
-            note = f"the same drive as {episodes[same].id}, as its actions and pictures show"
+            note = f"the same drive as {same.id}, as its actions and pictures show"
             faults.add(episodes[i].path / episodes[i].id, "copy", note)
             continue
         kept.add(i)
@@ -62,18 +71,33 @@ def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
     return runs or {action + str(k).encode(): k for k, action in enumerate(actions)}
 
 
-def _look_alike(episode: Episode, other: Episode, pairs: list[tuple[int, int]]) -> bool:
-    """Whether most pictures at the same actions are the same. pairs: a sample of each."""
+def _follow(episode: Episode, other: Episode) -> bool:
+    """Whether they are pieces of one session, one after the other."""
+    first, second = sorted((episode, other), key=lambda e: e.begin_s)
+    return (
+        episode.session != "" and episode.session == other.session and first.begin_s + first.duration_s < second.begin_s
+    )
+
+
+def _look_alike(
+    episode: Episode, other: Episode, pairs: list[tuple[int, int]], scaled: Callable[[Sample], np.ndarray]
+) -> bool:
+    """Whether most pictures at the same actions are the same, and could differ. pairs: a sample of each."""
     chosen, others = pick_evenly(sorted(pairs), COMPARED), 0
     for k, there in chosen:
-        others += not _is_same(_scaled(episode.samples[k]), _scaled(other.samples[there]))
+        others += not _is_same(scaled(episode.samples[k]), scaled(other.samples[there]))
         if others > SHARED * len(chosen):
             return False
-    return True
+    ours = [scaled(episode.samples[k]) for k, _ in chosen]
+    if np.ptp([s.chunk[0] for s in episode.samples], axis=0).any() or not all(_is_same(ours[0], a) for a in ours):
+        return True
+    # The car stands, as it may have on another day: but noise never repeats.
+    return all(np.array_equal(a, scaled(other.samples[there])) for a, (_, there) in zip(ours, chosen, strict=True))
 
 
 def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
-    if np.abs(a - b).mean() <= ALIKE:
+    contrast = np.abs(a - a.mean()).mean()
+    if np.abs(a - b).mean() < min(ALIKE, OF_CONTRAST * contrast):
         return True
     a, b = a - a.mean(), b - b.mean()
     return float((a * b).sum()) > CORRELATED * float(np.linalg.norm(a) * np.linalg.norm(b))

@@ -158,7 +158,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     if layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     own, blocks = name_long_drives(leave_out_copies(episodes, faults))
-    return Recordings(dataset.root, own, faults.listed(), source, layout, blocks)
+    return Recordings(dataset.root, own, faults.listed(), source, layout, blocks, "dataset")
 
 
 class _Dataset:

@@ -1,6 +1,7 @@
 """The common form of our recordings and LeRobot's: samples, and what was wrong."""
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -53,6 +54,12 @@ class Source:
             return path
         names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
         return cls(Path(path), names, cameras, facts, throttle)
+
+    def typed(self) -> str:
+        """What a user types for it."""
+        said = {"--action-names": self.action_names, "--camera": self.cameras, "--throttle": (self.throttle,)}
+        options = [part for name, values in said.items() if any(values) for part in (name, ",".join(values))]
+        return shlex.join([str(self.path), *options])
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
@@ -212,6 +219,7 @@ class Recordings:
     """All usable episodes below `root`, and every fault that was found.
 
     blocks: the names of the blocks of each place, such as each tub of a folder; () where whole episodes are parted.
+    kind: what they are, a key of onboard.kinds.CALLED.
     """
 
     root: Path
@@ -220,6 +228,7 @@ class Recordings:
     source: Source
     layout: Layout = Layout()
     blocks: tuple[tuple[str, ...], ...] = ()
+    kind: str = "recordings"
 
     @property
     def samples(self) -> tuple[Sample, ...]:
@@ -265,7 +274,10 @@ class Recordings:
             "controls": sum(e.controls for e in self.episodes),
             "samples": len(self.samples),
             "duration_s": sum(e.duration_s for e in self.episodes),
+            "kind": self.kind,
+            "throttle": self.source.throttle,
             "layout": self.layout.words(),
+            "blocks": sum(map(len, self.blocks)),  # 0 where whole episodes are parted
             "labels": sorted({e.label for e in self.episodes}),
             "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},

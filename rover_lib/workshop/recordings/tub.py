@@ -119,7 +119,7 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
             named, names = name_blocks(left, place)
             episodes += named
             blocks += [names] if names else []
-    return Recordings(root, tuple(episodes), every.listed(), source, blocks=tuple(blocks))
+    return Recordings(root, tuple(episodes), every.listed(), source, blocks=tuple(blocks), kind="tub")
 
 
 @dataclass(frozen=True)

@@ -70,3 +70,10 @@ def test_recordings_of_another_rate_are_said(tiny, driven):
         found = [w for w in of(tiny, driven[:half] + other).warnings() if "steps a second" in w]
         assert len(found) == warned and all(f"episode_2 has {hz:.1f} frames" in w for w in found)
     assert of(tiny, driven[::3]).other_rates_hz == {}  # a frame that is missing makes no other rate
+
+
+def test_what_was_trained_here_is_not_asked_what_it_was_trained_with(tiny, driven):
+    """`rover train`'s own file, which had learned nothing: with its statistics nothing can be wrong."""
+    ours = replace(tiny, report=tiny.report | {"written_here": True})
+    (warning,) = of(ours, driven, action_unnorm=Affine((1.0, 0.01), (0.0, 0.0))).warnings()
+    assert "has learned too little" in warning and "?" not in warning

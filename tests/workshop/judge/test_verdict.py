@@ -222,3 +222,15 @@ def test_odd_frames_are_named(demo):
     (said,) = (line for line in judged["cautions"] if "backbone.layer4" in line)
     assert all(part in said for part in ("3.5 %", "(a, b, frame 3 or earlier)", "236 times", "7.84 %"))
     assert "leave out drives" in " ".join(judged["failed"][0]["remedies"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "command"), [("recordings", "rover record"), ("tub", "python manage.py drive"), ("dataset", "")]
+)
+def test_more_drives_are_recorded_by_what_recorded_these(demo, kind, command):
+    demo["load"]["recordings"] |= {"kind": kind, "blocks": 32}
+    demo["compare"]["guesses"] = {"warnings": ["this policy is no better than a guess without eyes: x"]}
+    judged = judge(demo)
+    said = [line for line in commands(judged) if line.startswith(("rover record", "python manage.py"))]
+    assert [line.startswith(command) for line in said] == [True] * bool(command)
+    assert "the same track and hour" in "".join(judged["cautions"])

@@ -1,11 +1,13 @@
 """Long drives in blocks: what is held out, and how far apart the parts are."""
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.recordings.blocks import name_blocks, name_long_drives
 from rover_lib.workshop.recordings.episodes import split
 from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of
@@ -30,8 +32,7 @@ def parted(episodes, share=0.25, seed=0):
     return split(Recordings(Path("tub"), named, (), Source(Path("tub")), blocks=(names,)), share, seed)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("count", [398, 614, 1098, 2239, 5015, 14135])
+@pytest.mark.parametrize(("count", "seed"), [(398, 0), (614, 0), (1098, 0), (1098, 1), (2239, 0), (14135, 0)])
 def test_a_tenth_to_a_quarter_is_held_out_a_plan_away(count, seed):
     pieces = [drive(count // 2), drive(count - count // 2, "tub from 1", count // 2 / RATE_HZ + 0.2)]
     parts = parted(pieces, seed=seed)
@@ -41,13 +42,25 @@ def test_a_tenth_to_a_quarter_is_held_out_a_plan_away(count, seed):
     assert not set(parts.episodes["held_out"]) & {*parts.episodes["calibration"], *parts.episodes["choosing"]}
     times = [np.array([s.state[0] for s in part]) for part in (learned, chosen, judged)]
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        assert np.abs(times[a][:, None] - times[b]).min() >= CHUNK - 4  # 0.2 s of the session were not recorded
+        for border in (times[b].min(), times[b].max(), *times[b][:-1][np.diff(times[b]) > 1]):
+            assert np.abs(times[a] - border).min() >= CHUNK - 4  # 0.2 s of the session were not recorded
     acted = [{*np.concatenate([s.chunk[~s.is_pad, 0] for s in part])} for part in (learned, chosen, judged)]
     assert not any(a & b for a, b in product(acted, acted) if a is not b)
 
 
+def test_each_tub_has_enough_stretches_for_a_limit():
+    parts = parted([drive(1098)])
+    unseen = Drives.of(parts)
+    assert len(unseen.unseen) >= 19 and not unseen.warnings and "stretches" in unseen.each
+    assert sum(len(of) for of in unseen.unseen.values()) >= 0.4 * (len(parts.choosing) + len(parts.held_out))
+
+
 def test_drives_of_seconds_and_many_of_them_are_parted_whole():
-    for episodes in ([drive(600, f"e{i}", session="") for i in range(5)], [drive(1300, f"e{i}") for i in range(20)]):
+    long = replace(drive(100, "e0"), duration_s=90.0)
+    for episodes in (
+        [drive(100, f"e{i}", session="") for i in range(5)],
+        [replace(long, id=f"e{i}") for i in range(20)],
+    ):
         assert name_long_drives(episodes) == (tuple(episodes), ())
         assert block_of(episodes[0].samples[0]) == "e0"
     (few, *_), ((*names,),) = name_long_drives([drive(2400, session=""), drive(2400, "tub from 1", session="")])

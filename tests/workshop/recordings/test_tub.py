@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command import rover
+from recorded import record_drives
 from test_episodes import kinds
 
 from rover_exchange.export_dataset import usual_rate_hz
@@ -182,7 +183,7 @@ def test_what_is_broken_is_counted(tmp_path):
         with pytest.raises(EpisodeError, match=r"manifest\.json"):
             read_tub(root, LEFT)
     (root / "manifest.json").write_text('{"paths": ["catalog_1.catalog"]}')
-    with pytest.raises(EpisodeError, match="catalog_missing.*catalogs included"):
+    with pytest.raises(EpisodeError, match=r"catalog_missing.*catalogs included"):
         read_tub(root, LEFT)
     (root / "catalog_0.catalog").unlink()
     with pytest.raises(EpisodeError, match="a donkeycar tub without its catalogs"):
@@ -201,3 +202,73 @@ def test_what_is_imported_has_the_tubs_pictures_and_actions(tmp_path, monkeypatc
     assert len(again.samples) == len(ours) == 48
     assert (ours[7].frame_bgr() == again.samples[7].frame_bgr()).all()
     assert all((a.chunk[0] == b.chunk[0]).all() for a, b in zip(ours, again.samples, strict=True))
+
+
+def test_pieces_of_one_session_and_dark_pictures_are_no_copies(tmp_path):
+    """In a tub of edges, white on black, 51 of 99 pieces were called copies, and no two pictures were the same."""
+    rows = []
+    for k in range(6):
+        rows += records(30, f"s{k // 3}", 40 * k)
+    for row in rows:
+        row |= {"user/angle": 0.0, "user/throttle": 0.3}
+    root = tub(tmp_path / "tub", rows)
+    rng = np.random.default_rng(0)
+    for row in rows:
+        edges = np.zeros((120, 160, 3), np.uint8)
+        cv2.line(edges, *rng.integers(0, 120, (2, 2)).tolist(), (255, 255, 255))
+        cv2.imwrite(str(root / "images" / row["cam/image_array"]), edges)
+    found = read_tub(root, LEFT)
+    assert kinds(found) == {"records_missing": 4} and len(found.episodes) == 6
+    for row in rows:
+        cv2.imwrite(str(root / "images" / row["cam/image_array"]), np.full((120, 160, 3), 3, np.uint8))
+    assert "copy" not in kinds(read_tub(root, LEFT))
+
+
+def test_a_folder_of_tubs_is_read_by_its_folders_names(tmp_path):
+    """A chunk has the asked number of steps, and another tub's copy or a broken tub is left out."""
+    for name, first in (("one", 0), ("two/b", 300), ("copied", 0)):
+        tub(tmp_path / "data" / name, records(300, first=first), per_catalog=1000)
+    tub(tmp_path / "data" / "erased", records(10), deleted=range(10))
+    recordings = read_tub(tmp_path / "data", LEFT, chunk=8)
+    assert [e.id for e in recordings.episodes] == ["copied/21-08-21_0 from 0", "two/b/21-08-21_0 from 300"]
+    assert kinds(recordings) == {"copy": 1, "unusable_tub": 1} and recordings.summary()["kind"] == "tub"
+    erased = next(fault.note for fault in recordings.faults if fault.kind == "unusable_tub")
+    assert "deleted_record 10 times" in erased and erased.endswith("copy the tub as it was before")
+    for i in (0, 150, 295):
+        sample = recordings.episodes[0].samples[i]
+        steps = [min(i + k, 299) for k in range(8)]
+        assert sample.chunk == pytest.approx(np.array([[-angle(k), throttle(k)] for k in steps]), abs=1e-6)
+        assert sample.is_pad.tolist() == [i + k > 299 for k in range(8)]
+    assert {"copied/manifest.json", "copied/catalog_0.catalog"} < recordings.hashes().keys()
+    parts = split(recordings)
+    assert {name.split(" block")[0] for name in parts.episodes["held_out"]} == {"copied", "two/b"}
+    for place in ("copied", "two/b"):
+        assert 0.1 < sum(s.block.startswith(place) for s in parts.held_out) / 300 < 0.25
+
+
+def test_what_a_tub_needs_is_kept_for_the_next_stage(tmp_path):
+    rows = [row | {"user/throttle": -0.2} for row in records(40)]
+    root = tub(tmp_path / "data" / "tub", rows)
+    with pytest.raises(EpisodeError, match="--throttle negated"):
+        read_tub(root.parent, Car())
+    source = Source.loaded({"episodes": str(root.parent), "throttle": "negated"})
+    assert all(s.chunk[0, 1] == np.float32(0.2) for s in load_recordings(source).samples)
+    tub(tmp_path / "data" / "forward", [row | {"user/throttle": 0.2} for row in rows])
+    with pytest.raises(EpisodeError, match=r"positive already.*by themselves"):
+        load_recordings(source)
+    with pytest.raises(EpisodeError, match="for donkeycar tubs"):
+        load_recordings(Source.of(record_drives(tmp_path / "ours", drives=1), throttle="negated"))
+
+
+def test_reverse_is_said_to_be_read_as_stopped(tmp_path):
+    """40 % of a tub's records were called "repaired"."""
+    (fault,) = read_tub(tub(tmp_path / "tub", records(70)), Car()).faults
+    assert fault.handled == "read as stopped" and fault.note.startswith("43 % of the records have negative throttle")
+    assert "reverse_us" in fault.note and "--throttle as-recorded" in fault.note
+
+
+def test_a_slow_camera_keeps_its_rate(tmp_path):
+    """4.35 Hz became 4, and plans 8 % slower."""
+    rows = [row | {"_timestamp_ms": 1_629_500_000_000 + 230 * i} for i, row in enumerate(records(20))]
+    assert usual_rate_hz(read_tub(tub(tmp_path / "tub", rows), LEFT)) == pytest.approx(1 / 0.23, abs=1e-3)
+    assert usual_rate_hz(read_tub(tub(tmp_path / "usual", records(20)), LEFT)) == 20
