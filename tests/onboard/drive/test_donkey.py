@@ -300,7 +300,9 @@ def test_the_pages_lines_drive_in_donkeycars_own_loop(tmp_path, monkeypatch):
     from lab.driving.policy import make_artifact
     from rover_lib.onboard.policy.load import load_policy
 
-    make_artifact(tmp_path / "policy_static.pt", size=(60, 80), plan=PLANNED, follows=0.5)
+    make_artifact(
+        tmp_path / "policy_static.onnx.zip", size=(60, 80), plan=PLANNED, follows=0.5
+    )  # of torch: the name does not count
     monkeypatch.chdir(tmp_path)
     asked, calls, turns = [], [], []
     predict, add, command = PolicyProcess.predict, Follower.add, Follower.command
@@ -336,7 +338,7 @@ def test_the_pages_lines_drive_in_donkeycars_own_loop(tmp_path, monkeypatch):
     meant = [made for call in calls if (made := call(ours))]
     assert len(meant) > 40 and turns[-len(meant) :] == [(made.steering, made.throttle) for made in meant]
     assert all(turn == NEUTRAL for turn in turns[: -len(meant)])
-    policy = load_policy("policy_static.pt")
+    policy = load_policy("policy_static.onnx.zip")
     for frame, state, answer in asked:
         assert answer == pytest.approx(policy.predict_unclipped(frame, state), abs=1e-5)
     assert len({answer[0, 0] for *_, answer in asked}) > 10
