@@ -89,6 +89,11 @@ def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> 
     return network, epochs
 
 
+def r2(answers: Tensor, wanted: Tensor) -> float:
+    """Return the share of the variance that the answers explain: 0 for the mean, 1 for the driver's own actions."""
+    return 1 - float(((answers - wanted) ** 2).mean() / wanted.var(correction=0))
+
+
 def judge(source: Path | str) -> dict[str, Any]:
     """Train on recordings, and return R² of steering on the held-out part, by seconds ahead, and how it came about."""
     torch.set_num_threads(1)  # at this size, a second one mostly waits
@@ -98,15 +103,15 @@ def judge(source: Path | str) -> dict[str, Any]:
     picked = [pick_evenly(part, MOST) for part in (parts.calibration, parts.choosing, parts.held_out)]
     learning, choosing, held_out = (tensors(part, rate_hz) for part in picked)
     network, epochs = train(learning, choosing, p["seed"])
-    r2, spreads = {}, {}
-    for i, (ahead_s, answer) in enumerate(zip(AHEAD_S, predict(network, held_out[0]).T, strict=True)):
-        known = held_out[2][:, i]
-        wanted, answer = held_out[1][known, i].double(), answer[known].double()
-        r2[f"{ahead_s:g}"] = round(1 - float(((answer - wanted) ** 2).mean() / wanted.var(correction=0)), 4)
-        spreads[f"{ahead_s:g}"] = round(float(answer.std(correction=0)), 4)
+    answers, wanted, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
+    shares, spreads = {}, {}
+    for i, ahead_s in enumerate(AHEAD_S):
+        known = driven[:, i]
+        shares[f"{ahead_s:g}"] = round(r2(answers[known, i], wanted[known, i]), 4)
+        spreads[f"{ahead_s:g}"] = round(float(answers[known, i].std(correction=0)), 4)
     return {
-        "r2": r2,
-        "spread": round(float(held_out[1][:, 0].double().std(correction=0)), 4),  # the driver's
+        "r2": shares,
+        "spread": round(float(wanted[:, 0].std(correction=0)), 4),  # the driver's
         "predicted_spread": spreads,
         "samples": dict(zip(("learning", "choosing", "held_out"), map(len, picked), strict=True)),
         "rate_hz": round(rate_hz, 2),
