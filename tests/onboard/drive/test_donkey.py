@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+import needs
 import numpy as np
 import pytest
 from fake_drive import Clock, Log
@@ -291,6 +292,7 @@ def test_nothing_is_raised_into_the_loop(world, clock):
     policy.closed.set()
 
 
+@needs.real_time
 def test_the_pages_lines_drive_in_donkeycars_own_loop(tmp_path, monkeypatch):
     """A real artifact in its own process, in real time: each action is our own follower's by our own engine's plans."""
     dk = pytest.importorskip("donkeycar", reason="needs donkeycar, which needs Python 3.12: .ci/run installs it")
