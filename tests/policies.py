@@ -201,7 +201,7 @@ class MemorySample:
     episode: str = "memory"
     block: str = ""
 
-    def frame_bgr(self) -> np.ndarray:
+    def frame_bgr(self, least: int = 0) -> np.ndarray:
         return self.picture
 
 

@@ -1,5 +1,6 @@
 """A policy with a constant plan, and pictures for its camera."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,19 +13,31 @@ CHUNK, RATE_HZ = 32, 30.0
 PLAN = 0.2, 0.15  # steering, throttle
 
 
-def make_artifact(path: Path, *, camera: str = "front", size: tuple[int, int] = (48, 96)) -> None:
-    """Write an artifact with the constant plan PLAN. camera: its name. size: height and width of its pictures."""
+def make_artifact(
+    path: Path,
+    *,
+    camera: str = "front",
+    size: tuple[int, int] = (48, 96),
+    plan: Sequence[Sequence[float]] | np.ndarray = (PLAN,) * CHUNK,
+    follows: float = 0.0,
+) -> None:
+    """Write an artifact with a plan, (CHUNK, 2), that a white picture moves by `follows` from a black one's.
+
+    camera: its name. size: height and width of its pictures.
+    """
     import torch
+
+    planned = np.asarray(plan, np.float32)
 
     class Constant(torch.nn.Module):
         plan: torch.Tensor
 
         def __init__(self):
             super().__init__()
-            self.register_buffer("plan", torch.tensor([PLAN] * CHUNK)[None])
+            self.register_buffer("plan", torch.tensor(planned)[None])
 
         def forward(self, state, frame):
-            return self.plan + 0 * state[:, None]
+            return self.plan + 0 * state[:, None] + follows * frame.float().mean() / 255
 
     names, frame = ["steering", "throttle"], f"frame_{camera}"
     manifest = {
@@ -47,7 +60,7 @@ def make_artifact(path: Path, *, camera: str = "front", size: tuple[int, int] = 
     }
     seen: dict[str, np.ndarray] = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
     graph = torch.jit.trace(Constant().eval(), (torch.zeros(1, 2), torch.zeros((*size, 3), dtype=torch.uint8)))
-    save_artifact(path, torch.jit.freeze(graph), manifest, seen | {"chunk": np.full((1, CHUNK, 2), PLAN, np.float32)})
+    save_artifact(path, torch.jit.freeze(graph), manifest, seen | {"chunk": planned[None]})
 
 
 def pictures(size: tuple[int, int] = SIZE, count: int = 40) -> list[bytes]:

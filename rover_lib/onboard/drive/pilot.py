@@ -144,7 +144,7 @@ class PolicyPilot:
             if time.monotonic() > end:
                 raise PolicyError(f"no plan within {FIRST_PLAN_S:g} s", remedy="does 'rover benchmark' run on it?")
 
-    def order(self, now_s: float) -> Order | None:
+    def order(self, now_s: float) -> Order:
         frame = self._camera.latest()
         if frame:
             self._frame_age_s = max(self._frame_age_s, now_s - frame.captured_s)
