@@ -36,10 +36,10 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
-from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
+from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
