@@ -21,13 +21,14 @@ from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
+from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import CAR, DRIVEN_BY, INTERVENTION, REPORT
 from rover_lib.workshop.recordings.names import ACTION, CAMERA, STATE
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample, Source
-from rover_lib.workshop.recordings.turning import measure_sides
+from rover_lib.workshop.states import OTHER_STATE
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
@@ -56,7 +57,7 @@ def export_dataset(
     if size and not least <= min(size) <= max(size) <= most:
         raise EpisodeError(f"pictures must have {least} to {most} pixels a side", found=f"{size[1]}x{size[0]}")
     recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
-    if recordings.layout.rate_hz is not None:
+    if recordings.layout.rate_hz is not None and not any(fault.kind == OTHER_STATE for fault in recordings.faults):
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = usual_rate_hz(recordings)
     car = recorded_as.car_of(recordings.samples)

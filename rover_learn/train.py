@@ -48,13 +48,13 @@ from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
+from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source, pick_evenly
-from rover_lib.workshop.recordings.turning import measure_sides
 
 if TYPE_CHECKING:
     from lerobot.policies.act.modeling_act import ACTPolicy

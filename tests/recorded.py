@@ -92,7 +92,8 @@ def lerobot_dataset(
 ) -> Path:
     """Write a dataset by LeRobot's own writer, of one episode of each of these lengths, in frames. Returns `root`.
 
-    cameras: name -> (height, width). kind: "image" or "video". States and actions are random, from 0 to `largest`.
+    cameras: name -> (height, width). kind: "image" or "video". Actions are random, from 0 to `largest`; a state is the
+    action before.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -104,9 +105,12 @@ def lerobot_dataset(
     video = {"use_videos": kind == "video", "video_backend": "pyav"}
     made, rng = LeRobotDataset.create("local/made", rate_hz, features, root=root, **video), np.random.default_rng(0)
     for episode, frames in enumerate(lengths):
+        before = np.zeros(len(names), np.float32)
         for _ in range(frames):
             row: dict[str, Any] = {key: smooth_frame(rng, *shape[:2]) for key, shape in pictures.items()}
-            row |= {key: rng.uniform(0, largest, len(names)).astype(np.float32) for key in numbers}
+            action = rng.uniform(0, largest, len(names)).astype(np.float32)
+            row |= dict(zip(numbers, (before, action), strict=True))
+            before = action
             made.add_frame(row | {"task": f"hit the {episode}. balloon"})
         made.save_episode()
     made.finalize()

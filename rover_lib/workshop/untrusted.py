@@ -5,7 +5,8 @@ import json
 import resource
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ MEMORY_BYTES = 450_000_000  # a frame of 4608x2592 takes 36 MB; a decoder holds 
 STATM = Path("/proc/self/statm")
 FORMATS = ("PNG", "JPEG")  # what LeRobot writes; Pillow would start Ghostscript for PostScript
 CODECS = ("h264", "hevc", "av1", "libdav1d")  # what LeRobot writes, by FFmpeg's names of decoders
+ZEROS = bytes(32)  # in a row; the codecs put another byte after two, or hardly ever write as many
+MOST_DECODED = 300_000_000  # pixels of a video that are decoded to find damage: 1,300 pictures of 640x360, seconds
+AHEAD = 8  # pictures that a decoder may read before it gives one; an error there costs that one too
 ROW_BYTES = 4  # in a table, a frame's index and its time alone take more
 _LOCK = threading.RLock()
 
@@ -86,6 +90,43 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
     if found[0] not in CODECS or found[1:] != size:
         what = f"{path}: has another shape or codec than {size} in h264, hevc or av1"
         raise EpisodeError(what, found=found, remedy="encode it anew")
+
+
+def scan_video(path: Path) -> tuple[list[float], set[float]]:
+    """Return when the pictures of a video are shown, in seconds, in order; and when those that are torn are.
+
+    A picture needs those before it, up to one that is whole by itself. All packets are read: an encoder writes no row
+    of zeros, as a copy does that was not finished. Some are decoded, as other damage shows there only.
+    """
+    import av
+
+    with av.open(str(path), format="mp4") as container:
+        stream = container.streams.video[0]
+        packets: list[Any] = [packet for packet in container.demux(stream) if packet.pts is not None]
+        begins = [k for k, packet in enumerate(packets) if packet.is_keyframe or k == 0]
+        groups = [packets[a:b] for a, b in pairwise([*begins, len(packets)])]
+        every = max(1, round(len(packets) * stream.height * stream.width / MOST_DECODED))
+        torn: set[int] = set()
+        for number, (group, first) in enumerate(zip(groups, begins, strict=True)):
+            bad = next((k for k, packet in enumerate(group) if ZEROS in bytes(packet)), len(group))
+            if bad == len(group) and number % every == 0:
+                bad = _decoded(stream.codec_context, group)
+            if bad < len(group):
+                torn |= {*range(max(0, first + bad - AHEAD), first + len(group))}
+        times_s = [float(packet.pts * packet.time_base) for packet in packets]
+    return sorted(times_s), {times_s[k] for k in torn}
+
+
+def _decoded(decoder: Any, packets: list[Any]) -> int:
+    """Return how many of a group of pictures can be decoded before the first that cannot."""
+    import av
+
+    shown = set()
+    decoder.flush_buffers()
+    for packet in (*packets, None):  # decoders keep some pictures back until the end
+        with suppress(av.FFmpegError):
+            shown |= {frame.pts for frame in decoder.decode(packet) if not frame.is_corrupt}
+    return next((k for k, packet in enumerate(packets) if packet.pts not in shown), len(packets))
 
 
 def check_table(path: Path) -> list[str]:

@@ -25,6 +25,7 @@ from rover_lib.workshop.untrusted import quote, quote_all
 
 USER, GUESS = "--facts", "a guess"
 WORDS = yaml.safe_load(Path(__file__).with_name("keys.yml").read_text())
+NETWORK = 10_000  # floats; more may be all weights of a network
 SMALL = 64  # numbers or keys; more are weights
 # Values that change nothing, unlike True.
 NOTHING: tuple[Any, ...] = (None, False, 0, 1, "", "none", "identity", "rgb", "relu", "sine", "jpg", "png", [], (), {})
@@ -93,7 +94,7 @@ class Facts:
                 self.unknown[key.name] = None if key.harmless else key.value
         if refused:
             key, why = next(iter(refused.items()))
-            shown = f"{len(key.value)} values" if isinstance(key.value, Mapping) else key.value
+            shown = f"{len(key.value)} values" if key.of_network or isinstance(key.value, Mapping) else key.value
             raise self.refusal(key.name, shown, why, ",".join(each.name for each in refused))
 
     def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:
@@ -139,6 +140,7 @@ class _Key:
         self.words = words_of(name) | (words_of(value) if isinstance(value, str) else set())  # action_type: delta
         self.several = isinstance(value, (list, tuple)) and len(value) > 1
         self.is_label = self.has("labels") and not self.several  # the name of a run may have any words
+        self.of_network = count_floats(value) >= NETWORK
         done = any(self.last >= {*these} for these in WORDS["done"])
         self.done = done or (self.has("image") and "normali" in name)  # always, here
 
@@ -152,6 +154,8 @@ class _Key:
         if self.done and isinstance(self.value, bool):
             return self.value
         of_training = self.has("training") or not self.words.isdisjoint(WORDS["augments"])
+        if self.of_network and self.has("weights") and self.words.isdisjoint(WORDS["optimizer"]):
+            return False
         usual = any(_same(self.value, own) for own in (IMAGENET_MEAN, IMAGENET_STD))
         return (self.value is not True and self.value in NOTHING) or of_training or usual
 
@@ -168,7 +172,9 @@ class _Key:
         """Say why it cannot be passed over though its words say nothing, or "". chunk: steps of a plan."""
         if self.done and self.value is False:
             return "and here that is always done"
-        if isinstance(self.value, Mapping) and any(isinstance(v, Tensor) for v in self.value.values()):
+        if self.of_network or (
+            isinstance(self.value, Mapping) and any(isinstance(v, Tensor) for v in self.value.values())
+        ):
             return "which may be the weights that should drive"
         about = self.has("image") or self.has("numbers") or (self.several and self.last & {"camera", "cameras"})
         if about and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
@@ -181,6 +187,15 @@ def words_of(key: str) -> set[str]:
     return set(re.findall("[a-z]+[0-9]*", re.sub("([a-z])([A-Z])", r"\1_\2", key).lower()))
 
 
+def count_floats(value: Any) -> int:
+    """Return how many numbers all tensors of floats in nested dicts, lists and tuples have."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, (list, tuple)):
+        return sum(map(count_floats, value))
+    return value.numel() if isinstance(value, Tensor) and value.is_floating_point() else 0
+
+
 def _same(a: Any, b: Any) -> bool:
     try:
         return bool(np.allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-4, atol=1e-6, equal_nan=True))
@@ -190,7 +205,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _flatten(value: Any, key: str) -> Iterator[tuple[str, Any]]:
     """Yield ("action_stats.mean", [0.0, 0.4]): dicts opened unless they number names, small tensors as lists."""
-    if isinstance(value, (Tensor, np.ndarray, np.generic)):
+    if isinstance(value, (Tensor, np.ndarray, np.generic)) and count_floats(value) < NETWORK:
         count = value.numel() if isinstance(value, Tensor) else value.size
         value = value.tolist() if count <= SMALL else f"{count} numbers"
     numbered = isinstance(value, Mapping) and read_as_car(tuple(value)) and all(map(is_number, value.values()))

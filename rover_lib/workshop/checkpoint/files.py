@@ -5,7 +5,7 @@ Pickles are read with weights_only=True, and what that refuses is refused by nam
 
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import atomic_path, plain, read_plain
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.act_config import imagenet
-from rover_lib.workshop.checkpoint.facts import Facts
+from rover_lib.workshop.checkpoint.facts import USER, Facts
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -33,8 +33,11 @@ MOST = 8192  # pixels a side, or numbers of a state or an action, before `check_
 COPY_AGAIN = "copy it again, the whole folder if it is one"
 CORRECT_IT = "correct the config to what the policy was trained with"
 IS_IT_WHOLE = "is it an ACTPolicy of LeRobot, and whole? If its weights hold statistics, remove policy_p*processor.json"
-# Names that torch.compile, DataParallel and trainers put around a policy's own, which change nothing.
-WRAPPERS = r"^(module\.|policy\.)+|_orig_mod\."
+# Parts of names that torch.compile, DataParallel, FSDP and checkpointing put anywhere, which change nothing.
+WRAPPERS = r"(?<![^.])(module|_orig_mod|_(fsdp|checkpoint)_wrapped_module)\."
+COUNTS = r"(.*\.)?(num_batches_tracked|n_averaged)"  # a batch norm's, and AveragedModel's; LeRobot's norms are frozen
+OF_ACT = "action_head.weight"  # every ACT has one: what stands before it stands before all its names
+TORN, TORN_ROW = 1024, 64  # zeros that no training leaves in a matrix: one after the other, and in one of its rows
 RATE_HZ = 30.0  # steps of a plan in a second if nothing says it: the rate of the trainer's recordings
 JSON_BYTES = 1_000_000  # settings take some kB
 TRAINER_CAMERA, OF_TRAINER = "cam_front", "the trainer's format"
@@ -54,6 +57,7 @@ STATISTICS = re.compile(
     r"\.(pth?|json|ya?ml|pkl|joblib|np[yz]|safetensors)",
     re.I,
 )
+AVERAGED = re.compile(r"([^.].*[_.-])?(ema|swa|averaged?|shadow|polyak)([_.-].*)?\.(safetensors|pth?|ckpt|bin)", re.I)
 # best_val_loss is np.mean's float64; older numpys pickled it as numpy.core, newer ones as numpy._core.
 SCALAR = np.float64(0).__reduce__()[0]
 NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
@@ -69,26 +73,81 @@ OTHERS = (  # how other files begin, what they are, and what to do
 )
 
 
-def name_weights(path: Path, state: dict[Any, Any]) -> Weights:
-    """Return the weights by LeRobot's names without `model.`.
+def name_weights(path: Path, state: Mapping[Any, Any], ignored: Container[str] = ()) -> Weights:
+    """Return the weights by LeRobot's names, which begin with `model.`, without what others put before that.
 
-    Raises CheckpointError unless all names begin so and all weights are dense floats with values.
+    ignored: prefixes of networks in it that the user does not want. Raises CheckpointError if there is no ACT in it, or
+    several that differ.
     """
-    # A batch norm counts its batches; LeRobot's are frozen and drop the count.
-    state = {re.sub(WRAPPERS, "", str(k)): v for k, v in state.items() if not str(k).endswith(".num_batches_tracked")}
-    if "action_head.weight" in state:  # those of the network, without the policy around it
-        state = {f"model.{k}": v for k, v in state.items()}
-    odd = []
+    named: dict[str, Any] = {}
     for key, weight in state.items():
+        name = re.sub(WRAPPERS, "", str(key))
+        if not _is_same(named.setdefault(name, weight), weight):
+            raise CheckpointError(f"{path}: has two '{name}', which differ", remedy="save one policy.state_dict()")
+    prefixes = sorted(name.removesuffix(OF_ACT) for name in named if re.fullmatch(rf"(.*\.)?{OF_ACT}", name))
+    kept = [prefix for prefix in prefixes if not prefix or prefix.rstrip(".") not in ignored]
+    if not kept:
+        remedy = "give an ACTPolicy of LeRobot's; of another network, nothing can be used"
+        raise CheckpointError(f"{path}: no ACT, which has an '{OF_ACT}'", found=quote_all(named), remedy=remedy)
+
+    def network(prefix: str) -> dict[str, Any]:
+        others = tuple(each for each in prefixes if each.startswith(prefix) and each != prefix)
+        inside = [name for name in named if name.startswith(prefix) and not name.startswith(others or ("\0",))]
+        return {name.removeprefix(prefix): named[name] for name in inside}
+
+    own = network(kept[0])
+    for each in kept[1:]:
+        if not all(_is_same(own.get(name), weight) for name, weight in network(each).items()):
+            option = " or ".join(f"{USER} ignore={prefix.rstrip('.')}" for prefix in kept if prefix)
+            what = f"{path}: several networks are in it, that differ: which one drives?"
+            raise CheckpointError(what, found=f"names with {quote_all(kept)}", remedy=f"say which does not: {option}")
+    around = kept[0].removesuffix("model.")  # before the names of the policy's other parts, such as statistics
+    known = tuple(prefix for prefix in prefixes if prefix) or ("\0",)
+    rest = {name.removeprefix(around): named[name] for name in named if kept[0] and not name.startswith(known)}
+    return {f"model.{name}": weight for name, weight in own.items()} | rest
+
+
+def _is_same(a: Any, b: Any) -> bool:
+    return a is b or (isinstance(a, Tensor) and isinstance(b, Tensor) and torch.equal(a, b))
+
+
+def check_weights_are_whole(path: Path, weights: Mapping[str, Any]) -> Weights:
+    """Return a network's weights without `model.`.
+
+    Raises CheckpointError for other names, what is no dense tensor of floats with values, and for matrices with a long
+    row of zeros, as in files that were not copied to their end.
+    """
+    weights = {name: weight for name, weight in weights.items() if not re.fullmatch(COUNTS, name)}
+    odd, torn = [], []
+    for name, weight in weights.items():
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
         if not dense or not weight.is_floating_point():  # as a quantized tensor is not
-            odd.append(key)
+            odd.append(name)
+        elif weight.dim() > 1 and "state_input" not in name and _is_torn(weight, ".backbone." in name):
+            torn.append(name)
     if odd:
         what = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
         raise CheckpointError(what, remedy="save policy.state_dict() as it was trained")
-    if outside := [k for k in state if not k.startswith("model.")]:
+    if outside := [name for name in weights if not name.startswith("model.")]:
         raise CheckpointError(f"{path}: names outside 'model.': {quote_all(outside)}", remedy=IS_IT_WHOLE)
-    return {k.removeprefix("model."): v for k, v in state.items()}
+    if torn:
+        what = f"{path}: damaged, its weights are zeros where a training leaves none: {quote_all(torn)}"
+        raise CheckpointError(what, remedy=f"was it copied to its end? {COPY_AGAIN}")
+    return {name.removeprefix("model."): weight for name, weight in weights.items()}
+
+
+def _is_torn(weight: Tensor, backbone: bool) -> bool:
+    """Whether a matrix has TORN zeros in a row, or only zeros.
+
+    In the backbone, channels may be left out: rows of zeros, and the same columns of all others.
+    """
+    zero = (weight.detach().flatten(1) == 0).numpy()
+    if backbone or zero.size < TORN:
+        left = zero[~zero.all(1)]
+        return not len(left) or int((left & ~left.all(0)).sum(1).max()) >= TORN_ROW
+    whole = zero.ravel()
+    blocks = whole[: whole.size // TORN * TORN].reshape(-1, TORN).all(1)
+    return bool(blocks.any() or whole[-TORN:].all())
 
 
 def name_numbers(count: int, stem: str) -> tuple[str, ...]:
@@ -131,7 +190,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
             remedy = "is it the trainer's, or only weights? those of the first ACT, ALOHA's, are of another network"
             raise CheckpointError(f"{path}: no '{key}' in it", found=found, remedy=remedy)
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
-    weights = name_weights(path, content["model_state_dict"])
+    weights = check_weights_are_whole(path, name_weights(path, content["model_state_dict"], facts.ignored))
     loss = content.get("best_val_loss")  # NaN if the training had diverged
     with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
@@ -140,9 +199,7 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
     with as_checkpoint_error(path):
         facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
         facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
-        for file in sorted(path.parent.iterdir()):
-            if STATISTICS.fullmatch(file.name) and file.name not in facts.ignored:
-                raise facts.refusal(file.name, "beside it", "which may mean how its numbers are normalised")
+        for file in check_beside(path.parent, facts):
             said = yaml.safe_load(read_plain(file, JSON_BYTES)) if BESIDE.fullmatch(file.name) else None
             if isinstance(said, dict) and "input_features" not in said:  # that is LeRobot's, of another format
                 facts.read({k: v for k, v in said.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
@@ -154,6 +211,21 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
         "trainer_config": plain(raw),
     }
     return _config(path, raw, weights, facts), weights, extra
+
+
+def check_beside(folder: Path, facts: Facts) -> list[Path]:
+    """Return a folder's files. Raises CheckpointError for one whose name says statistics or averaged weights."""
+    found = sorted(folder.iterdir())
+    named = b"".join(read_plain(path, JSON_BYTES) for path in folder.glob("policy_p*processor.json"))  # LeRobot's own
+    for pattern, meaning in (
+        (STATISTICS, "which may mean how its numbers are normalised"),
+        (AVERAGED, "which may be the weights that should drive"),
+    ):
+        for file in found:
+            ours = file.name in facts.ignored or file.name.encode() in named
+            if pattern.fullmatch(file.name) and not ours:
+                raise facts.refusal(file.name, "beside it", meaning)
+    return found
 
 
 def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> ActConfig:

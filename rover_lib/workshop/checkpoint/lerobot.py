@@ -7,7 +7,7 @@ statistics and so is left as it is, is checked here.
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import astuple, fields
+from dataclasses import astuple, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,8 @@ WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
 SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
 IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
 Sizes = tuple[tuple[int, int], ...]
+VARIES = 1e-5  # standard deviation, or half of a range; less is rounding
+APART = 2.0  # deviations, or as many times as large: statistics of other numbers than the actions
 EPS = 1e-8  # what LeRobot's normaliser adds to a standard deviation
 SAME = {"type", "chunk_size", "input_features", "output_features", "normalization_mapping", "vision_backbone"}
 NOT_OF_POLICY = {"policy", "optimizer", "scheduler", "eval", "wandb", "env"}  # sections of train_config.json
@@ -65,12 +67,15 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         raise CheckpointError(what, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     said = _act_config(folder, raw, facts)
-    tensors, inside = _read_safetensors(folder / WEIGHTS), dict[str, Tensor]()
+    tensors, inside = (
+        files.name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored),
+        dict[str, Tensor](),
+    )
     # Statistics of before LeRobot had processors.
     for key in () if (folder / OUTER[0]).exists() else (*said.input_features, *said.output_features):
         for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
             inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
-    weights = files.name_weights(folder, tensors)
+    weights = files.check_weights_are_whole(folder, tensors)
     inner, outer = Normaliser(folder, *INNER, said, inside), Normaliser(folder, *OUTER, said, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
@@ -102,8 +107,54 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
             **{ours: getattr(said, theirs) for ours, theirs in LEROBOTS.items()},
         )
+        if config.state_norm is not None:
+            config, weights = _without_constants(config, weights, inner, facts)
+        _compare_statistics(config, inner, outer, facts)
+    files.check_beside(folder, facts)
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
     return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
+
+
+def _without_constants(
+    config: ActConfig, weights: files.Weights, inner: "Normaliser", facts: Facts
+) -> tuple[ActConfig, files.Weights]:
+    """Return a policy to which numbers of the state that never varied in its training are what they were then.
+
+    Its network learned nothing from them, and their scale of 1e8 would make anything of a car's last action.
+    """
+    norm, constants = config.state_norm, inner.constants("observation.state", config.state_norm)
+    if norm is None or not constants:
+        return config, weights
+    weights, chosen = dict(weights), list(constants)
+    for stem in ("encoder_robot_state_input_proj", "vae_encoder_robot_state_input_proj"):
+        if f"{stem}.weight" in weights:
+            columns = weights[f"{stem}.weight"].clone()
+            weights[f"{stem}.bias"] = weights[f"{stem}.bias"] + columns[:, chosen].sum(1) * constants[chosen[0]]
+            columns[:, chosen] = 0
+            weights[f"{stem}.weight"] = columns
+    scale = tuple(1.0 if i in constants else each for i, each in enumerate(norm.scale))
+    shift = tuple(0.0 if i in constants else each for i, each in enumerate(norm.shift))
+    which = quote_all(config.state_names[i] for i in chosen)
+    facts.notes.append(
+        f"its state ({which}) never varied in its training, so that it learned nothing from it: whatever a car gives, "
+        "the network is given what it was then; to use it, train on a state that is the last action"
+    )
+    return replace(config, state_norm=Affine(scale, shift)), weights
+
+
+def _compare_statistics(config: ActConfig, inner: "Normaliser", outer: "Normaliser", facts: Facts) -> None:
+    """Note a state of two numbers whose statistics are not those of the actions: a car's state is its last action."""
+    state, action = inner.statistics("observation.state"), outer.statistics("action")
+    if config.action_names != files.ACTION_NAMES or not (len(state) == len(action) == 2):
+        return
+    for name, (mean, std), (own_mean, own_std) in zip(config.state_names, state, action, strict=True):
+        alike = abs(mean - own_mean) <= APART * own_std and own_std <= APART * std and std <= APART * own_std
+        if min(std, own_std) > VARIES and not alike:
+            what = f"mean {mean:.3g}, deviation {std:.3g}, and its action's {own_mean:.3g}, {own_std:.3g}"
+            facts.notes.append(
+                f"the state that it learned from was not its last action, which a car gives: {name} {what}"
+            )
+            return
 
 
 def _of_today(folder: Path, raw: dict[str, Any]) -> dict[str, Any]:
@@ -216,6 +267,27 @@ class Normaliser:
             what = f"{self.where}: normalises {len(read)} times, or some of the observations only"
             raise CheckpointError(what, remedy="copy the folder again, or train with LeRobot's own single step")
         self.step = read[0]
+
+    def statistics(self, key: str) -> list[tuple[float, float]]:
+        """Return the mean and the deviation of each number of a feature; [] if they are not there."""
+        stats = self.step.state_dict()
+        parts = [stats[name].flatten().tolist() for part in ("mean", "std") if (name := f"{key}.{part}") in stats]
+        return list(zip(*parts, strict=True)) if len(parts) == 2 else []
+
+    def constants(self, key: str, norm: Affine | None) -> dict[int, float]:
+        """Return the numbers of an input that never varied in training, by their place, as the network saw them.
+
+        Raises CheckpointError for those that varied, and whose quantiles were equal.
+        """
+        if norm is None:
+            return {}
+        found = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
+        mode = self.step.norm_map[self.step.features[key].type].value
+        varied = [i for i in found if (each := self.statistics(key)) and each[i][1] > VARIES]
+        if varied and mode.startswith("QUANTILE"):
+            what = f"{self.where}: most values of '{key}' were equal, so that {mode} is no range for the others"
+            raise CheckpointError(what, found=f"scale {norm.scale[varied[0]]:.3g}", remedy="train with MEAN_STD")
+        return dict.fromkeys(found, 0.0 if mode == "MEAN_STD" else -1.0)
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.

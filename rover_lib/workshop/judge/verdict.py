@@ -172,6 +172,7 @@ def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str
         blind=bool(actions) and not sees,
         misses=any(row["gate"] == "fp32 hits" for row in failed),
         fp32=compared["fp32"],
+        cautions=stages["load"].get("recordings", {}).get("cautions", []),
         episodes=len({name for part in stages["load"]["split"].values() for name in part}),
     )
 

@@ -37,12 +37,12 @@ from rover_lib.workshop.recordings.blocks import (
     usual_rate_hz,
 )
 from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
-from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
 from rover_lib.workshop.recordings.pictures import HOLE_INTERVALS, HOLE_S, check_pictures
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source, block_of, following
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.recordings.tub import find_tubs, load_tubs
+from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.

@@ -28,10 +28,12 @@ from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import name_long_drives
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
-from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.names import ACTION, STATE, camera_names, name_numbers, name_states
 from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, following
+from rover_lib.workshop.recordings.twins import leave_out_copies
+from rover_lib.workshop.states import OTHER_STATE, explain_state, last_actions
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
+from rover_lib.workshop.videos import match_pictures
 
 INFO = Path("meta/info.json")
 INFO_BYTES = 5_000_000  # LeRobot's: some kB
@@ -39,6 +41,7 @@ MOST_FEATURES = 200  # an arm with six cameras has 20
 PICTURE_PIXELS = 4608 * 2592  # at most: a Pi camera's largest
 BACKEND = "pyav"  # needs no FFmpeg on the machine, as torchcodec does
 TOLERANCE_S = 1e-4  # LeRobot's, between a frame's time and that of a picture in its video
+OFF = 0.25  # of the time between two pictures; farther from any, it is not known which one was meant
 NUMBERS = ("timestamp", "frame_index", "episode_index")
 STATS = "meta/episodes_stats.jsonl"  # of version 2.1
 INTERVENTION = "intervention"  # as lerobot-rollout writes it: in this frame a human had taken over from a policy
@@ -52,6 +55,7 @@ STATES = "state|joint|qpos|proprio"  # in other names of a state
 DRIVEN_BY = "driven_by"  # who drove where nobody intervened
 CAR = "car"  # and of them all, the content of their car.yml
 UNEVEN = 0.1  # the time between two frames may differ by this share
+DERIVE_STATE = "to train, rover export-dataset writes it so"
 WRITE_ANEW = "copy it whole, or let LeRobot write it anew"
 BATCH = 256  # pictures that are read at once
 OURS = re.compile(r"file-\d+\.parquet")  # among "._file-000.parquet" and "file-000-checkpoint.parquet"
@@ -66,7 +70,8 @@ def _broken(what: str, found: object = None) -> EpisodeError:
 class _Camera:
     """One camera. size: (height, width). paths: each row's file. times_s: when its picture is shown in a video.
 
-    rows: else all rows, from which Hugging Face's library reads one picture without its table's others.
+    torn: rows whose picture in a video is. rows: else all rows, from which Hugging Face's library reads one picture
+    without its table's others.
     """
 
     key: str
@@ -74,6 +79,7 @@ class _Camera:
     paths: Sequence[Path]
     times_s: Sequence[float] = ()
     rows: Any = None
+    torn: frozenset[int] = frozenset()
 
     def find_unusable(self, faults: Faults) -> set[int]:
         """Return the rows whose pictures are not there, torn, or not in colours; the fault says why the first is not.
@@ -84,8 +90,11 @@ class _Camera:
         if self.rows is None:
             for row in {path: row for row, path in enumerate(self.paths)}.values():
                 with _as_episode_error(f"{self.paths[row]}: cannot be decoded"):
-                    self.read_bgr(row)
-            return set()
+                    self.read_bgr(row) if row not in self.torn else None
+            if self.torn:
+                note = f"the picture of '{self.key}' in row {min(self.torn)} is torn, or one it needs: copy it again"
+                faults.add(self.paths[min(self.torn)], "broken_picture", note, len(self.torn))
+            return {*self.torn}
         found: list[str] = []
         for batch in self.rows.iter(BATCH):
             encoded = [(picture or {}).get("bytes") or b"" for picture in batch[self.key]]
@@ -214,10 +223,10 @@ class _Dataset:
                 what = f"{self.root}: '{key}' has {len(order)} numbers in {INFO} and {values.shape[1]} in the tables"
                 raise EpisodeError(what, remedy="correct its shape and names")
             self.columns[key] = values.astype(np.float32)[:, list(order)] if order else values.ravel()
-        if STATE not in self.columns:  # as in our own recordings, it is the action before
-            self.columns[STATE] = np.roll(self.columns[ACTION], 1, axis=0)
-            self.columns[STATE][self.columns["frame_index"] == 0] = 0
+        before = last_actions(self.columns[ACTION], self.columns["frame_index"] == 0)
+        self.columns.setdefault(STATE, before)  # as in our own recordings
         self._check_order()
+        self._check_state(before)
         self._check_times()
         drivers, self.car = _read_export(self.root, len(self.entries), INTERVENTION in keys, self.faults)
         self.drivers = {row["episode_index"]: driver for row, driver in zip(self.entries, drivers, strict=True)}
@@ -246,6 +255,18 @@ class _Dataset:
         note = "dataset_from_index and _to_index of an early converter: convert it again by a newer LeRobot to train"
         self.faults.add(self.root / "meta/episodes", "scrambled_index", note, scrambled)
 
+    def _check_state(self, before: np.ndarray) -> None:
+        """Let a state of a car's names be the action before, which the car gives, where it was recorded as another."""
+        if self.layout.state_names != CHANNELS or self.layout.action_names != CHANNELS:
+            return
+        for number in np.unique(self.columns["episode_index"]):
+            rows = self.columns["episode_index"] == number
+            words = explain_state(self.columns[STATE][rows], self.columns[ACTION][rows], CHANNELS)
+            if words:
+                self.columns[STATE][rows] = before[rows]
+                note = f"its state is not the last action, which a car gives and is taken: {words}; {DERIVE_STATE}"
+                self.faults.add(self.root / INFO, OTHER_STATE, note)
+
     def _check_times(self) -> None:
         """Let episodes begin with 0 s. Raises EpisodeError for frames that do not come `fps` times a second."""
         times_s, first = self.columns["timestamp"].astype(np.float64), self.columns["frame_index"] == 0
@@ -264,7 +285,7 @@ class _Dataset:
 
     def _check_numbers(self) -> None:
         """Raise EpisodeError for states and actions beyond what the car can do."""
-        for key, labels in ((STATE, self.layout.state_names), (ACTION, self.layout.action_names)):
+        for key, labels in ((ACTION, self.layout.action_names), (STATE, self.layout.state_names)):
             if key == STATE and labels != CHANNELS:
                 continue  # a state of these names is what the car is told when it drives: its last action
             limits = action_limits(labels, self.car)
@@ -278,9 +299,7 @@ class _Dataset:
         """Find each row's picture of a camera."""
         if self.features[key]["dtype"] == "video":
             self._check_videos(key, size)
-            shown = [part for row in self.entries for part in [self._shown(row, key)] * row["length"]]
-            times_s = np.array([first_s for _, first_s, _ in shown]) + self.columns["timestamp"]
-            return _Camera(key, size, [path for path, *_ in shown], times_s.tolist())
+            return self._video_camera(key, size)
         from datasets import Dataset, Features, Image
         from lerobot.utils.utils import SuppressProgressBars
 
@@ -289,6 +308,27 @@ class _Dataset:
             kept = Features({key: Image(decode=False)})
             rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=kept)
         return _Camera(key, size, paths, rows=rows)
+
+    def _video_camera(self, key: str, size: tuple[int, int]) -> _Camera:
+        """Find each row's picture in a video. Raises EpisodeError for times at which a video shows none."""
+        shown = [part for row in self.entries for part in [(*self._shown(row, key), row)] * row["length"]]
+        times_s = np.array([first_s for _, first_s, *_ in shown]) + self.columns["timestamp"]
+        torn = np.zeros(len(shown), bool)
+        for path in dict.fromkeys(path for path, *_ in shown):
+            rows = np.array([k for k, part in enumerate(shown) if part[0] == path])
+            with _as_episode_error(f"{path}: cannot be decoded"):
+                times_s[rows], off_s, torn[rows] = match_pictures(path, times_s[rows], self.fps, TOLERANCE_S)
+            numbers = np.array([shown[k][3]["episode_index"] for k in rows])
+            for number in np.unique(numbers[off_s > TOLERANCE_S]):
+                most_s = float(off_s[numbers == number].max())
+                note = f"episode {number}: from_timestamp is {1000 * most_s:.2g} ms off the pictures in {path.name}"
+                if most_s * self.fps > OFF:
+                    remedy = "correct it in meta/episodes, or merge the original datasets again with a newer LeRobot"
+                    raise EpisodeError(f"{self.root}: {note}", found=f"{self.fps:g} a second", remedy=remedy)
+                note += "; the nearest are taken, and LeRobot's training would refuse them: correct it in meta/episodes"
+                self.faults.add(self.root / "meta/episodes", "other_times", note)
+        paths = [path for path, *_ in shown]
+        return _Camera(key, size, paths, times_s.tolist(), torn=frozenset(np.flatnonzero(torn).tolist()))
 
     def _check_videos(self, key: str, size: tuple[int, int]) -> None:
         """Raise EpisodeError unless each video has the camera's size, and each episode a part of it, of its length.
@@ -355,12 +395,17 @@ def _read_info(root: Path) -> dict[str, Any]:
     path = root / INFO
     refuse_pointer(path, EpisodeError)
     with _as_episode_error(f"{path}: not readable as JSON"):
-        info = untrusted.read_json(path, INFO_BYTES)
-    version = str(info.get("codebase_version")) if isinstance(info, dict) else "without a version"
+        info: Any = untrusted.read_json(path, INFO_BYTES)
+    if not isinstance(info, dict) or not info.keys() & {"codebase_version", "features", "data_path", "total_frames"}:
+        remedy = "give a LeRobotDataset, donkeycar's tub, or a folder of episodes"
+        what = f"{root}: another program's {INFO}, not that of a LeRobotDataset"
+        raise EpisodeError(what, found=quote_all(info) if isinstance(info, dict) else quote(info), remedy=remedy)
+    version = str(info.get("codebase_version", "without a version"))
     if not version.removeprefix("v").startswith(("2", "3")):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
         raise EpisodeError(f"{root}: a LeRobotDataset {quote(version)}, only v2 and v3 are read", remedy=remedy)
-    features, fps = info.get("features"), info.get("fps")
+    features: Any = info.get("features")
+    fps = info.get("fps")
     try:
         shapes = [feature.get("shape") or () for feature in features.values()]
         right = all(is_whole(n, 1, 10_000) for shape in shapes for n in shape)

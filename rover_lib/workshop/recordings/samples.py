@@ -21,11 +21,15 @@ OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has an
 LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
+# Faults of pictures that are whole: a policy that learned from them drives badly, and nothing else tells.
+SHOW_NOTHING = "frozen_camera|repeated_pictures|blank_pictures|without_colours|swapped_colours|upside_down"
 HANDLED = {  # what is done about a fault, by its kind
-    "repaired": "serial_burst|unsorted_.*_times|stood_unrecorded|scrambled_index|other_units",
+    "repaired": "serial_burst|unsorted_.*_times|stood_unrecorded|scrambled_index|other_units|other_times",
     "read as stopped": "reverse_on_a_car_without",
     "recomputed from the pulses": ".*_recomputed",
-    "taken as recorded": "another_export|another_total|one_sided_steering|no_times|.*_disagrees_with_pulse",
+    "replaced by the last action": "other_state",
+    "taken as recorded": "another_export|another_total|one_sided_steering|no_times|.*_disagrees_with_pulse"
+    f"|{SHOW_NOTHING}",
     "left out": ".*",
 }
 
@@ -257,6 +261,14 @@ class Recordings:
             counted[fault.handled][fault.kind] += fault.count
         return {handled: dict(kinds.most_common()) for handled, kinds in counted.items() if kinds}
 
+    def cautions(self) -> list[str]:
+        """A sentence for each kind of fault that makes a policy of these recordings drive badly."""
+        found: dict[str, list[Fault]] = {}
+        for fault in self.faults:
+            if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
+                found.setdefault(fault.kind, []).append(fault)
+        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in found.values()]
+
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
         files = dict.fromkeys(path for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples)))
@@ -282,6 +294,7 @@ class Recordings:
             "driven_by_pct": {who: round(100 * n / len(self.samples), 1) for who, n in sorted(drivers.items())},
             "action_range": {name: list(ends) for name, ends in self.action_range().items()},
             "recomputed": self.recomputed(),
+            "cautions": self.cautions(),
             "faults_by_kind": self.faults_by_kind(),
             "faults": [vars(f) for f in self.faults],
         }

@@ -25,7 +25,6 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import name_blocks
 from rover_lib.workshop.recordings.controls import Faults, note_one_sided
-from rover_lib.workshop.recordings.copies import leave_out_copies
 from rover_lib.workshop.recordings.pictures import HOLE_INTERVALS, HOLE_S, check_pictures
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
@@ -37,6 +36,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
 )
+from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import quote, quote_all
 
 RATE_HZ = 20.0  # of records without a time: donkeycar's own
@@ -320,8 +320,11 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
 
 
 def _parse(text: str) -> _Record:
-    """Return the record in a line. Raises ValueError, also of other kinds."""
+    """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cameras."""
     row = json.loads(text)
+    if PICTURE not in row and (others := [key for key in row if key.startswith(f"{PICTURE}_")]):
+        remedy = f"to use one, name it so in the catalogs: sed -i 's#{others[0]}#{PICTURE}#' *.catalog"
+        raise EpisodeError(f"a record has no '{PICTURE}', as of two cameras", found=quote_all(others), remedy=remedy)
     number, ms, values = row["_index"], row.get("_timestamp_ms"), (row[ANGLE], row[THROTTLE])
     if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
         raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")

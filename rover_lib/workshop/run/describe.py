@@ -11,10 +11,11 @@ from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import check_kind, kinds_of
 from rover_lib.onboard.stage import read_stage, sha256_of
+from rover_lib.workshop.pictures.shown import with_faults
+from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import Source
-from rover_lib.workshop.recordings.turning import measure_sides
 
 FIRST = "rover run makes the first; in a clone, make demo too"
 
@@ -43,7 +44,7 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
     if not path.exists():
         check_kind(path, "recordings")  # says what to do
     if kind in ("recordings", "dataset", "tub") or (kind is None and path.is_dir()):
-        recordings = load_recordings(source, progress=progress)
+        recordings = with_faults(load_recordings(source, progress=progress), progress)
         sides = measure_sides(recordings, progress)
         words = {"steering": sides.words(), "by_episode": [turning.words() for turning in sides.turnings]}
         return {"recordings": recordings.summary() | (words if sides.turnings else {})}

@@ -1,6 +1,10 @@
 """What the notebooks' parameters may be, whether a cell, `rover run -p` or params.yml sets them."""
 
+import ast
+import sys
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +14,9 @@ from rover_lib.onboard.errors import ParamsError
 from rover_lib.workshop.int8.scheme import MODES, OBSERVERS
 
 MOST = 1_000_000
+INJECTED = "# Parameters\n"  # how papermill's cell begins, after the notebook's own
+DEFAULT, DEMO = "../runs/", "../runs/demo"  # how the notebooks' defaults begin
+FILES = ("run_dir", "checkpoint", "episodes")  # in notebook 01, of one run
 
 
 def _is_path(value: Any) -> bool:
@@ -43,8 +50,59 @@ RULES = {
 
 
 def check_parameters(**turned: Any) -> None:
-    """Raise ParamsError, which names the parameter and what it may be, for the first that is something else."""
+    """Check a notebook's parameters before anything uses them.
+
+    Raises ParamsError, which names the parameter and what it may be, for the first that is something else; for names
+    that papermill was given and the notebook does not have; and where some of its files would be the defaults'.
+    """
+    own, passed = _parameters_here()
+    if unknown := sorted(passed.keys() - own.keys()):
+        raise ParamsError(f"no parameter {', '.join(unknown)}", remedy=f"known are {', '.join(own)}")
+    left = [name for name, value in own.items() if passed and name not in passed and _is_of_a_run(value)]
+    if left:
+        what = (
+            f"{', '.join(passed)} was passed, and {' and '.join(left)} would be another run's, the notebook's default"
+        )
+        raise ParamsError(what, found=own[left[0]], remedy=f"pass {' and '.join(left)} too")
     if broken := broken_rule(turned, {name: RULES[name] for name in turned}):
         name, wanted, found = broken
         remedy = "set it in the notebook, by -p, or in params.yml"
         raise ParamsError(f"the parameter {name} must be {wanted}", found=found, remedy=remedy)
+    files = {name: str(turned[name]).startswith(DEMO) for name in FILES if "checkpoint" in turned}
+    if not passed and len(set(files.values())) > 1:
+        default = next(name for name, of_default in files.items() if of_default)
+        remedy = f"set {', '.join(files)}; if you mean the demo's, by its whole path"
+        raise ParamsError(
+            f"the parameter {default} is still the notebook's default", found=turned[default], remedy=remedy
+        )
+
+
+def _is_of_a_run(value: Any) -> bool:
+    """Whether a default, or the first of several, is a run's folder or in one."""
+    first = value[0] if isinstance(value, list) and value else value
+    return isinstance(first, str) and first.startswith(DEFAULT)
+
+
+def _parameters_here() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what the parameters cell of the notebook in this kernel sets, and what papermill's cell after it sets.
+
+    Both are empty where papermill was given nothing.
+    """
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    cells = shell.user_ns.get("In", []) if shell else []
+    for before, cell in pairwise(cells):
+        if cell.startswith(INJECTED):
+            return _assigned(before), _assigned(cell)
+    return {}, {}
+
+
+def _assigned(source: str) -> dict[str, Any]:
+    """Return the names that a cell of literals sets, and their values; None for what is no literal."""
+    found = {}
+    for line in ast.parse(source).body:
+        if isinstance(line, ast.Assign) and isinstance(line.targets[0], ast.Name):
+            value = None
+            with suppress(ValueError):
+                value = ast.literal_eval(line.value)
+            found[line.targets[0].id] = value
+    return found

@@ -263,10 +263,17 @@ def test_a_state_that_never_changed_is_minus_one(copied, value):
     same, stats = torch.tensor([value, 0.5]), load_file(copied / STATS)
     ends = {"observation.state.min": same, "observation.state.max": torch.tensor([value, 2.5])}
     save_file(stats | ends, copied / STATS)
-    norm = load_checkpoint(copied).config.state_norm
-    scale, shift = torch.tensor(norm.scale), torch.tensor(norm.shift)
-    assert (same * scale + shift).tolist() == [-1, -1]
-    assert ((same + torch.tensor([0, 1])) * scale + shift).tolist() == [-1, 0]
+    found, project = load_checkpoint(copied), "encoder_robot_state_input_proj"
+    scale, shift = (torch.tensor(part) for part in (found.config.state_norm.scale, found.config.state_norm.shift))
+    trained = {name: weight.float() for name, weight in load_file(copied / "model.safetensors").items()}
+    for step in (0, 1):
+        given = (same + torch.tensor([5 * step, step])) * scale + shift  # whatever the car gives for what never changed
+        saw = torch.tensor([-1.0, step - 1.0])
+        seen = [
+            weights[f"{stem}{project}.weight"] @ x + weights[f"{stem}{project}.bias"]
+            for stem, weights, x in (("", found.weights, given), ("model.", trained, saw))
+        ]
+        assert torch.allclose(*seen, atol=1e-5)
 
 
 def test_the_steps_own_type_of_a_feature_decides_how_it_is_normalised(policy, tmp_path):
@@ -283,6 +290,8 @@ def test_a_folder_without_its_processors_is_refused_unless_it_says_identity(copi
         (copied / file).unlink()
         assert "policy_preprocessor*" in refused(copied)
     edit(copied / "config.json", lambda c: c.update(normalization_mapping=RAW))
+    assert "stats.safetensors" in refused(copied), "is that how its numbers are normalised?"
+    (copied / STATS).unlink()
     assert load_checkpoint(copied).config.state_norm is None
 
 

@@ -212,3 +212,85 @@ def test_an_older_torchs_file_is_refused_and_saved_again_it_is_read(tiny, tiny_p
         load_checkpoint(tmp_path / "m.pth")
     exec(shlex.split(str(e.value).partition("python ")[2])[1], {})
     assert load_checkpoint(tmp_path / "m.pth").config == tiny.config
+
+
+def test_the_network_is_found_under_any_prefix_and_twice_it_is_asked_about(lerobots):
+    right, file = load_checkpoint(lerobots).weights, lerobots / "model.safetensors"
+    same = {name: weight.clone() for name, weight in right.items()}
+    for prefix in (
+        "_orig_mod.module.",
+        "_orig_mod.policy.model.",
+        "ema_model.",
+        "actor.",
+        "a.b._fsdp_wrapped_module.c.",
+    ):
+        counted = {f"{prefix}{name}": weight for name, weight in right.items()} | {"n_averaged": torch.tensor(7)}
+        save_file(counted, file)
+        found = load_checkpoint(lerobots).weights
+        assert all(torch.equal(found[name], weight) for name, weight in right.items())
+    twice = {f"model.{name}": weight for name, weight in right.items()}
+    save_file(twice | {f"policy.model.{name}": weight for name, weight in same.items()}, file)
+    assert load_checkpoint(lerobots).weights.keys() == right.keys()
+    other = {f"ema.model.{name}": weight + 1 for name, weight in right.items()}
+    save_file(twice | other, file)
+    assert "several networks" in remedied(lerobots)
+    kept = load_checkpoint(lerobots, said="ignore=model").weights["action_head.bias"]
+    assert torch.equal(kept, right["action_head.bias"] + 1)
+    save_file({f"net.{name}": weight for name, weight in right.items() if "action_head" not in name}, file)
+    with pytest.raises(CheckpointError, match=r"no ACT, which has an 'action_head\.weight'"):
+        load_checkpoint(lerobots)
+
+
+def test_averaged_weights_are_asked_about_in_any_form_and_beside(tiny, tiny_policy, lerobots, tmp_path):
+    weights = list(tiny.weights.values())
+    for number, more in enumerate(
+        (
+            {"ema": weights},
+            {"ema": {"shadow_params": weights, "decay": 0.99}},
+            {"best_weights": tuple(weights)},
+            {"flat_params": torch.cat([weight.flatten() for weight in weights])},
+        )
+    ):
+        path = says_more(tiny_policy, tmp_path / f"m{number}.pth", **more)
+        assert "the weights that should drive" in remedied(path)
+    for name, words in (
+        ("norm_stats.json", "normalised"),
+        ("ema.safetensors", "should drive"),
+        ("model_swa.pt", "should"),
+    ):
+        (lerobots / name).write_text("{}")
+        assert words in remedied(lerobots)
+        (lerobots / name).unlink()
+
+
+def test_weights_that_were_not_copied_to_their_end_are_called_damaged(lerobots):
+    file = lerobots / "model.safetensors"
+    whole = file.read_bytes()
+    for begin, end in ((0.7, 1.0), (0.4, 0.5), (0.98, 1.0)):
+        first, last = (int(len(whole) * share) for share in (begin, end))
+        file.write_bytes(whole[:first] + bytes(last - first) + whole[last:])
+        with pytest.raises(CheckpointError, match=r"damaged, its weights are zeros .* copied to its end\?"):
+            load_checkpoint(lerobots)
+
+
+def test_a_state_that_never_varied_is_given_to_the_network_as_it_was(lerobots):
+    """The car's last action, in deviations of 1e-8, made of a policy that drove one that hit 4 of 8 balloons."""
+    file, state = next(lerobots.glob("policy_pre*.safetensors")), "observation.state"
+    stats = load_file(file)
+    whole = load_checkpoint(lerobots)
+    was = stats[f"{state}.mean"].clone()
+    for std in (0.0, 1e-8):
+        save_file(stats | {f"{state}.std": torch.tensor([std, 0.3])}, file)
+        found = load_checkpoint(lerobots)
+        (note,) = (each for each in found.report["notes"] if "never varied" in each)
+        assert "its state (steering)" in note
+        norm = found.config.state_norm
+        assert (norm.scale[0], norm.shift[0]) == (1, 0)
+        project = "encoder_robot_state_input_proj"
+        given = torch.tensor([0.7, was[1] + 0.3]) * torch.tensor(norm.scale) + torch.tensor(norm.shift)
+        seen = found.weights[f"{project}.weight"] @ given + found.weights[f"{project}.bias"]
+        trained = whole.weights[f"{project}.weight"] @ torch.tensor([0.0, 1.0]) + whole.weights[f"{project}.bias"]
+        assert torch.allclose(seen, trained, atol=1e-5)
+    save_file(stats | {f"{state}.mean": was * 100, f"{state}.std": stats[f"{state}.std"] * 100}, file)
+    assert any("not its last action" in note for note in load_checkpoint(lerobots).report["notes"])
+    assert not whole.report["notes"]

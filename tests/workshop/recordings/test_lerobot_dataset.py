@@ -195,7 +195,7 @@ def table(path, change):
 
 def again(rows):
     """The first drive's actions and pictures in the second one, as in a dataset that was merged with itself."""
-    for name in ("action", CAM):
+    for name in ("action", "observation.state", CAM):
         column = rows.column(name).take([*range(FRAMES), *range(FRAMES), *range(2 * FRAMES, rows.num_rows)])
         rows = rows.set_column(rows.column_names.index(name), name, column)
     return rows
@@ -459,3 +459,82 @@ def test_a_policy_of_other_numbers_or_another_rate_is_refused(trained, tiny):
     for layout in (Layout(("front",), wheels, wheels, 30.0), Layout(("front",), wheels, ours, 30.0)):
         with pytest.raises(CheckpointError, match="state is left, right"):
             tiny.recorded_as(layout)
+
+
+# ---- what is well-formed, and wrong ---------------------------------------------------------------------------------
+
+
+def states_are(value):
+    def change(rows):
+        actions = np.stack(rows.column("action").to_pylist()).astype(np.float32)
+        column = pyarrow.array(list(value(actions)), rows.column("observation.state").type)
+        return rows.set_column(rows.column_names.index("observation.state"), "observation.state", column)
+
+    return change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (np.zeros_like, "steering and throttle: always 0"),
+        (lambda actions: actions, "the action of the same row"),
+        (lambda actions: actions * 100, "100 times the action of the same row"),
+    ],
+)
+def test_a_state_that_is_not_the_last_action_is_replaced_by_it(copied, tmp_path, value, words):
+    """And the dataset that the fault tells to write has it."""
+    root = copied()
+    right = [sample.state for sample in load_recordings(root, CHUNK).samples]
+    table(root / DATA, states_are(value))
+    recordings = load_recordings(root, CHUNK)
+    (fault,) = recordings.faults
+    assert words in fault.note and fault.handled == "replaced by the last action" and fault.count == EPISODES
+    assert recordings.cautions() and np.array_equal([sample.state for sample in recordings.samples], right)
+    command = re.search("rover export-dataset", fault.note)[0].split()[1:]
+    assert CliRunner().invoke(main, [*command, str(root), str(tmp_path / "out")]).exit_code == 0
+    written_anew = load_recordings(tmp_path / "out", CHUNK)
+    assert not written_anew.faults and np.array_equal([sample.state for sample in written_anew.samples], right)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("data", [bytes(600), bytes(range(1, 201)) * 3])
+def test_a_video_that_is_torn_in_its_middle_costs_its_own_pictures(copied, data):
+    root = copied("video")
+    whole = (root / VIDEO_AT).read_bytes()
+    middle = len(whole) // 2
+    (root / VIDEO_AT).write_bytes(whole[:middle] + data + whole[middle + len(data) :])
+    recordings = load_recordings(root, CHUNK)
+    (fault,) = recordings.faults
+    assert fault.kind == "broken_picture" and 2 <= fault.count == EPISODES * FRAMES + 3 - len(recordings.samples) <= 16
+    for sample in recordings.samples:
+        sample.frame_bgr()  # each that is left can be decoded
+
+
+@pytest.mark.slow
+def test_times_that_are_not_quite_those_of_a_videos_pictures_are_repaired_or_named(copied):
+    root = copied("video")
+    right = [sample.frame_bgr() for sample in load_recordings(root, CHUNK).samples]
+    at = f"videos/{CAM}/from_timestamp"
+
+    def shifted(by_s):
+        def change(rows):
+            times = rows.column(at).to_pylist()
+            times[1] += by_s
+            return rows.set_column(rows.column_names.index(at), at, pyarrow.array(times, rows.column(at).type))
+
+        return change
+
+    table(root / EPISODES_AT, shifted(2e-4))
+    recordings = load_recordings(root, CHUNK)
+    assert [(fault.kind, fault.handled) for fault in recordings.faults] == [("other_times", "repaired")]
+    assert "episode 1: from_timestamp is 0.2 ms off" in recordings.faults[0].note
+    assert all(
+        np.array_equal(sample.frame_bgr(), picture) for sample, picture in zip(recordings.samples, right, strict=True)
+    )
+    table(root / EPISODES_AT, shifted(0.02))
+    assert "episode 1: from_timestamp is 20 ms off" in refused(root)
+
+
+def test_another_programs_info_is_called_so(tmp_path):
+    assert "another program's meta/info.json" in refused(written(tmp_path, {"name": "my robot", "license": "mit"}))

@@ -1,0 +1,1 @@
+"""What recorded pictures show: which way the car turned, and whether they show what it saw."""

@@ -1,0 +1,174 @@
+"""Find pictures that show nothing, or not what the car saw: a camera that stood still, black or grey pictures, colours
+or sides that are not those of the other drives.
+
+    recordings = with_faults(recordings)     # its faults name them; `rover inspect` and notebook 01 do so
+
+All are well-formed files, and a policy that learned from them is only known to be bad. Some pictures are looked at,
+evenly chosen, each beside the next one; so 14,000 take seconds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rover_lib.onboard.errors import EpisodeError
+from rover_lib.workshop.pictures.beside import LEAST_DRIVES, find_swapped, find_upside_down
+from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, pick_evenly
+
+PLACES, LEAST_PLACES, MOST_DRIVES = 600, 6, 150  # looked at in all, and in a drive; drives
+ENCODED = 3  # a PNG's or a video's picture costs some times more than a JPEG's, whose small version is decoded
+SEEN = (96, 72)  # width and height to which pictures are scaled down
+EQUAL = 0.05  # grey levels between two pictures, on average; a real camera's noise alone is 0.2
+FROZEN = 10  # equal pictures in a row; a car that has just been started may stand for some
+REPEATED = 0.3  # the share of equal neighbours; of public tubs at most 0.13
+MOVES = 0.01  # of throttle; a simulated car that stands sees equal pictures
+FLAT = 8.0  # grey levels between the darkest and the brightest part; of real pictures 37 and more
+BLANK = 0.05  # the share of a drive's pictures
+DARK, BRIGHT = 24.0, 231.0
+COMPARED = 30  # samples of a drive; fewer show what the car stood before, or who carried it
+COLOURLESS, COLOURED = 0.5, 4.0  # grey levels between a picture's colours, on average
+LEAST_COMPARED = 12  # pairs of pictures
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """What a drive's pictures show. pictures: (n, 72, 96, 3) float32, those that were looked at.
+
+    compared, equal: how many were compared with the next one while the car moved, and how many of these equal it.
+    longest: the most equal ones in a row.
+    """
+
+    episode: Episode
+    pictures: np.ndarray
+    compared: int
+    equal: int
+    longest: int
+
+    @property
+    def frozen(self) -> bool:
+        return self.longest >= FROZEN
+
+
+def with_faults(recordings: Recordings, progress: Progress = silent) -> Recordings:
+    """Return the recordings with a fault for each drive whose pictures do not show what the car saw."""
+    faults = Faults(recordings.root)
+    episodes = pick_evenly(recordings.episodes, MOST_DRIVES)
+    for name in recordings.layout.cameras:
+        of_camera = f" of '{name}'" if len(recordings.layout.cameras) > 1 else ""
+        drives = []
+        for episode in progress(episodes, desc="what its pictures show", total=len(episodes)):
+            drive = _look(episode, name, recordings, len(episodes))
+            if drive is not None:
+                drives.append(drive)
+                _note_nothing(drive, of_camera, faults)
+        _note_repeated(drives, of_camera, faults)
+        _note_others(drives, of_camera, faults)
+    return replace(
+        recordings, faults=tuple(sorted((*recordings.faults, *faults.listed()), key=lambda f: (f.file, f.kind)))
+    )
+
+
+def _look(episode: Episode, camera: str, recordings: Recordings, drives: int) -> _Drive | None:
+    """Look at some pictures of a drive, each beside the next one; None if one cannot be read, as its fault says."""
+    samples = episode.samples
+    cheap = samples[0].frame_path.suffix.lower() in (".jpg", ".jpeg")
+    count = max(PLACES // (1 if cheap else ENCODED) // drives, LEAST_PLACES)
+    small = lru_cache(4)(lambda k: _scaled(samples[k], camera))
+    moving = _moving(samples, recordings)
+    pictures, equal, compared, longest = [], 0, 0, 0
+    try:
+        for k in pick_evenly(range(len(samples)), count):
+            pictures.append(small(k))
+            if k + 1 == len(samples) or samples[k + 1].row != samples[k].row + 1 or not moving[k]:
+                continue
+            compared += 1
+            if _are_equal(small(k), small(k + 1)):
+                equal += 1
+                longest = max(longest, _count_equal(samples, k, small, moving))
+    except EpisodeError:
+        return None
+    return _Drive(episode, np.stack(pictures), compared, equal, longest)
+
+
+def _moving(samples: Sequence[Sample], recordings: Recordings) -> np.ndarray:
+    """Whether the car moves at each sample, (n,) bool: by its throttle, or where that says nothing by any action."""
+    actions = np.array([sample.chunk[0] for sample in samples], float)
+    if recordings.layout.action_names == ACTION_NAMES and np.ptp(actions[:, 1]) > MOVES:
+        return np.abs(actions[:, 1]) > MOVES
+    return np.full(len(samples), bool(np.ptp(actions, axis=0).max() > MOVES))
+
+
+def _count_equal(samples: Sequence[Sample], k: int, small: Any, moving: np.ndarray) -> int:
+    """How many pictures around sample `k` equal their neighbours without a break, while an action changes."""
+    first = last = k
+    while first and moving[first - 1] and _are_equal(small(first - 1), small(k)):
+        first -= 1
+    while last + 1 < len(samples) and moving[last] and _are_equal(small(last + 1), small(k)):
+        last += 1
+    changed = np.ptp([sample.chunk[0] for sample in samples[first : last + 1]], axis=0).max()
+    return last + 1 - first if changed > 0 else 1
+
+
+def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
+    """Add a fault for a camera that stood still, and for pictures of a single colour."""
+    where, frames = drive.episode.path / drive.episode.id, drive.episode.frames
+    means = drive.pictures.mean((1, 2, 3))
+    blocks = drive.pictures.reshape(len(drive.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
+    flat = np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
+    if flat.mean() >= BLANK:
+        mean = float(means[flat].mean())
+        word = "black" if mean < DARK else "white" if mean > BRIGHT else "of one colour"
+        note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
+        faults.add(where, "blank_pictures", note, max(round(flat.mean() * frames), 1))
+    elif drive.frozen:
+        count = max(round(drive.equal / drive.compared * frames), drive.longest)
+        note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
+        faults.add(where, "frozen_camera", note, count)
+
+
+def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
+    """Add a fault if all drives together, or one that was looked at often, have each picture several times."""
+    rest = [drive for drive in drives if not drive.frozen]
+    compared, equal = sum(drive.compared for drive in rest), sum(drive.equal for drive in rest)
+    if compared >= LEAST_COMPARED and equal >= REPEATED * compared:
+        note = f"{equal / compared:.0%} of the pictures{of_camera} equal the next one, though the car moves"
+        files = sum(round(drive.episode.frames * equal / compared) for drive in rest)
+        faults.add(faults.root, "repeated_pictures", f"{note}: is the camera slower than the recording?", files)
+
+
+def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
+    """Add a fault for each drive whose pictures beside the others' have no or other colours, or are upside down."""
+    long = [drive for drive in drives if len(drive.episode.samples) >= COMPARED]
+    if len(long) < LEAST_DRIVES:
+        return
+    pictures = [drive.pictures for drive in long]
+    colours = np.array([float(np.ptp(each, axis=-1).mean()) for each in pictures])
+    coloured = colours[colours >= COLOURLESS]
+    grey = (colours < COLOURLESS) & bool(len(coloured) >= LEAST_DRIVES and np.median(coloured) > COLOURED)
+    for kind, words, odd in (
+        ("without_colours", "have no colours", grey),
+        ("swapped_colours", "have red and blue swapped", find_swapped(pictures)),
+        ("upside_down", "are upside down", find_upside_down(pictures)),
+    ):
+        others = f"beside those of {len(long) - odd.sum()} other drives"
+        if 2 * odd.sum() == len(long):
+            others += ", or these are"  # nobody can tell which half is right
+        note = f"its pictures{of_camera} {words}, {others}: turn them or leave them out"
+        for drive in (drive for drive, is_odd in zip(long, odd, strict=True) if is_odd):
+            faults.add(drive.episode.path / drive.episode.id, kind, note, drive.episode.frames)
+
+
+def _scaled(sample: Sample, camera: str) -> np.ndarray:
+    frame: Any = sample.frame_bgr(SEEN[0])
+    frame = frame[camera] if isinstance(frame, dict) else frame
+    return cv2.resize(frame, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def _are_equal(a: np.ndarray, b: np.ndarray) -> bool:
+    return float(np.abs(a - b).mean()) < EQUAL

@@ -1,0 +1,67 @@
+"""Hold a recorded state against the actions: of these names, a car's state is its last action.
+
+A converter's zeros, the action of the same row or one in other units are in files that are well-formed in every other
+way. What learned from them meets another state on the car.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+LAGS = (1, 0, 2, 3, 4, 5, -1, -2)  # rows by which a state may follow the action; 1 is right
+LEAST_ROWS = 8
+VARIES = 1e-5  # standard deviation, of an action or of the state's mean; less is rounding
+NEAR = 0.1  # of the actions' standard deviation: the mean distance of what is the same, but for noise and rounding
+NEARER = 1.5  # another lag is the right one if it leaves this much less
+ALIKE = 0.98  # correlation with the actions, in other units
+OTHER_STATE = "other_state"  # the kind of fault
+
+
+def last_actions(actions: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the action before each row, (n, A); 0 where an episode begins. first: (n,) bool."""
+    before = np.roll(actions, 1, axis=0)
+    before[first] = 0
+    return before
+
+
+def explain_state(states: np.ndarray, actions: np.ndarray, names: Sequence[str]) -> str:
+    """Say what an episode's states are, if they are not the action before; empty if they are. Both are (n, A)."""
+    found: dict[str, list[str]] = {}
+    if len(states) > LEAST_ROWS and np.isfinite(states).all() and np.isfinite(actions).all():
+        for name, state, action in zip(names, states.T.astype(float), actions.T.astype(float), strict=True):
+            if words := _explain(state, action):
+                found.setdefault(words, []).append(name)
+    return ", ".join(f"{' and '.join(which)}: {words}" for words, which in found.items())
+
+
+def _explain(state: np.ndarray, action: np.ndarray) -> str:
+    """Say what one number of the state is instead of the action before, or ""."""
+    if state.std() <= VARIES * max(1.0, abs(state.mean())):
+        same = np.abs(action - state.mean()).max() <= NEAR * max(abs(state.mean()), VARIES)
+        return "" if same else f"always {state.mean():.3g}"
+    errors = {lag: float(np.abs(a - b).mean()) for lag in LAGS for a, b in [_lagged(state, action, lag)]}
+    best = min(LAGS, key=errors.__getitem__)
+    if errors[1] <= NEARER * errors[best] + VARIES and errors[1] <= NEAR * max(action.std(), VARIES):
+        return ""
+    if errors[best] <= NEAR * action.std():
+        return _called(best)
+    pairs = {lag: _lagged(state, action, lag) for lag in LAGS}
+    alike = {lag: abs(np.corrcoef(a, b)[0, 1]) if b.std() > VARIES else 0.0 for lag, (a, b) in pairs.items()}
+    best = max(LAGS, key=alike.__getitem__)
+    if alike[best] < ALIKE:
+        return "follows no action"
+    gain, offset = np.polyfit(*pairs[best][::-1], 1)
+    return f"{gain:.3g} times {_called(best)}" + (f" plus {offset:.3g}" if abs(offset) > NEAR * state.std() else "")
+
+
+def _lagged(state: np.ndarray, action: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the states of the rows that have one `lag` rows before, and the actions of those."""
+    return (state[lag:], action[: len(action) - lag]) if lag >= 0 else (state[:lag], action[-lag:])
+
+
+def _called(lag: int) -> str:
+    if lag == 1:
+        return "the last action"
+    return (
+        "the action of the same row" if lag == 0 else f"the action {abs(lag)} rows {'before' if lag > 0 else 'later'}"
+    )

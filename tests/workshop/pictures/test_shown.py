@@ -1,0 +1,116 @@
+"""Pictures that are whole and show nothing, or something else than the other drives': each is named by its fault."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recorded import real_recordings
+
+from balloon_world.world import World
+from rover_lib.workshop.pictures.shown import with_faults
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+
+FRAMES, DRIVES = 60, 6
+
+
+@dataclass(frozen=True, eq=False)
+class Seen(Sample):
+    picture: np.ndarray | None = None
+
+    def frame_bgr(self, least=0):
+        return self.picture
+
+
+@cache
+def drives():
+    """Pictures and actions of drives through the balloon world, (FRAMES, h, w, 3) and (FRAMES, 2) each."""
+    found = []
+    for seed in range(DRIVES):
+        world, pictures, actions = World(seed), [], []
+        for k in range(FRAMES):
+            actions.append((0.3 * np.sin(k / 9 + seed), 0.05))
+            pictures.append(cv2.resize(world.render(), (96, 72), interpolation=cv2.INTER_AREA))
+            world.step(*actions[-1])
+        found.append((np.stack(pictures), np.float32(actions)))
+    return found
+
+
+def recordings(change, odd=(0, 1)):
+    """The drives, of which the odd ones' pictures are changed."""
+    episodes = []
+    for d, (pictures, actions) in enumerate(drives()):
+        seen = change(pictures) if d in odd else pictures
+        samples = []
+        for k in range(FRAMES):
+            numbers = actions[max(k - 1, 0)], actions[k : k + 1], np.zeros(1, bool)
+            samples.append(Seen(f"e{d}", Path("x.jpg"), k / 20, *numbers, k, picture=np.ascontiguousarray(seen[k])))
+        episodes.append(Episode(f"e{d}", Path("r"), "", FRAMES / 20, FRAMES, FRAMES, tuple(samples), ()))
+    return with_faults(Recordings(Path("r"), tuple(episodes), (), Source(Path("r"))))
+
+
+def frozen(pictures, first=20, count=25):
+    return np.concatenate(
+        [pictures[:first], np.repeat(pictures[first : first + 1], count, 0), pictures[first + count :]]
+    )
+
+
+def blank(value, share=2):
+    def change(pictures):
+        noise = np.random.default_rng(0).integers(0, 3, pictures.shape, np.uint8)
+        return np.where(np.arange(FRAMES)[:, None, None, None] % share == 0, np.uint8(value) + noise, pictures)
+
+    return change
+
+
+def grey(pictures):
+    return np.repeat(pictures.mean(-1, keepdims=True), 3, -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (frozen, "frozen_camera"),
+        (blank(0), "blank_pictures"),
+        (blank(128), "blank_pictures"),
+        (blank((0, 130, 0)), "blank_pictures"),
+        (blank(250, 5), "blank_pictures"),
+        (grey, "without_colours"),
+        (lambda pictures: pictures[..., ::-1], "swapped_colours"),
+        (lambda pictures: pictures[:, ::-1, ::-1], "upside_down"),
+        (lambda pictures: pictures[:, ::-1], "upside_down"),
+        (lambda pictures: pictures, None),
+    ],
+)
+@pytest.mark.parametrize("odd", [[1], [0, 4]])
+def test_each_drive_that_shows_nothing_or_another_thing_is_named(change, kind, odd):
+    found = recordings(change, odd)
+    assert [(fault.file, fault.kind) for fault in found.faults] == [(f"e{d}", kind) for d in odd if kind]
+    assert len(found.cautions()) == bool(kind) and found.faults_by_kind().keys() <= {"taken as recorded"}
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_pictures_that_stand_there_several_times_are_named_once(times):
+    """As of a camera of 15 pictures a second in recordings of 30."""
+    (fault,) = recordings(lambda pictures: pictures[np.arange(FRAMES) // times * times], range(DRIVES)).faults
+    assert fault.kind == "repeated_pictures" and "is the camera slower" in fault.note
+
+
+def test_a_car_that_stands_may_see_the_same():
+    still = recordings(lambda pictures: pictures)
+    episodes = []
+    for episode in still.episodes:
+        samples = [
+            replace(s, chunk=s.chunk * (1, s.row > 30), picture=episode.samples[max(s.row, 30)].picture)
+            for s in episode.samples
+        ]
+        episodes.append(replace(episode, samples=tuple(samples)))
+    assert with_faults(replace(still, episodes=tuple(episodes))).faults == ()
+
+
+def test_real_recordings_have_no_such_fault():
+    recordings = load_recordings(real_recordings(), 2)
+    assert with_faults(recordings).faults == recordings.faults
