@@ -319,12 +319,11 @@ class _Pilot(PolicyPilot):
     world: World
     planner: VirtualPlanner
 
-    def order(self, now_s: float) -> Order | None:
+    def order(self, now_s: float) -> Order:
         order = super().order(now_s)
-        if order:
-            self.world.content_ms, self.world.planned = self.planner.content[order.plan], not self.world.mad_us
-            if self.world.mad_us:
-                order = replace(order, throttle_us=self.world.mad_us)
+        self.world.content_ms, self.world.planned = self.planner.content[order.plan], not self.world.mad_us
+        if self.world.mad_us:
+            order = replace(order, throttle_us=self.world.mad_us)
         return order
 
 
