@@ -143,11 +143,18 @@ def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> 
 
 
 def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
-    """Add a fault for each drive whose pictures beside the others' have no or other colours, or are upside down."""
-    long = [drive for drive in drives if len(drive.episode.samples) >= COMPARED]
+    """Add a fault for each drive whose pictures beside the others' have no or other colours, or are upside down.
+
+    The pieces of a session are one drive: its camera stays as it is while it lasts.
+    """
+    sessions: dict[str, list[_Drive]] = {}
+    for drive in drives:
+        if len(drive.episode.samples) >= COMPARED:
+            sessions.setdefault(drive.episode.session or drive.episode.id, []).append(drive)
+    long = list(sessions.values())
     if len(long) < LEAST_DRIVES:
         return
-    pictures = [drive.pictures for drive in long]
+    pictures = [np.concatenate([piece.pictures for piece in pieces]) for pieces in long]
     colours = np.array([float(np.ptp(each, axis=-1).mean()) for each in pictures])
     coloured = colours[colours >= COLOURLESS]
     grey = (colours < COLOURLESS) & bool(len(coloured) >= LEAST_DRIVES and np.median(coloured) > COLOURED)
@@ -160,8 +167,9 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         if 2 * odd.sum() == len(long):
             others += ", or these are"  # nobody can tell which half is right
         note = f"its pictures{of_camera} {words}, {others}: turn them or leave them out"
-        for drive in (drive for drive, is_odd in zip(long, odd, strict=True) if is_odd):
-            faults.add(drive.episode.path / drive.episode.id, kind, note, drive.episode.frames)
+        for pieces, is_odd in zip(long, odd, strict=True):
+            for drive in pieces if is_odd else ():
+                faults.add(drive.episode.path / drive.episode.id, kind, note, drive.episode.frames)
 
 
 def _scaled(sample: Sample, camera: str) -> np.ndarray:

@@ -114,3 +114,10 @@ def test_a_car_that_stands_may_see_the_same():
 def test_real_recordings_have_no_such_fault():
     recordings = load_recordings(real_recordings(), 2)
     assert with_faults(recordings).faults == recordings.faults
+
+
+def test_the_pieces_of_a_session_are_one_drive():
+    """A camera stays as it is while a session lasts: a piece that looks turned over shows another place."""
+    found = recordings(lambda pictures: pictures[:, ::-1], [1])
+    joined = [replace(e, session="s" if e.id in ("e0", "e1", "e2") else e.id) for e in found.episodes]
+    assert with_faults(replace(found, episodes=tuple(joined), faults=())).faults == ()
