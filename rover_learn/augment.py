@@ -14,20 +14,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-GAIN, OFFSET, NOISE, BLUR = "gain", "offset", "noise", "blur"  # of a variation
+GAIN, NOISE, BLUR = "gain", "noise", "blur"  # of a variation
 
 
 @dataclass(frozen=True)
 class Augmentation:
     """How far pictures are varied; with 0, not at all.
 
-    light: a picture is multiplied by up to 1 + light, or divided. offset: grey levels that are added or taken. shift:
-    share of a side by which a picture is moved. blur: share of the pictures that are blurred. noise: largest standard
-    deviation of what is added to each value, in grey levels.
+    light: a picture is multiplied by up to 1 + light, or divided. shift: share of a side by which a picture is moved.
+    blur: share of the pictures that are blurred. noise: largest standard deviation of what is added to each value, in
+    grey levels.
     """
 
     light: float = 0.0
-    offset: float = 0.0
     shift: float = 0.0
     blur: float = 0.0
     noise: float = 0.0
@@ -37,7 +36,6 @@ class Augmentation:
         brightest = np.log1p(self.light)
         variation = {
             GAIN: np.exp(rng.uniform(-brightest, brightest, count)),
-            OFFSET: rng.uniform(-self.offset, self.offset, count),
             NOISE: rng.uniform(0, self.noise, count),
             BLUR: rng.random(count) < self.blur,
         }
@@ -67,8 +65,6 @@ def vary(pictures: Tensor, variation: Mapping[str, Tensor]) -> Tensor:
         x = torch.where(variation[BLUR] > 0, blurred, x)
     if GAIN in variation:
         x = x * variation[GAIN]
-    if OFFSET in variation:
-        x = x + variation[OFFSET]
     if NOISE in variation and variation[NOISE].any():
         x = x + torch.randn_like(x) * variation[NOISE]
     return x.clamp_(0, 255) if variation else x

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rover_learn.curves import leave_curves
+from rover_learn.judges import SMALLEST_RANGE
 from rover_learn.lessons import BatchedPolicy, Pool, lit
 from rover_learn.student import gmac
 from rover_learn.training import STATE, Batch, Machine, Phase, Resumable, threads
@@ -36,7 +37,6 @@ from rover_lib.workshop.run.session import SMALL_GMAC
 MOST = {"to_parent": 1.0, "held_out_share": 0.999, "mirrored": 0.5, "blur": 1.0, "shift": 0.2}
 MAY_BE_ZERO = ("seed", "transformer_warmup")
 LEAST_RATE, LARGE = 1e-9, 10**9
-SMALLEST_RANGE = 0.02  # for an action that hardly changes, as errors are divided by the range
 VERSIONS = ("torch", "lerobot", "torchvision", "numpy")
 
 

@@ -102,7 +102,6 @@ class TrainingRecipe(Recipe):
     minutes: float = float(LARGE)
     mirrored: float = 0.0
     light: float = 0.25
-    offset: float = 0.0
     shift: float = 0.0
     blur: float = 0.0
     noise: float = 0.0
@@ -111,7 +110,7 @@ class TrainingRecipe(Recipe):
 
     @property
     def augmentation(self) -> Augmentation:
-        return Augmentation(self.light, self.offset, self.shift, self.blur, self.noise)
+        return Augmentation(self.light, self.shift, self.blur, self.noise)
 
     @classmethod
     def of(
