@@ -3,10 +3,11 @@
     judged = against_guesses(report, parts.calibration)
     for warning in judged.warnings(): ...
 
-The guesses are a constant action (the better of mean and median), the last action again and again, and the mean plan,
-step by step, of the recordings that the policy could learn from. A guess is beaten if the policy is nearer to the
-driver in every judged action, and surely so in their mean, each in percent of its recorded range: as few episodes say
-little, that is asked of many draws of the held-out ones (a bootstrap).
+Each action is asked by itself. The guesses are a constant (the better of mean and median) and the mean plan, step by
+step, of the recordings that the policy could learn from, and the last action again and again. That one is handed the
+driver's own action at each picture, which no car has: it is asked for the later half of a plan only. A guess is beaten
+if the policy is surely nearer to the driver: as few drives say little, that is asked of many draws of the held-out
+drives, or of the blocks of long ones (a bootstrap). A throttle that hardly varies is held, and not judged.
 """
 
 from collections.abc import Sequence
@@ -17,56 +18,102 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.judge.compare import Fidelity
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
+from rover_lib.workshop.recordings.blocks import group_by_block
 from rover_lib.workshop.recordings.samples import Sample
 
 DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
 SURE_PCT = 95
+MARGIN = 0.05  # a guess's error must surely be larger by this share of it; chosen by driving: research/readiness.py
 MEAN, MEDIAN, MEAN_PLAN = "the mean action", "the median action", "the mean plan"  # guesses that need no eyes
+CONSTANT, LAST = "a constant", "the last action again"
 
 
 @dataclass(frozen=True)
 class Guess:
-    """One guess: its error by action, and by how much the policy is better: the mean, and the ends of the interval.
+    """A guess of one action: its error, and by how much the policy is better: the mean, and the interval's ends.
 
-    All in percent of the recorded range. The interval has SURE_PCT % of the draws.
+    All in percent of the recorded range, of the plan's steps that it is asked for. The interval has SURE_PCT % of the
+    draws.
     """
 
-    errors_pct: dict[str, float]
+    error_pct: float
     better: float
     low: float
     high: float
-    beaten: bool
+
+    @property
+    def beaten(self) -> bool:
+        return self.low > MARGIN * self.error_pct
 
     def lead(self) -> str:
         return f"{self.better:.1f} points ({self.low:.1f} to {self.high:.1f})"
 
 
 @dataclass(frozen=True)
-class Judged:
-    """The result of `against_guesses`. drawn: how many episodes or pieces of them were drawn from, in words."""
+class ActionJudged:
+    """One action: the policy's error in percent of the recorded range, and the guesses by name.
 
-    errors_pct: dict[str, float]
+    held: it hardly varies, so that it is not judged. off: the policy's error as a share of the action's usual size.
+    """
+
+    error_pct: float
     guesses: dict[str, Guess]
+    held: bool
+    off: float
+
+    def lost(self) -> list[str]:
+        """The guesses that are not beaten; none if the action is held."""
+        return [] if self.held else [name for name, guess in self.guesses.items() if not guess.beaten]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The result of `against_guesses`. drawn: how many drives, blocks or pieces were drawn from, in words."""
+
+    actions: dict[str, ActionJudged]
     drawn: str
 
     def table(self) -> Table:
         """The policy and the guesses beside each other, for people."""
-        rows = [("the policy", *(f"{e:.2f} %" for e in self.errors_pct.values()), "")]
-        for name, g in self.guesses.items():
-            rows.append((name, *(f"{e:.2f} %" for e in g.errors_pct.values()), g.lead()))
-        return Table(("", *self.errors_pct, "the policy is better by"), rows)
+        rows = []
+        for action, found in self.actions.items():
+            rows.append((action, "the policy", f"{found.error_pct:.2f} %", "held, not judged" if found.held else ""))
+            rows += [("", name, f"{g.error_pct:.2f} %", g.lead()) for name, g in found.guesses.items()]
+        return Table(("", "", "off the driver", "the policy is better by"), rows)
 
     def warnings(self) -> list[str]:
-        """A sentence for each guess that is not beaten."""
-        what = "this policy is no better than a guess without eyes"
-        lost = {name: g for name, g in self.guesses.items() if not g.beaten}
-        return [f"{what}: {name} (better by {g.lead()} over {self.drawn})" for name, g in lost.items()]
+        """A sentence for each action that is no better than a guess, or if none can be judged."""
+        if all(found.held for found in self.actions.values()):
+            return ["no action varies enough in these recordings to show whether the policy sees"]
+        warnings = []
+        for action, found in self.actions.items():
+            if lost := found.lost():
+                where = " in the later half of a plan" if lost[0] == LAST else ""
+                name, guess = lost[0], found.guesses[lost[0]]
+                errors = f"{guess.error_pct - guess.better:.2f} % off the driver{where}, {name} {guess.error_pct:.2f} %"
+                lead = f"better by {guess.lead()} over {self.drawn}"
+                warnings.append(f"{action} is not clearly better than a guess without eyes: {errors}; {lead}")
+            if found.held and found.off > HELD_OFF:
+                off = f"its plans are {100 * found.off:.0f} % off what is usual there"
+                warnings.append(f"{action} hardly varies in these recordings, and {off}")
+        return warnings
+
+    def notes(self) -> list[str]:
+        """A sentence for each action that is held."""
+        held = {action: found for action, found in self.actions.items() if found.held}
+        return [
+            f"{action} hardly varies in these recordings: held, not judged ({found.error_pct:.1f} % off, "
+            f"{CONSTANT} {found.guesses[CONSTANT].error_pct:.1f} %)"
+            for action, found in held.items()
+        ]
 
     def summary(self) -> dict[str, Any]:
         """The same as plain JSON types, for compare.json."""
-        return {**asdict(self), "warnings": self.warnings()}
+        lost = {action: found.lost() for action, found in self.actions.items()}
+        return {**asdict(self), "lost": lost, "warnings": self.warnings(), "notes": self.notes()}
 
 
 def blind_plans(chunks: np.ndarray, is_pad: np.ndarray) -> dict[str, np.ndarray]:
@@ -83,9 +130,13 @@ def blind_plans(chunks: np.ndarray, is_pad: np.ndarray) -> dict[str, np.ndarray]
 
 
 def frame_errors(plans: np.ndarray, recorded: np.ndarray, is_pad: np.ndarray) -> np.ndarray:
-    """Return (n, A): each frame's mean absolute error over its recorded steps. plans: (n, C, A), or one for all."""
+    """Return (n, A): each frame's mean absolute error over its recorded steps; NaN where none is.
+
+    plans: (n, C, A), or one for all; recorded: (n, C, A); is_pad: (n, C).
+    """
     errors = np.abs(plans.astype(np.float64) - recorded) * ~is_pad[..., None]
-    return errors.sum(1) / (~is_pad).sum(1)[:, None]
+    count = (~is_pad).sum(1)[:, None]
+    return np.divide(errors.sum(1), count, out=np.full_like(errors[:, 0], np.nan), where=count > 0)
 
 
 def least_blind_errors(
@@ -100,53 +151,60 @@ def least_blind_errors(
 
 
 def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
-    """Hold the FP32 plans of a comparison and the guesses against the driver.
+    """Hold the FP32 plans of a comparison and the guesses against the driver, action by action.
 
-    learned: samples of other episodes, which the policy could learn from; the guesses know no others. None if there
-    are none, or no action is judged.
+    learned: samples of other drives, which the policy could learn from; the guesses know no others. None without any.
+    An action that never changes is left out.
     """
-    units = {a: pct for a in report.action_names if (pct := report.pct(a)) is not None}
-    if not units or not learned:
+    if not learned:
         return None
-    learned_chunks, learned_pads = np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned])
-    judged = [i for i, a in enumerate(report.action_names) if a in units]
-
-    def errors_of(plans: np.ndarray) -> np.ndarray:
-        """(n, judged actions): each frame's mean error over its recorded steps, in percent of the recorded range."""
-        return frame_errors(plans, report.recorded, report.is_pad)[:, judged] * list(units.values())
-
-    own = errors_of(report.reference)
-    blind = {name: errors_of(plan) for name, plan in blind_plans(learned_chunks, learned_pads).items()}
-    found = {"a constant action": min((blind[MEAN], blind[MEDIAN]), key=lambda e: e.mean())}
+    recorded, is_pad, half = report.recorded, report.is_pad, report.recorded.shape[1] // 2
+    blind = blind_plans(np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned]))
+    own = frame_errors(report.reference, recorded, is_pad)
+    errors = {name: frame_errors(plan, recorded, is_pad) for name, plan in blind.items()}
+    compared = {MEAN_PLAN: (errors[MEAN_PLAN], own)}
     states = np.stack([s.state for s in report.samples])
     if states.shape[1] == len(report.action_names):
-        found["the last action again"] = errors_of(states[:, None])
-    found[MEAN_PLAN] = blind[MEAN_PLAN]
+        later = recorded[:, half:], is_pad[:, half:]
+        compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
-    counts = np.array([len(p) for p in pieces])
-    guesses, own_pct = {}, dict(zip(units, own.mean(0).tolist(), strict=True))
-    for name, errors in found.items():
-        gain = (errors - own).mean(1)
-        sums = np.array([gain[p].sum() for p in pieces])
-        means = sums[draws].sum(1) / counts[draws].sum(1)
-        low, high = np.percentile(means, [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]).tolist()
-        errors_pct = dict(zip(units, errors.mean(0).tolist(), strict=True))
-        beaten = low > 0 and all(own_pct[action] < error for action, error in errors_pct.items())
-        guesses[name] = Guess(errors_pct, float(gain.mean()), low, high, beaten)
-    return Judged(own_pct, guesses, drawn)
+    actions = {}
+    for i, action in enumerate(report.action_names):
+        if (pct := report.pct(action)) is None:
+            continue
+        constant = min(errors[MEAN], errors[MEDIAN], key=lambda e: e[:, i].mean())
+        guesses = {}
+        for name, (of_guess, of_policy) in ({CONSTANT: (constant, own)} | compared).items():
+            if not np.isnan(of_guess[:, i]).all():
+                guesses[name] = _guess(pct * of_guess[:, i], pct * of_policy[:, i], pieces, draws)
+        acted, error = recorded[~is_pad][:, i], own[:, i].mean()
+        held, size = hardly_varies(action, acted), usual_size(acted)
+        actions[action] = ActionJudged(float(pct * error), guesses, held, float(error / size) if size else 0.0)
+    return Judged(actions, drawn)
+
+
+def _guess(of_guess: np.ndarray, of_policy: np.ndarray, pieces: Sequence[np.ndarray], draws: np.ndarray) -> Guess:
+    """Compare errors (n,), NaN where a frame has none. draws: (DRAWS, pieces), numbers of pieces."""
+    gain = of_guess - of_policy
+    sums = np.array([np.nansum(gain[rows]) for rows in pieces])
+    counts = np.array([np.count_nonzero(~np.isnan(gain[rows])) for rows in pieces])
+    means = sums[draws].sum(1) / counts[draws].sum(1).clip(1)
+    low, high = np.percentile(means, [(100 - SURE_PCT) / 2, (100 + SURE_PCT) / 2]).tolist()
+    return Guess(float(np.nanmean(of_guess)), float(np.nanmean(gain)), low, high)
 
 
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
     """Return what is drawn from, in words, and for each piece the numbers of its frames."""
     samples = report.samples
-    groups = groupby(range(len(samples)), lambda row: samples[row].episode)
-    episodes = [np.array(list(rows)) for _, rows in groups]
-    if len(episodes) >= LEAST_EPISODES:
-        return f"{len(episodes)} episodes", episodes
+    blocks = [np.array(rows) for rows in group_by_block(samples)]
+    one_drive_each = all(len({samples[i].episode for i in rows}) == 1 for rows in blocks)
+    what = "episode" if one_drive_each and len({s.episode for s in samples}) == len(blocks) else "block"
+    if len(blocks) >= LEAST_EPISODES:
+        return f"{len(blocks)} {what}s", blocks
     chunk = report.reference.shape[1]
     pieces = []
-    for rows in episodes:
-        numbers = [samples[row].row // chunk for row in rows]
-        pieces += [rows[np.array(numbers) == n] for n in dict.fromkeys(numbers)]
-    return f"{len(pieces)} pieces of {len(episodes)} episode{'s' if len(episodes) > 1 else ''}", pieces
+    for rows in blocks:
+        parts = [(samples[row].episode, samples[row].row // chunk) for row in rows]
+        pieces += [np.array(list(group)) for _, group in groupby(rows, key=dict(zip(rows, parts, strict=True)).get)]
+    return f"{len(pieces)} pieces of {len(blocks)} {what}{'s' if len(blocks) > 1 else ''}", pieces

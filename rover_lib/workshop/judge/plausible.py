@@ -16,7 +16,7 @@ import numpy as np
 
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.judge.recorded_range import Range, constant_actions
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, constant_actions, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly
 
@@ -33,11 +33,11 @@ OURS = "it was trained here and has learned too little of it: train longer, on m
 class Fit:
     """The result of `fits`.
 
-    recorded: range by action. actions: {predicted: [least, most], beyond_pct, spread} by action: the percentage of
-    predicted values that lie outside the recorded range by more than BEYOND of it, and their spread divided by the
-    recorded one. largest_state: by name, the largest normalised recorded state. plans_hz: steps per second of the
-    policy's plans. other_rates_hz: frames per second of each episode that has another rate. remedy: for numbers that do
-    not fit.
+    recorded: range by action. actions: {predicted: [least, most], beyond_pct, spread, held} by action: the percentage
+    of predicted values that lie outside the recorded range by more than BEYOND of it, their spread divided by the
+    recorded one, and whether that hardly varies, so that the spread says nothing. largest_state: by name, the largest
+    normalised recorded state. plans_hz: steps per second of the policy's plans. other_rates_hz: frames per second of
+    each episode that has another rate. remedy: for numbers that do not fit.
     """
 
     frames: int
@@ -64,7 +64,7 @@ class Fit:
             if found["beyond_pct"] > MOST_BEYOND_PCT:
                 what = f"{found['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
                 warnings.append(f"{name}: {what}; {self.remedy}")
-            elif found["spread"] < LEAST_SPREAD:
+            elif found["spread"] < LEAST_SPREAD and not found["held"]:
                 what = f"its predictions vary {100 * found['spread']:.0f} % as much as what was recorded"
                 warnings.append(f"{name}: {what}; {self.remedy}")
         for name, largest in self.largest_state.items():
@@ -96,12 +96,15 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     for i, (name, (low, high)) in enumerate(action_range.items()):
         if name in constant_actions(action_range):
             continue
-        values, margin = plans[..., i], BEYOND * (high - low)
+        values, acted = plans[..., i], recorded[..., i][known]
+        held = hardly_varies(name, acted)
+        margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if held else 0)
         beyond = (values < low - margin) | (values > high + margin)
         actions[name] = {
             "predicted": [float(values.min()), float(values.max())],
             "beyond_pct": 100 * float(beyond.mean()),
-            "spread": float(values[known].std() / max(recorded[..., i][known].std(), 1e-12)),
+            "spread": float(values[known].std() / max(acted.std(), 1e-12)),
+            "held": held,
         }
     largest: dict[str, float] = {}
     if (norm := config.state_norm) is not None:

@@ -47,7 +47,9 @@ def verdict(
     if deploy is None:
         best["because"] = "the best of them"
     familiar = stages["quantize"]["modes"].get(best["mode"], {}).get("familiar")
-    why = unfit or advice.fill_in("why.txt", best=best, fp32=rows["fp32"], familiar=familiar, counted=COUNTED)
+    notes = stages["compare"].get("guesses", {}).get("notes", [])
+    known = {"familiar": familiar, "counted": COUNTED, "notes": notes}
+    why = unfit or advice.fill_in("why.txt", best=best, fp32=rows["fp32"], **known)
     if other_robot:
         robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
         why.append(f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in other_robot)}.")
@@ -164,15 +166,21 @@ def _list_failures(
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared, looking = stages["compare"], stages["compare"].get("looking", {})
+    guesses, fit = compared.get("guesses", {}), stages["load"].get("fit", {}).get("warnings", [])
+    held = [action for action, found in guesses.get("actions", {}).items() if found["held"]]
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
-    sees = any(judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"]) for a in actions)
+    actions = [action for action in actions if action not in held]
+    blind = [a for a in actions if not judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"])]
     return advice.fill_in(
         "unfit.txt",
-        warnings=compared.get("guesses", {}).get("warnings", []) + stages["load"].get("fit", {}).get("warnings", []),
-        blind=bool(actions) and not sees,
+        warnings=[*guesses.get("warnings", []), *fit],
+        notes=guesses.get("notes", []),
+        blind=blind,
+        all_blind=len(blind) == len(actions),
+        unlearned=[action for action, lost in guesses.get("lost", {}).items() if lost or action in blind],
+        fit=fit,
         misses=any(row["gate"] == "fp32 hits" for row in failed),
         fp32=compared["fp32"],
-        episodes=len({name for part in stages["load"]["split"].values() for name in part}),
     )
 
 

@@ -62,6 +62,18 @@ def test_statistics_of_other_recordings_are_said(tiny, driven, changes, says):
     assert [w for w in of(tiny, driven, **changes).warnings() if re.match(says, w)]
 
 
+@pytest.mark.parametrize(("planned", "fit"), [(0.4, True), (0.41, True), (0.0, False)])
+def test_a_held_throttle_may_be_planned_as_a_constant(tiny, driven, planned, fit):
+    """Within a range as narrow as a hair, a hundredth beside it is not far outside."""
+    throttle = 0.4 + 0.0005 * np.sin(np.arange(len(driven)))
+    held = [
+        replace(s, chunk=np.column_stack([s.chunk[:, 0], np.full(len(s.chunk), t)]))
+        for s, t in zip(driven, throttle, strict=True)
+    ]
+    constant = Affine((1.0, 1e-6), (0.0, planned))
+    assert (of(tiny, held, action_unnorm=constant).warnings() == []) == fit
+
+
 def test_recordings_of_another_rate_are_said(tiny, driven):
     """The trainer's file does not say how fast it plans, which is 30 steps a second. Of 15, it drives twice as fast."""
     half = len(driven) // 2

@@ -122,21 +122,48 @@ def test_what_does_not_drive_is_not_deployed(demo):
     assert "train longer" in judged["failed"][0]["remedies"][0] and "record" in " ".join(commands(judged))
 
 
+def seen(by_picture, apart=5.0, action="steering"):
+    return {f"{action}_by_picture_pct": by_picture, f"{action}_apart_pct": apart}
+
+
+LOST = {"warnings": ["steering is not clearly better than x: 2.60 % off"], "lost": {"steering": ["a constant"]}}
+LOST_THROTTLE = {"warnings": ["throttle is not clearly better"], "lost": {"steering": [], "throttle": ["a constant"]}}
+HOLDS = {"warnings": [], "actions": {"throttle": {"held": True}}, "notes": ["throttle hardly varies: held, not judged"]}
+FAR = {"fit": {"warnings": ["throttle: far outside; are these the recordings?"]}}
+
+
 @pytest.mark.parametrize(
-    ("stage", "change", "says"),
+    ("stage", "change", "says", "helps"),
     [
-        ("load", {"fit": {"warnings": ["throttle: far outside; are these the recordings?"]}}, "Throttle: far outside"),
-        ("compare", {"guesses": {"warnings": ["this policy is no better than a guess without eyes: x"]}}, "no better"),
-        ("compare", {"looking": {"steering_by_picture_pct": 0.05, "steering_apart_pct": 0.05}}, "ignores its camera"),
+        ("load", FAR, "Throttle: far outside", "its own dataset"),
+        ("compare", {"guesses": LOST}, "Steering is not clearly better than x: 2.60 % off.", "longer training"),
+        ("compare", {"guesses": LOST_THROTTLE}, "Throttle is not clearly better", "a throttle held alike"),
+        ("compare", {"looking": seen(0.05, 0.05)}, "The policy ignores its camera", "longer training"),
+        (
+            "compare",
+            {"looking": seen(0.05) | seen(5.0, action="throttle")},
+            "Steering hardly follows",
+            "of other hours and places",
+        ),
+        ("compare", {"looking": seen(5.0) | seen(0.0, action="throttle")}, "Throttle hardly follows", "held alike"),
     ],
 )
-def test_a_policy_that_is_not_ready_gets_no_command_that_drives(demo, stage, change, says):
-    demo["compare"]["looking"] |= {"steering_by_picture_pct": 5.0, "throttle_by_picture_pct": 0.0}
-    assert judge(demo)["deploy"] == "static"  # one action that follows the camera is enough
+def test_a_policy_that_is_not_ready_gets_no_command_that_drives(demo, stage, change, says, helps):
+    assert judge(demo)["deploy"] == "static"
     demo[stage] |= change
     judged = judge(demo)
-    assert judged["deploy"] is None and says in judged["why"][0]
+    assert judged["deploy"] is None and says in judged["why"][0] and helps in judged["why"][-1]
+    assert ("held alike" in judged["why"][-1]) == ("held alike" in helps)
     assert not any(word in " ".join(commands(judged)) for word in ("ansible", "rover drive", "deploy.yml"))
+
+
+def test_a_held_throttle_is_said_and_need_not_follow_the_camera(demo):
+    demo["compare"] |= {"guesses": HOLDS, "looking": seen(5.0) | seen(0.0, action="throttle")}
+    judged = judge(demo)
+    assert judged["deploy"] == "static" and judged["why"][-1] == "Throttle hardly varies: held, not judged."
+    demo["compare"]["looking"] |= seen(0.05)
+    *_, helps, note = judge(demo)["why"]
+    assert helps.startswith("What helps") and note == judged["why"][-1]
 
 
 @pytest.mark.parametrize(
