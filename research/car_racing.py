@@ -1,0 +1,94 @@
+"""gymnasium's CarRacing-v3 as a world to record and to drive in, with the physics and the tracks as they are.
+
+Its own picture takes 20 ms or more, so what it shows is drawn here, 128x72 and from above: the road, the car, its speed
+as a bar. A drive ends with its time, or once the car's middle is half a road's width beside the road.
+"""
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from gymnasium.envs.box2d.car_dynamics import Car
+from gymnasium.envs.box2d.car_racing import TRACK_DETAIL_STEP, TRACK_WIDTH, CarRacing
+
+RATE_HZ, TIMEOUT_S, LEFT_M = 25.0, 8.0, 1.5 * TRACK_WIDTH
+WIDTH, HEIGHT, PX_PER_M, CAR_ROW = 128, 72, 1.6, 58
+GRASS, CAR_COLOUR, BAR = (102, 204, 102), (0, 0, 204), (255, 255, 255)  # BGR
+TOP_SPEED = 50.0  # of the bar
+SHOVE, SHOVE_TICKS = 0.3, 5  # somebody pulls the wheel
+
+
+class _Unseen(CarRacing):  # type: ignore[misc]
+    """The environment without its own pictures."""
+
+    def _render(self, mode: str) -> None: ...
+
+
+class Track:
+    """One drive along a track. seed: determines it, and the pulls at its wheel. `score` is in metres."""
+
+    def __init__(self, seed: int, shoves: int = 0, timeout_s: float = TIMEOUT_S):
+        self._env: Any = _Unseen(lap_complete_percent=1.0)
+        self._env.reset(seed=seed)
+        self._line = np.array([(x, y) for _, _, x, y in self._env.track])
+        self._angles = np.unwrap([beta for _, beta, _, _ in self._env.track])
+        self._quads = np.array([quad for quad, _ in self._env.road_poly])
+        self._colours = [tuple(float(c) for c in colour) for _, colour in self._env.road_poly]
+        self._ticks = RATE_HZ * timeout_s
+        rng = np.random.default_rng([seed, 25])
+        self._shoves = {int(t): rng.choice([-1, 1]) for t in rng.uniform(20, self._ticks, shoves)}
+        self.restart()
+
+    def restart(self) -> "Track":
+        """Put the car on the start again."""
+        if self._env.car:
+            self._env.car.destroy()
+        self._env.car = Car(self._env.world, *self._env.track[0][1:4])
+        self._at, self.score, self.ticks, self.done = 0, 0.0, 0, False
+        return self
+
+    def _seen(self, points: np.ndarray) -> np.ndarray:
+        """(..., 2) metres to the car's right and ahead of it."""
+        hull = self._env.car.hull
+        cos, sin = math.cos(hull.angle), math.sin(hull.angle)
+        return (points - np.array(hull.position)) @ np.array([[cos, -sin], [sin, cos]])
+
+    @property
+    def speed(self) -> float:
+        return float(self._env.car.hull.linearVelocity.length)
+
+    def step(self, steering: float, throttle: float) -> None:
+        """Drive for a tick. Positive steering turns right; throttle above a half is gas, below it brakes."""
+        action = np.array([steering, max(0.0, 2 * throttle - 1), max(0.0, 1 - 2 * throttle)])
+        for start, side in self._shoves.items():
+            action[0] += side * SHOVE * (start <= self.ticks < start + SHOVE_TICKS)
+        for _ in range(2):  # its physics has 50 Hz
+            self._env.step(action)
+        self.ticks += 1
+        near = np.arange(self._at, self._at + 12) % len(self._line)
+        away = np.linalg.norm(self._line[near] - np.array(self._env.car.hull.position), axis=1)
+        self._at += int(away.argmin())
+        self.score = self._at * TRACK_DETAIL_STEP
+        self.done = away.min() > LEFT_M or self.ticks >= self._ticks or self._at >= len(self._line) - 1
+
+    def expert(self) -> tuple[float, float]:
+        """Return what a good driver does now: pure pursuit of the road's middle, slower where it turns."""
+        right, ahead = self._seen(self._line[(self._at + 3 + round(0.12 * self.speed)) % len(self._line)])
+        coming = self._angles[min(self._at + 16, len(self._line) - 1)] - self._angles[self._at]
+        wanted = np.clip(64 - 60 * abs(coming), 23, 64)
+        throttle = np.clip(0.5 + 0.04 * (wanted - self.speed), 0.2, 0.87)
+        return float(np.clip(1.2 * math.atan2(right, ahead), -1, 1)), float(throttle)
+
+    def render(self) -> np.ndarray:
+        """(72, 128, 3) uint8 BGR, from above, the car's front up."""
+        frame = np.full((HEIGHT, WIDTH, 3), GRASS, np.uint8)
+        seen = self._seen(self._quads)
+        px = np.stack([WIDTH / 2 + PX_PER_M * seen[..., 0], CAR_ROW - PX_PER_M * seen[..., 1]], -1)
+        near = np.abs(px - (WIDTH / 2, HEIGHT / 2)).max((1, 2)) < WIDTH
+        fixed = np.round(px * 16).astype(np.int32)
+        for i in np.flatnonzero(near):
+            cv2.fillConvexPoly(frame, fixed[i], self._colours[i], shift=4)
+        cv2.rectangle(frame, (WIDTH // 2 - 2, CAR_ROW - 4), (WIDTH // 2 + 2, CAR_ROW + 4), CAR_COLOUR, -1)
+        cv2.line(frame, (0, HEIGHT - 2), (round(WIDTH * min(1.0, self.speed / TOP_SPEED)), HEIGHT - 2), BAR, 2)
+        return frame
