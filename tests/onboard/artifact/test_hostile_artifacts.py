@@ -145,7 +145,7 @@ def test_a_program_that_writes_a_file_cannot_do_so_confined(artifacts, tmp_path,
 
 
 def test_what_a_program_prints_reaches_no_terminal(artifacts, tmp_path, capfd):
-    said = "\\x1b[2J stopped, the human has the car"
+    said = "\\033[2J stopped, the human has the car"
     path = hostile(artifacts, tmp_path, {".py": line_before_end(f'print("{said}")')})
     with PolicyProcess(path, threads=1) as process:
         cameras = process.manifest["cameras"]

@@ -279,8 +279,8 @@ def test_prune_keeps_those_used_last_and_the_one_in_use(releases, two, third):
 def test_a_damaged_release_takes_no_other_ones_place(releases, two, third):
     first, never = releases.current, content_hash(third)
     second = releases.stage(two[1]).name
-    releases.switch(second)
-    releases.rollback()
+    for name in (second, first):
+        releases.switch(name)
     damage(releases.path_of(second))
     assert releases.prune(2) == [second]
     assert releases.current == first and releases.path_of(never).exists()
