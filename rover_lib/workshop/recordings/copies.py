@@ -30,7 +30,7 @@ MOST_ALIKE = 50  # episodes with the same run; it then tells nothing
 
 def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
     """Return the episodes without those that are the same drive as another, of which the longest is kept."""
-    scaled = lru_cache(1000)(_scaled)
+    scaled = lru_cache(1000)(scaled_down)
     having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
     kept = set()
     for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
@@ -44,7 +44,7 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
             for other, pairs in shared.items()
             if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other])
         ]
-        same = next((other for other, pairs in suspects if _look_alike(episodes[i], other, pairs, scaled)), None)
+        same = next((other for other, pairs in suspects if look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
             note = f"the same drive as {same.id}, as its actions and pictures show"
             faults.add(episodes[i].path / episodes[i].id, "copy", note)
@@ -79,7 +79,7 @@ def _follow(episode: Episode, other: Episode) -> bool:
     )
 
 
-def _look_alike(
+def look_alike(
     episode: Episode, other: Episode, pairs: list[tuple[int, int]], scaled: Callable[[Sample], np.ndarray]
 ) -> bool:
     """Whether most pictures at the same actions are the same, and could differ. pairs: a sample of each."""
@@ -103,7 +103,7 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
     return float((a * b).sum()) > CORRELATED * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
-def _scaled(sample: Sample) -> np.ndarray:
+def scaled_down(sample: Sample) -> np.ndarray:
     """The picture in few pixels; of several cameras, one beside the other."""
     frame: Any = sample.frame_bgr(SEEN[0])
     frames = frame.values() if isinstance(frame, dict) else (frame,)

@@ -26,10 +26,16 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         names = Path(fault.file).name, fault.note.partition(OF)[2].partition(", as ")[0]
         pair = sorted((by_name[n] for n in names if n in by_name), key=lambda e: (-len(e.samples), kept.index(e)))
         first, second = pair[0], pair[-1]
-        if first is not second and not left & {first.id, second.id}:
+        if first is not second and not left & {first.id, second.id} and not _is_symmetric(first):
             left.add(second.id)
             faults.add(second.path / second.id, "copy", f"{OF}{first.id}, mirrored, as its actions and pictures show")
     return tuple(episode for episode in kept if episode.id not in left)
+
+
+def _is_symmetric(episode: Episode) -> bool:
+    """Whether its pictures look the same turned over, so that a mirrored drive cannot be told from another one."""
+    rows = [(k, k) for k in range(len(episode.samples))]
+    return copies.look_alike(episode, _mirror(episode), rows, copies.scaled_down)
 
 
 def _mirror(episode: Episode) -> Episode:

@@ -29,7 +29,8 @@ PLANNED = np.stack([np.linspace(-0.5, 0.5, 32), np.linspace(0.1, 0.18, 32)], 1) 
 
 def picture(turn):
     """What the car's camera shows at a turn of the loop, (60, 80, 3) uint8 RGB."""
-    return np.random.default_rng(turn).integers(60, 200, (60, 80, 3), np.uint8)
+    blocks = np.random.default_rng(turn).integers(60, 200, (6, 8, 3), np.uint8)
+    return blocks.repeat(10, axis=0).repeat(10, axis=1)  # single pixels would be noise, and no motion
 
 
 def black(turn):

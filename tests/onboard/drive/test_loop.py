@@ -307,11 +307,14 @@ def test_a_picture_without_anything_on_it(pilot, seen, fault):
 SCENE = np.random.default_rng(0).integers(30, 220, (9, 16, 3), np.uint8).repeat(20, 0).repeat(20, 1)
 
 
+NOISE = np.random.default_rng(0)
+
+
 def noisy(dimmer=1.0, moved_px=0, noise=6, flicker=0.0, at_s=0.0):
     """flicker: of lamps at 100 Hz, a share of their light, through a camera that reads its rows in 25 ms."""
     row_s = at_s + np.arange(180)[:, None, None] / 180 * 0.025
     lamp = dimmer * (1 + flicker * np.sin(2 * np.pi * 100 * row_s))
-    shown = np.roll(SCENE, moved_px, 1) * lamp + np.random.default_rng().normal(0, noise, SCENE.shape)
+    shown = np.roll(SCENE, moved_px, 1) * lamp + NOISE.normal(0, noise, SCENE.shape)
     return np.clip(shown, 0, 255).astype(np.uint8)
 
 

@@ -36,7 +36,7 @@ class Timed(MemorySample):
 
 def drives_of(samples, each=2):
     """As a split: 12 of the samples calibrate, the others are held-out drives of `each` pictures, 0.1 s apart."""
-    timed = [Timed(s.state, s.picture, i % each, str(i // each), i % each / 10) for i, s in enumerate(samples)]
+    timed = [Timed(s.state, s.picture, i % each, str(i // each), time_s=i % each / 10) for i, s in enumerate(samples)]
     calibration = [replace(s, episode="calibration") for s in timed[:12]]
     return Drives.of(SimpleNamespace(calibration=calibration, choosing=(), held_out=timed[12:]))
 
@@ -72,7 +72,7 @@ def test_too_few_drives_and_parts_of_a_drive_set_no_threshold(thin, tmp_path):
     policy, _ = thin
     few = drives_of(memory_samples(12 + 2 * 18))
     assert "18 drives" in few.warnings[0] and not drives_of(memory_samples(12 + 2 * 19)).warnings
-    one = [Timed(s.state, s.picture, i, "one", i / 30) for i, s in enumerate(memory_samples(60))]
+    one = [Timed(s.state, s.picture, i, "one", time_s=i / 30) for i, s in enumerate(memory_samples(60))]
     assert not Drives.of(SimpleNamespace(calibration=one[:20], choosing=one[20:40], held_out=one[40:])).unseen
     module, exporter = ACT(policy.config, policy.weights), Exporter(policy, memory_samples(2))
     plain = exporter.export(module, tmp_path / "plain.pt")

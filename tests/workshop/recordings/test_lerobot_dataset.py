@@ -102,7 +102,7 @@ def test_a_camera_that_is_not_there_is_refused(tmp_path):
     root = written(tmp_path, features(**{"observation.front": info()["features"]["observation.images.front"]}))
     assert "has 2 cameras" in refused(root), "none hides another"
     (own := tmp_path / "episode_20260101_120000").mkdir()
-    assert "name their actions" in refused(Source.of(own, "throttle,steering"))
+    assert "named actions" in refused(Source.of(own, "throttle,steering"))
 
 
 # ---- what LeRobot's writer made ------------------------------------------------------------------------------------
