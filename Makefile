@@ -132,7 +132,7 @@ mutants: $(READY)
 
 # Without NAME it opens the repository's notebooks.
 notebooks-open: $(READY)
-	$(if $(filter file,$(origin NAME)),$(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(AS),--as '$(AS)'))
+	$(if $(filter file,$(origin NAME)),$(VENV)/bin/python -m jupyterlab $(if $(filter 0,$(shell id -u)),--allow-root) notebooks,$(ROVER) notebooks 'runs/$(NAME)' $(if $(filter default,$(origin AS)),,--as '$(AS)'))
 
 notebooks: demo demo-more
 	$(VENV)/bin/python -m lab.repository.publish
