@@ -71,11 +71,12 @@ def test_what_readme_says_to_type_works(demo_run, tmp_path, monkeypatch):
     for words in (words for words in asked if words[1] in ("watch", "notebooks-open", "run")):
         dry = ["make", "-n", "--no-print-directory", f"VENV={sys.prefix}", f"--old-file={sys.prefix}/.ready"]
         printed = subprocess.run([*dry, *words[1:]], capture_output=True, text=True, check=True).stdout
-        command = printed.splitlines()[-1]  # after the checks of what was typed
+        *before, command = printed.splitlines()
         if words[1] == "run":
             assert command == f"{sys.prefix}/bin/rover run 'best_model.pth' 'episodes' --name 'mine'"
             continue
         env = os.environ | {"PYTHONPATH": str(ROOT), "BROWSER": "true", "ROVER_AS_ROOT": "1", "HOME": str(tmp_path)}
+        subprocess.run("\n".join(before), shell=True, check=True)
         with started(command + " --web-port 0" * (words[1] == "watch"), env) as output:
             assert any(re.search(seen[words[1]], line) for line in output), command
     assert not {"episodes", "best_model.pth"} & {path.name for path in (tmp_path / "runs" / "demo-copy").iterdir()}
