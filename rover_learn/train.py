@@ -326,8 +326,10 @@ def _train(
         backbone = saved.machine.taking(live_backbone(pretrained))
         head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(device)
         _train_backbone(training, head)
-        _train_transformer(training)
-        optimizer, scheduler = _train_together(training, "all together", recipe.together_steps, recipe.together_rounds)
+        before = _train_transformer(training)
+        optimizer, scheduler = _train_together(
+            training, "all together", recipe.together_steps, recipe.together_rounds, before
+        )
         if recipe.at:
             data, frames = (Frames.of(each, size.image_sizes[0], workers) for each in (samples, judging))
             training = replace(training, data=data, judging=frames)
@@ -446,8 +448,11 @@ def _in_rounds(
     saved.judged[name] = judged
 
 
-def _train_transformer(training: _Training) -> None:
-    """Phase two: train all but the backbone on features that are computed once, of each frame as it is and varied."""
+def _train_transformer(training: _Training) -> np.ndarray:
+    """Phase two: train all but the backbone on features that are computed once, of each frame as it is and varied.
+
+    Returns its errors by action, (A,), in % of the range.
+    """
     policy, recipe, data, rng = training.policy, training.recipe, training.data, training.rng
     backbone = policy.model.backbone.eval()
     chosen = np.asarray(pick_evenly(range(len(data)), recipe.feature_samples))
@@ -471,8 +476,10 @@ def _train_transformer(training: _Training) -> None:
     with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
         best = Best(lambda: training.judge(judged))
         training.saved.train(phase, policy, rng, batch, training.loss, best)
-        training.say(f"transformer: {training.judges.words(training.judge(judged))}")
+        errors = training.judge(judged)
+    training.say(f"transformer: {training.judges.words(errors)}")
     policy.model.backbone = backbone
+    return errors
 
 
 def _features(
@@ -511,8 +518,13 @@ def _features(
     return maps
 
 
-def _train_together(training: _Training, name: str, steps: int, rounds: int = 1) -> tuple[torch.optim.Optimizer, Any]:
-    """Phase three: all parameters at a tenth of the rate, in rounds; a round stays if it is no worse than before."""
+def _train_together(
+    training: _Training, name: str, steps: int, rounds: int = 1, before: np.ndarray | None = None
+) -> tuple[torch.optim.Optimizer, Any]:
+    """Phase three: all parameters at a tenth of the rate, in rounds; a round stays if it is no worse than before.
+
+    before: the errors by action, (A,), until then, if they are known.
+    """
     policy, saved, made = training.policy, training.saved, list[Any]()
 
     def judge() -> tuple[float, np.ndarray]:
@@ -529,7 +541,7 @@ def _train_together(training: _Training, name: str, steps: int, rounds: int = 1)
             loss=training.loss,
         )
 
-    before = training.judge()
+    before = training.judge() if before is None else before
     _in_rounds(training, policy, name, rounds, 1.0, learn, judge, float(before.mean()))
     saved.judged[name].insert(0, [0, *map(float, before)])
     optimizer, scheduler = made

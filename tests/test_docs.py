@@ -40,7 +40,7 @@ PROGRAM = r"rover|lab|make|ansible-playbook|lerobot-[a-z-]+|python3? -m [\w.]+"
 def texts(path: Path) -> Iterator[str]:
     """Yield what a file shows people: a page's lines of code, a program's texts, each with X for what is filled in."""
     if path.suffix != ".py":
-        text = path.read_text().partition("## What left")[0].replace("\\\n", " ")
+        text = path.read_text().replace("\\\n", " ")
         yield from re.findall(r"^    +(\S.*)$", text, re.M) if path in PAGES else ()
         yield from (f"`{code}`" for code in re.findall(r"[`']([^`'\n]+)[`'](?! there)", text))
         return

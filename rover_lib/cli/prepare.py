@@ -31,7 +31,7 @@ ITERATIONS: dict[str, Any] = {"cls": Preset, "preset": lambda p, _: p["benchmark
 
 
 class Resumable(click.Command):
-    """A long command that, run again after Ctrl-C, goes on where it was."""
+    """A long command that, run again after Ctrl-C, resumes."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run it."""

@@ -16,7 +16,7 @@ from rover_lib.workshop.recordings.samples import Episode, Sample, block_of, fra
 BLOCK_S, SHORTER_S = 30.0, 20.0  # seconds; the shorter where there would be fewer than
 WANTED = 32  # blocks, a quarter of which are eight that are held out
 FEWEST = 12, 8  # blocks of a short drive, where they are at least two plans long, and else
-MANY_DRIVES, LONG_S = 20, 60.0  # whole drives are parted if there are so many, or all are shorter
+MANY_DRIVES, LONG_S = 20, 60.0  # drives stay whole from that many on, or if all are that short
 SAME_PLACE = "the same track and hour"
 PARTS = ("calibration", "choosing", "held_out")  # each may take the gap from those before it
 
