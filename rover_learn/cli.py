@@ -157,12 +157,12 @@ def train(episodes: "Source", output: Path, backbone: str, **options: Any) -> No
     from rover_learn.judges import not_learned
     from rover_learn.train import curves_of
     from rover_learn.train import train as train_policy
-    from rover_lib.workshop.installed import command_line
+    from rover_lib.workshop.installed import typed
 
     options |= {"backbone": None if backbone == "none" else backbone}
     click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
     actions = read_actions(curves_of(output))
     if lacking := not_learned(actions):
         return click.echo("\n".join(lacking))
-    command = command_line("rover", "run", output, *shlex.split(episodes.typed()), "--name", "mine")
+    command = typed(f"rover run {shlex.quote(str(output))} {episodes.typed()} --name mine")
     click.echo(f"next: {command}")

@@ -68,6 +68,7 @@ SIZES = {
     ),
     "full": ActConfig(),
 }
+JUDGED_AT_ONCE = 64  # frames
 FALLS = 0.02  # a further round is worth its time while the error falls by this share
 BACKBONE_SHARE = 0.75  # of the budget, for the backbone's rounds: the other phases take about as long as one of them
 # A cached checkpoint that takes minutes is made anew after each change of the code that makes it. One that takes an
@@ -278,11 +279,15 @@ class _Training:
         seen = loop.normalised(batch[IMAGE], batch) if batch[IMAGE].dtype == torch.uint8 else batch[IMAGE]
         return loop.policy_loss(self.policy, {**batch, IMAGE: seen}, self.weights)
 
+    def judging_blocks(self) -> list[np.ndarray]:
+        """Return the rows of what judges, in blocks that fit into memory."""
+        count = len(self.judging)
+        return [np.arange(first, min(first + JUDGED_AT_ONCE, count)) for first in range(0, count, JUDGED_AT_ONCE)]
+
     def plans(self, maps: loop.RowFile | None = None) -> np.ndarray:
         """Return the policy's plans on what judges it, (n, C, A). maps: as of `plans_on`."""
-        count = len(self.judging)
-        rows = [np.arange(first, min(first + 64, count)) for first in range(0, count, 64)]
-        plans = np.concatenate([loop.plans_on(self.policy, self.judging, each, maps) for each in rows])
+        blocks = self.judging_blocks()
+        plans = np.concatenate([loop.plans_on(self.policy, self.judging, rows, maps) for rows in blocks])
         self.policy.train()
         return plans
 
@@ -381,8 +386,7 @@ def _train_backbone(training: _Training, model: PlanFromFeatures) -> None:
         model.eval()
         data, plans = training.judging, []
         with torch.no_grad():
-            for first in range(0, len(data), 64):
-                rows = np.arange(first, min(first + 64, len(data)))
+            for rows in training.judging_blocks():
                 pictures = torch.from_numpy(data.pictures(rows)).to(training.weights.device)
                 plans.append(model(loop.normalised(pictures)).cpu().numpy())
         model.train()

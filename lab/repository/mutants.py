@@ -1,10 +1,9 @@
 """Plant slips, each in a copy, and see that a test fails: `make mutants`.
 
 A program draws lines of the judging, quantizing, recording, learning and driving code, each file in proportion to its
-lines, and plants a slip in each: a `<` becomes a `<=`, a 3 a 4, an `and` an `or`. cosmic-ray finds and makes the slips
-(mutmut, tried too, rewrites each function for a process that forks, which our tests' own processes and threads do not
-survive). The tests that run are those of the file's name, of its room, and those that import it; a slip is caught if
-one fails, or hangs. What survives needs a test, or a reason in survivors.yml.
+lines, and plants a slip in each: a `<` becomes a `<=`, a 3 a 4, an `and` an `or`. cosmic-ray finds and makes the slips.
+The tests that run are those of the file's name, of its room, and those that import it; a slip is caught if one fails,
+or hangs. What survives needs a test, or a reason in survivors.yml.
 
 What cosmic-ray cannot do stands in planted.yml: lines of the firmware, and lines that random drives must notice. A row
 has a `name`, a `file`, the `good` text that stands in it once, the `bad` text that takes its place, and the `test` file
