@@ -32,7 +32,6 @@ from rover_lib.workshop.states import OTHER_STATE
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
 SIDES_PX = 16, 8192  # smallest and largest side of a picture that an artifact takes
-NEARLY_WHOLE = 0.02  # the share by which a rate may be rounded; 4.35 Hz as 4 made plans 8 % slower
 SHORTEST = 2  # rows in the shortest episode: a single row has no spread to normalise by
 
 
@@ -86,8 +85,7 @@ def usual_rate_hz(recordings: Recordings) -> float:
         what = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
         name, odd_hz = next(iter(odd.items()))
         raise EpisodeError(what, found=f"{odd_hz:.1f} in {name}", remedy="export those of each rate by themselves")
-    whole_hz = max(round(usual_hz), 1)
-    return whole_hz if abs(whole_hz / usual_hz - 1) <= NEARLY_WHOLE else round(usual_hz, 3)
+    return recorded_as.round_rate_hz(usual_hz)
 
 
 def _parts(

@@ -53,6 +53,7 @@ from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
 from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings import samples as recorded
+from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source, pick_evenly
 
@@ -61,7 +62,6 @@ if TYPE_CHECKING:
 
 SMALL_DIM = 256  # below it, a second thread saves a quarter on a quiet machine, and on a busy one trebles the time
 PLANNED_HZ = 30.0  # of the user's trainer
-EXACT_BELOW_HZ = 15.0  # half a frame a second would be more than 3 % of a slower rate
 SIZES = {
     "small": ActConfig(
         image_sizes=((72, 128),), dim=128, heads=4, feedforward=512, encoder_layers=1, decoder_layers=1, vae_layers=1
@@ -238,10 +238,9 @@ def _rate_hz(recordings: Recordings) -> float:
         what = f"{recordings.root}: rover train is for cars of steering and throttle with one camera"
         remedy = f"name them, as in --action-names steering,throttle, or: {lerobot_train(recordings.root)}"
         raise EpisodeError(what, found=layout.words(), remedy=remedy)
-    rates = [found for e in recordings.episodes if (found := recorded.frame_rate_hz(e.samples)) is not None]
-    found_hz = layout.rate_hz or (float(np.median(rates)) if rates else PLANNED_HZ)
+    found_hz = layout.rate_hz or usual_rate_hz(recordings.episodes) or PLANNED_HZ
     as_recorded = layout.rate_hz or recorded.is_another_rate(found_hz, PLANNED_HZ)
-    return round(found_hz, 2 if found_hz < EXACT_BELOW_HZ else 0) if as_recorded else PLANNED_HZ
+    return float(recorded.round_rate_hz(found_hz)) if as_recorded else PLANNED_HZ
 
 
 def _turned(recordings: Recordings, progress: Progress) -> Recordings:

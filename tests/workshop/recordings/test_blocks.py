@@ -10,7 +10,7 @@ import pytest
 from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.recordings.blocks import name_blocks, name_long_drives
 from rover_lib.workshop.recordings.episodes import split
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of, round_rate_hz
 
 RATE_HZ, CHUNK = 20, 32
 
@@ -66,3 +66,10 @@ def test_drives_of_seconds_and_many_of_them_are_parted_whole():
     (few, *_), ((*names,),) = name_long_drives([drive(2400, session=""), drive(2400, "tub from 1", session="")])
     assert few.samples[0].block == names[0] and len(names) == 12
     assert not name_blocks([drive(87)])[1]
+
+
+@pytest.mark.parametrize(
+    ("found_hz", "kept_hz"), [(19.97, 20), (24.5, 24.5), (29.6, 30), (4.348, 4.348), (15.4, 15.4), (0.3, 0.3)]
+)
+def test_a_rate_is_rounded_only_as_far_as_no_plan_notices(found_hz, kept_hz):
+    assert round_rate_hz(found_hz) == kept_hz
