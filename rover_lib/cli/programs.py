@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from rover_lib.onboard.durable import build_folder
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.kinds import PathTo
 
@@ -73,12 +74,9 @@ def notebooks(run_dir: Path, name: str | None) -> None:
 
 def copy_run(run_dir: Path, copy: Path) -> None:
     """Copy what a run's notebooks made; `copy` appears only once it is complete."""
-    part = copy.with_name(f".{copy.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    for path in (path for pattern in COPIED for path in run_dir.glob(pattern)):
-        if path.is_dir():
-            shutil.copytree(path, part / path.name)
-        else:
-            shutil.copy2(path, part)
-    part.rename(copy)
+    with build_folder(copy) as new:
+        for path in (path for pattern in COPIED for path in run_dir.glob(pattern)):
+            if path.is_dir():
+                shutil.copytree(path, new / path.name)
+            else:
+                shutil.copy2(path, new)
