@@ -6,13 +6,19 @@ folder of their own, on a few frames and worlds.
 """
 
 import os
+from pathlib import Path
 from typing import Any
 
 # The notebooks' kernels inherit these, as in `rover run`.
 from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT, LINE
 
+# By its whole path: beside a folder of its own, the default would count as forgotten.
+DEMO = Path(__file__).resolve().parents[1] / "runs" / "demo"
+
 FEW: dict[str, Any] = {
     "run_dir": "../runs/nbval",
+    "checkpoint": str(DEMO / "best_model.pth"),
+    "episodes": str(DEMO / "episodes"),
     "samples": 12,
     "choosing_frames": 4,
     "held_out_frames": 8,
