@@ -31,13 +31,13 @@ class Augmentation:
     blur: float = 0.0
     noise: float = 0.0
 
-    def draw(self, count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draw a variation for each of `count` pictures: (count, 1, 1, 1) float32 each."""
+    def draw(self, count: int, rng: np.random.Generator, of: np.ndarray | bool = True) -> dict[str, np.ndarray]:
+        """Draw a variation for each of `count` pictures: (count, 1, 1, 1) float32 each. of: (count,), which vary."""
         brightest = np.log1p(self.light)
         variation = {
-            GAIN: np.exp(rng.uniform(-brightest, brightest, count)),
-            NOISE: rng.uniform(0, self.noise, count),
-            BLUR: rng.random(count) < self.blur,
+            GAIN: np.exp(rng.uniform(-brightest, brightest, count) * of),
+            NOISE: rng.uniform(0, self.noise, count) * of,
+            BLUR: (rng.random(count) < self.blur) & of,
         }
         return {name: values.astype(np.float32).reshape(count, 1, 1, 1) for name, values in variation.items()}
 

@@ -12,6 +12,7 @@ from interrupted import interrupt
 from lerobot.policies.act.modeling_act import ACTPolicy
 from recorded import record_drives
 
+from rover_learn import act_phases
 from rover_learn import train as train_module
 from rover_learn import training as training_module
 from rover_learn.backbone import IMAGENET, Pretrained
@@ -96,7 +97,7 @@ def test_a_training_ended_in_each_phase_gives_the_same_weights(drives, trained, 
     lerobots = ACTPolicy.from_pretrained(tmp_path / "killed_pretrained_model").state_dict()
     assert all(torch.equal(v, lerobots[k]) for k, v in whole["model_state_dict"].items())
     with monkeypatch.context() as patch:  # now it is taken from the cache
-        patch.setattr(train_module, "_train", lambda *_: pytest.fail("trained again"))
+        patch.setattr(train_module, "train_in_phases", lambda *_: pytest.fail("trained again"))
         assert train(drives, tmp_path / "again.pth", machine=CPU).read_bytes() == out.read_bytes()
     other = torch.load(train(drives, tmp_path / "other.pth", seed=1, machine=CPU), weights_only=False)
     name = "model.action_head.weight"
@@ -112,7 +113,7 @@ def test_what_a_lost_gpu_began_goes_on_or_is_said_to_begin_anew(
 
     set_params(CARRIED[:-1] + differs + "}")
     monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
-    monkeypatch.setattr(train_module, "_train", interrupted)
+    monkeypatch.setattr(train_module, "train_in_phases", interrupted)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "a GPU")
     said = []
     for kind in ("cuda", "cpu"):
@@ -210,7 +211,7 @@ def test_rounds_go_on_while_the_error_falls(errors, fits, learned, kept):
         error = errors[len(rounds) - 1]
         return error, np.array([error])
 
-    train_module._in_rounds(training, module, "backbone", 4, 0.5, learn, judge)
+    act_phases._in_rounds(training, module, "backbone", 4, 0.5, learn, judge)
     assert len(rounds) == learned and module.weight.item() == kept
     assert rounds[:2] == ["backbone", "backbone, round 2"][:learned]
     assert said[0] == "backbone: steering 5.0 %" and ("budget" in said[-1]) == (not fits)
@@ -246,7 +247,7 @@ def test_a_throttle_that_hardly_varies_and_was_not_learned_is_held(varies, error
         varies=np.array([True, varies]), blind_pct=np.array([8.0, 5.0]), names=["steering", "throttle"]
     )
     said = []
-    train_module._hold(policy, judges, np.array(errors), np.array([0.1, 0.4], np.float32), said.append)
+    act_phases._hold(policy, judges, np.array(errors), np.array([0.1, 0.4], np.float32), said.append)
     planned = head(torch.rand(5, 3))
     assert torch.allclose(planned[:, 1], torch.tensor(0.4)) == is_held and not torch.allclose(
         planned[:, 0], torch.tensor(0.1)

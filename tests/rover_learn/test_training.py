@@ -215,3 +215,19 @@ def test_a_mirrored_sample_is_mirrored_whole():
         assert np.array_equal(image, pictures[i][:, ::side])
         assert batch[STATE][i].tolist() == [side * 0.5, 0]
         assert np.array_equal(batch[ACTION][i], np.tile(np.float32([side * 0.25, 0.1]), (4, 1)))
+
+
+@pytest.mark.parametrize("shape", [(2, 512, 3, 4), (1, 512, 5, 5)])
+def test_a_wide_convolution_computes_the_same_in_another_way(shape):
+    torch.manual_seed(0)
+    conv, x = torch.nn.Conv2d(512, 8, 3, padding=1, bias=False), torch.randn(shape)
+    expected = conv(x)
+    expected.square().sum().backward()
+    gradient, names = conv.weight.grad.clone(), list(conv.state_dict())
+    conv.zero_grad()
+    taken = Machine.of("cpu").taking(torch.nn.Sequential(conv))[0]
+    computed = taken(x)
+    computed.square().sum().backward()
+    assert type(taken) is training.UnfoldedConv and list(taken.state_dict()) == names
+    torch.testing.assert_close(computed, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(taken.weight.grad, gradient, rtol=1e-3, atol=1e-3)
