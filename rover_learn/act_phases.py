@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 SMALL_DIM = 256  # below it, a second thread saves a quarter on a quiet machine, and on a busy one trebles the time
 JUDGED_AT_ONCE = 64  # frames
+HELD_WEIGHT = 0.1  # of an action that hardly varies: its noise would outweigh what the picture decides
 FALLS = 0.02  # a further round is worth its time while the error falls by this share
 BACKBONE_SHARE = 0.75  # of the budget, for the backbone's rounds: the other phases take about as long as one of them
 
@@ -173,7 +174,9 @@ def train_in_phases(
     mean, spread = actions.mean(axis=0), np.maximum(actions.std(axis=0), 1e-3)
     # Errors count in % of the range, so that a throttle that is held does not outweigh steering by its noise. The
     # largest spread counts 1, as LeRobot's loss has a second part.
-    weights = torch.from_numpy((1 / judges.ranges / (spread / judges.ranges).max()).astype(np.float32)).to(device)
+    counting = judges.varies if judges.varies.any() else np.ones_like(judges.varies)
+    weights = 1 / judges.ranges / (spread / judges.ranges)[counting].max()
+    weights[~counting] *= HELD_WEIGHT
     with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         torch.manual_seed(seed)
         policy = lerobot_act(size)
@@ -183,7 +186,8 @@ def train_in_phases(
             policy.model.action_head.bias.copy_(torch.from_numpy(mean))
         saved.machine.taking(policy)
         rng = np.random.default_rng([seed, 77])
-        training = PolicyTraining(first, policy, data, frames, judges, recipe, weights, rng, saved, say)
+        loss_weights = torch.from_numpy(weights.astype(np.float32)).to(device)
+        training = PolicyTraining(first, policy, data, frames, judges, recipe, loss_weights, rng, saved, say)
         backbone = saved.machine.taking(live_backbone(pretrained))
         head = PlanFromFeatures(backbone, mean, spread, size.chunk).to(device)
         _train_backbone(training, head)
@@ -336,7 +340,7 @@ def _train_transformer(training: PolicyTraining) -> np.ndarray:
     policy.train()
     phase = Phase("transformer", recipe.transformer_steps, recipe.transformer_rate, recipe.transformer_warmup)
     with loop.threads(1 if policy.config.dim_model < SMALL_DIM else torch.get_num_threads()):
-        best = Best(lambda: training.judge(judged))
+        best = Best(lambda: training.judge(judged), training.judges.overall_pct)
         training.saved.train(phase, policy, rng, batch, training.loss, best)
         errors = training.judge(judged)
     training.say(f"transformer: {training.judges.words(errors)}")
@@ -390,7 +394,7 @@ def _train_together(
 
     def judge() -> tuple[float, np.ndarray]:
         errors = training.judge()
-        return float(errors.mean()), errors
+        return training.judges.overall_pct(errors), errors
 
     def learn(phase: str, _: int) -> None:
         policy.train()
@@ -403,7 +407,7 @@ def _train_together(
         )
 
     before = training.judge() if before is None else before
-    _in_rounds(training, policy, name, rounds, 1.0, learn, judge, float(before.mean()))
+    _in_rounds(training, policy, name, rounds, 1.0, learn, judge, training.judges.overall_pct(before))
     saved.judged[name].insert(0, [0, *map(float, before)])
     optimizer, scheduler = made
     return optimizer, scheduler

@@ -47,6 +47,11 @@ class Judges:
         """Return (A,): how far plans, (n, C, A), are from what was recorded, in % of each action's range."""
         return 100 * np.nanmean(frame_errors(plans, self.chunks, self.is_pad), axis=0) / self.ranges
 
+    def overall_pct(self, errors_pct: Sequence[float] | np.ndarray) -> float:
+        """Return the mean error of the actions that vary, of all if none does: that of a held one says nothing."""
+        errors = np.asarray(errors_pct)
+        return float(errors[self.varies].mean() if self.varies.any() else errors.mean())
+
     def words(self, errors_pct: np.ndarray) -> str:
         """Say how far each action is off, beside the best guess without eyes."""
         each = zip(self.names, errors_pct, self.blind_pct, strict=True)

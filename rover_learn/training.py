@@ -10,6 +10,7 @@ and others read its pictures, so that no number of them changes a weight.
 import ctypes
 import math
 import os
+import statistics
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -212,12 +213,13 @@ class Phase:
 
 @dataclass
 class Best:
-    """The best weights so far. judge: returns the module's errors now, by action; their mean counts.
+    """The best weights so far. judge: returns the module's errors now, by action. overall: one error of them.
 
     stale: how often they were not beaten since. seen: [step, *errors] of each judgement.
     """
 
     judge: Callable[[], Sequence[float] | np.ndarray]
+    overall: Callable[[Sequence[float] | np.ndarray], float] = statistics.fmean
     error: float = math.inf
     stale: int = 0
     weights: dict[str, Tensor] = field(default_factory=dict)
@@ -226,7 +228,7 @@ class Best:
     def see(self, module: nn.Module, step: int) -> None:
         """Judge the module, and keep its weights if they are better than all before."""
         errors = [float(each) for each in self.judge()]
-        error = sum(errors) / len(errors)
+        error = self.overall(errors)
         self.seen.append([step, *errors])
         self.stale += 1
         if error < self.error:
