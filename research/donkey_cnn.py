@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from rover_lib.onboard.params import params
 from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, Source, pick_evenly
 
 WIDTH, HEIGHT = 80, 60
 AHEAD_S = (0.0, 0.25, 0.5, 1.0)
@@ -94,7 +94,7 @@ def r2(answers: Tensor, wanted: Tensor) -> float:
     return 1 - float(((answers - wanted) ** 2).mean() / wanted.var(correction=0))
 
 
-def judge(source: Path | str) -> dict[str, Any]:
+def judge(source: Path | str | Source) -> dict[str, Any]:
     """Train on recordings, and return R² of steering on the held-out part, by seconds ahead, and how it came about."""
     torch.set_num_threads(1)  # at this size, a second one mostly waits
     began_s, p = time.process_time(), params()["calibration"]

@@ -119,6 +119,22 @@ def _recorded(root: Path) -> list[Row]:
     return [("drives recorded", *(str(row["drives"]) for row in rows)), ("off the driver, %", *errors)]
 
 
+def _cars(root: Path) -> list[Row]:
+    """What became of the recordings of each real car."""
+    rows: list[Row] = [
+        ("place, camera", "pictures", "steering, R²: policy / CNN", "off, % (blind guess)", "static, % / ms", "verdict")
+    ]
+    for place, car in _metrics(root / "results" / "real", "cars")["cars"].items():
+        if "r2" not in car:
+            continue
+        seen = f"{car['r2']['0.5']:.2f} / {car['cnn_r2']['0.5']:.2f}"
+        off = f"{car['off_pct'][0]:.1f} ({car['blind_pct'][0]:.1f})"
+        static = f"{max(car['static_pct']):.2f} / {car['static_ms'][0]:.0f}"
+        verdict = "ready" if car["ready"] else "not ready"
+        rows.append((f"{place}, {car['camera']}", f"{car['pictures']:,}", seen, off, static, verdict))
+    return rows
+
+
 def _learning(root: Path) -> list[Row]:
     """The demo's policy before and after learning on, from corrections and from demonstrations."""
     policies = _metrics(root / "results" / "demo", "learn")["policies"]
@@ -168,6 +184,7 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "faults": _faults,
     "drives": _drives,
     "recorded": _recorded,
+    "cars": _cars,
     "learning": _learning,
     "judging": _judging,
     "parameters": _parameters,
