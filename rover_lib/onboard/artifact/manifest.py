@@ -37,7 +37,7 @@ MANGLED = re.compile(rb"___torch_mangle_\d+")
 MODES = ("fp32", "dynamic", "static", "mixed")
 SCHEMES = ("float", "dynamic", "symmetric", "affine")
 # What the reader accepts, whatever a manifest says; both ends included
-SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (5.0, 120.0)
+SIDE_PX, CHUNK, RATE_HZ = (16, 8192), (1, 256), (1.0, 120.0)
 WEIGHTS_MB, GMAC = (0.0, 1000.0), (0.0, 1000.0)
 MOST_NAMES, NAME_LENGTH = 64, 64
 MOST_VECTORS = 16

@@ -15,7 +15,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from rover_lib.onboard.checked import is_whole
+from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import atomic_path, plain, read_plain
@@ -247,7 +247,8 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
         what = f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}"
         raise CheckpointError(what, remedy="ACT acts on one observation, train with 1")
     size = whole("image_height"), whole("image_width")
-    whole("rate_hz", default=30)
+    if not is_number(rate_hz := raw.get("rate_hz", RATE_HZ)):
+        raise CheckpointError(f"{path}: config 'rate_hz' must be a number", found=quote(rate_hz), remedy=CORRECT_IT)
     actions = facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER)
     if (states := facts.value("state")) not in (None, actions):
         raise facts.refusal(facts.source("state"), states, f"and its actions are {quote_all(actions)}")
