@@ -4,10 +4,10 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from recorded import record_drives
 
 from lab import gpu
 from lab.__main__ import main
+from tests.helpers.recorded import record_drives
 
 TINY = "train: {small: {backbone_steps: 2, backbone_rounds: 1, transformer_steps: 3, together_steps: 2, "
 TINY += "together_rounds: 1, batch: 4, transformer_batch: 4, together_batch: 2, samples: 40, feature_samples: 12, "

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from policies import memory_samples
 
 from research import donkey_cnn
 from research.donkey_cnn import AHEAD_S, linear, predict, r2, tensors, train
+from tests.helpers.policies import memory_samples
 
 RATE_HZ = 20.0
 

@@ -12,9 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from archives import rewritten
-from policies import TINY, check_is, lerobot_policy, memory_samples, saved_normalised, trainer_content
-from recorded import edit_json as edit
 from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
@@ -25,6 +22,9 @@ from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, write_lerobot
 from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.recordings.samples import Layout
+from tests.helpers.archives import rewritten
+from tests.helpers.policies import TINY, check_is, lerobot_policy, memory_samples, saved_normalised, trainer_content
+from tests.helpers.recorded import edit_json as edit
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 RENAMES = {"registry_name": "rename_observations_processor", "config": {"rename_map": {"a": "b"}}}

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, saved_normalised, trainer_content
-from recorded import edit_json as edit
-from recorded import record_drives
 from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.samples import Layout, Source
 from rover_lib.workshop.run.session import load
+from tests.helpers.policies import TINY, lerobot_policy, saved_normalised, trainer_content
+from tests.helpers.recorded import edit_json as edit
+from tests.helpers.recorded import record_drives
 
 TURNED = {"mean": torch.tensor([0.25, 0.3]), "std": torch.tensor([0.05, 0.4])}
 

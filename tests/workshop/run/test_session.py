@@ -4,8 +4,6 @@ import json
 from dataclasses import replace
 
 import pytest
-from executed import run_cells
-from recorded import record_drives
 
 from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
 from rover_lib.workshop.act import Affine
@@ -14,6 +12,8 @@ from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.recordings.samples import Source
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.session import load, open_run
+from tests.helpers.executed import run_cells
+from tests.helpers.recorded import record_drives
 
 
 @pytest.mark.slow
