@@ -36,6 +36,7 @@ def test_r2_by_hand():
     assert r2(torch.full((4,), 1.5), wanted) == 0
 
 
+@pytest.mark.research
 def test_it_learns_what_can_be_seen(monkeypatch):
     monkeypatch.setattr(donkey_cnn, "EPOCHS", 6)
     learning, choosing = tensors(samples(500, 0), RATE_HZ), tensors(samples(100, 1), RATE_HZ)
