@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.workshop.act import ACT, Affine, example_inputs, inputs_of, predictions
-from rover_lib.workshop.checkpoint import files
+from rover_lib.workshop.checkpoint import trainer
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint, write_both
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, write_lerobot
@@ -400,5 +400,5 @@ def test_the_size_of_what_was_trained_here_is_not_guessed(tiny, tmp_path):
     for ours in (False, True):
         read = replace(tiny, report=tiny.report | {"written_here": ours})
         assert bool(read.recorded_as(Layout(), [wide]).report["guesses"]) != ours
-    known = files.trainer_config(tiny.config, learning_rate=1e-3)
-    assert files.OURS.items() <= known.items() and not tiny.report["written_here"]
+    known = trainer.trainer_config(tiny.config, learning_rate=1e-3)
+    assert trainer.OURS.items() <= known.items() and not tiny.report["written_here"]

@@ -11,7 +11,8 @@ import pytest
 from balloon_world.world import World
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.source import Source
 from tests.helpers.recorded import real_recordings
 
 FRAMES, DRIVES = 60, 6

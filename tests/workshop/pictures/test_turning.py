@@ -8,7 +8,8 @@ import pytest
 
 from rover_lib.workshop.pictures.turning import LEAST_SPREAD, measure_sides
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.source import Source
 from tests.helpers.recorded import pass_a_wall, real_recordings
 
 

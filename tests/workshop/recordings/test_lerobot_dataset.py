@@ -21,7 +21,8 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Layout, Source
+from rover_lib.workshop.recordings.samples import Layout
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import load
 from tests.helpers.policies import TINY, lerobot_policy, memory_samples, saved_normalised
 from tests.helpers.recorded import edit_json as edit

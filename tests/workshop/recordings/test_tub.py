@@ -13,7 +13,8 @@ from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.recordings import tub as reader
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Source, frame_rate_hz
+from rover_lib.workshop.recordings.samples import frame_rate_hz
+from rover_lib.workshop.recordings.source import Source
 from tests.helpers.command import rover
 from tests.helpers.episodes import kinds
 from tests.helpers.recorded import record_drives

@@ -7,7 +7,7 @@ import pytest
 
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run import run_report as report
 from rover_lib.workshop.run.describe import describe, runs
 from tests.helpers.recorded import record_drives

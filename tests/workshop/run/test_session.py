@@ -9,7 +9,7 @@ from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import check_limits
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.session import load, open_run
 from tests.helpers.executed import run_cells
