@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 ROVER := $(VENV)/bin/rover
 LAB := $(VENV)/bin/python -m lab
-PACKAGES := rover_lib rover_exchange rover_learn balloon_world lab lerobot_robot_rover
+PACKAGES := rover_lib rover_exchange rover_learn balloon_world lab research lerobot_robot_rover
 READY := $(VENV)/.ready
 LOOK := runs/look
 # Each process runs whole test files or notebooks, and one waits while others compute. More than four processes would
@@ -106,12 +106,12 @@ test: lint $(DEMO)
 # No notebook is among these tests, so they do without nbval, whose import takes three seconds in each process.
 # They hardly wait for anything, so that a process more than there are cores would only import torch once more.
 test-fast: $(READY)
-	$(PYTEST) --numprocesses $$(nproc) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release' tests
+	$(PYTEST) --numprocesses $$(nproc) -p no:nbval --override-ini 'addopts=-q -rs --strict-markers' -m 'not slow and not emulated and not release and not research' tests
 
 # Tests in real time and of whole fleets. Run them on a quiet machine before each release.
 check-release: lint $(DEMO)
 	$(MAKE) demo-more
-	$(VENV)/bin/pytest -m release tests
+	$(VENV)/bin/pytest -m 'release or research' tests
 	$(VENV)/bin/pytest notebooks
 	$(LAB) faults runs/faults.json
 	for car in crawler inverted; do $(LAB) faults runs/faults-$$car.json --car lab/cars/$$car.yml || exit; done

@@ -32,7 +32,8 @@ from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, wors
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, Source, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
+from rover_lib.workshop.recordings.source import Source
 
 PUSHES = 4
 TEACHER = "teacher"

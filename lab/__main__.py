@@ -82,24 +82,6 @@ def faults(ctx: click.Context, output: Path | None, only: tuple[str, ...], car_f
     _end(ctx, metrics["wrong"])
 
 
-@main.command("gpu")
-@click.argument("output", type=FILE)
-@click.argument("episodes", type=FILE, required=False)
-@click.option("--device", default="cuda", show_default=True)
-@click.option("--size", type=click.Choice(["small", "full"]), default="full", show_default=True)
-@click.pass_context
-def measure_gpu(ctx: click.Context, output: Path, episodes: Path | None, device: str, size: str) -> None:
-    """Train on a GPU, on EPISODES or on 128 drives recorded for it, and write what it takes to OUTPUT, as JSON.
-
-    It takes some ten minutes. The exit code is 1 if it takes too long, or an interruption changes the weights.
-    lab/gpu_proof.sh trains for longer, and judges what comes of that.
-    """
-    from lab.gpu import measure
-    from rover_lib.workshop.cache import cache_root
-
-    _end(ctx, measure(output, device, size, episodes or cache_root() / "gpu-episodes"))
-
-
 @main.command("mutants")
 @click.argument("output", type=FILE, required=False)
 @click.option("--count", type=click.IntRange(min=0), default=300, show_default=True, help="How many slips.")
@@ -163,25 +145,6 @@ def pi(ctx: click.Context, output: Path, demo: Path) -> None:
     from lab.pi.deployment import deploy_and_drive
 
     _end(ctx, deploy_and_drive(output, demo, click.echo))
-
-
-@main.command("strange")
-@click.argument("output", type=FILE)
-@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose static artifact drives.")
-@click.option("--worlds", type=click.IntRange(min=1), default=200, show_default=True, help="Good drives of each kind.")
-@click.option("--each", type=click.IntRange(min=1), default=60, show_default=True, help="Drives of each strangeness.")
-@click.option("--real", type=FILE, help="Recordings of another room, to be unfamiliar.")
-def judge_strange(output: Path, demo: Path, worlds: int, each: int, real: Path | None) -> None:
-    """Make the balloon world strange, and see whether the policy stops in time, and only then. Writes OUTPUT as JSON.
-
-    Drives that were made are kept beside OUTPUT, and not made again.
-    """
-    from lab.driving.strange import judge_strangeness
-    from rover_lib.onboard.stage import write_stage
-
-    metrics = judge_strangeness(demo, worlds, each, real, output.with_suffix(".jsonl"), terminal_bar())
-    write_stage(output, "strange", params={"worlds": worlds, "each": each}, metrics=metrics)
-    show(metrics, False)
 
 
 if __name__ == "__main__":

@@ -36,11 +36,11 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
     A tub's steering and throttle become those of this machine's car (car.yml). Its deleted records and those at which a
     pilot drove are left out, and episodes end where records are missing.
     """
-    from rover_exchange.export_dataset import export_dataset as write
-    from rover_lib.workshop.recordings.samples import Source
+    from rover_exchange import export_dataset
+    from rover_lib.workshop.recordings.source import Source
 
     source = Source.of(recordings, throttle=throttle or "")
-    _print_export(write(source, out, progress=terminal_bar(), **options), out, as_json)
+    _print_export(export_dataset.export_dataset(source, out, progress=terminal_bar(), **options), out, as_json)
 
 
 def _print_export(report: dict[str, Any], out: Path, as_json: bool) -> None:
@@ -111,7 +111,7 @@ def _draw(flight: Any, output: Path) -> None:
 
     figure = flight_figure(flight)
     if output.suffix.lower()[1:] not in figure.canvas.get_supported_filetypes():
-        found = output.suffix or "no ending"
-        raise RoverError(f"{output}: no figure has that ending", found=found, remedy="say .png, .pdf or .svg")
+        actual = output.suffix or "no ending"
+        raise RoverError(f"{output}: no figure has that ending", found=actual, remedy="use .png, .pdf or .svg")
     with atomic_path(output) as temporary:
         figure.savefig(temporary)

@@ -27,7 +27,8 @@ from rover_lib.workshop.recordings import samples as recorded_as
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.lerobot_dataset import CAR, DRIVEN_BY, INTERVENTION, REPORT
 from rover_lib.workshop.recordings.names import ACTION, CAMERA, STATE
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, LEAST_RATED, Episode, Recordings, Sample
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.states import OTHER_STATE
 
 NAME = "cam_front"  # the camera's name, as in the trainer's policies
@@ -52,20 +53,20 @@ def export_dataset(
     out = Path(out)
     if out.exists() or out.is_symlink():
         raise EpisodeError(f"{out}: is there already", remedy="give a new folder, or remove it")
-    least, most = SIDES_PX
-    if size and not least <= min(size) <= max(size) <= most:
-        raise EpisodeError(f"pictures must have {least} to {most} pixels a side", found=f"{size[1]}x{size[0]}")
+    smallest, largest = SIDES_PX
+    if size and not smallest <= min(size) <= max(size) <= largest:
+        raise EpisodeError(f"pictures must have {smallest} to {largest} pixels a side", found=f"{size[1]}x{size[0]}")
     recordings = load_recordings(episodes, chunk=2, sync_s=params()["calibration"]["sync_s"], progress=progress)
     if recordings.layout.rate_hz is not None and not any(fault.kind == OTHER_STATE for fault in recordings.faults):
         raise EpisodeError(f"{recordings.root}: is a LeRobotDataset already", remedy="use it as it is")
     rate_hz = usual_rate_hz(recordings)
     car = recorded_as.car_of(recordings.samples)
     with build_folder(out) as new:
-        made = new / "dataset"  # LeRobot makes its folder itself
-        report = _write(recordings, made, rate_hz, size, progress) | {CAR: car.description()}
-        for path in made.iterdir():
+        dataset_folder = new / "dataset"  # LeRobot makes its folder itself
+        report = _write(recordings, dataset_folder, rate_hz, size, progress) | {CAR: car.description()}
+        for path in dataset_folder.iterdir():
             path.rename(new / path.name)
-        made.rmdir()
+        dataset_folder.rmdir()
         (new / REPORT).write_text(json.dumps(report, indent=2) + "\n")
     return report
 
@@ -77,14 +78,14 @@ def usual_rate_hz(recordings: Recordings) -> float:
     """
     longest = max(len(e.samples) for e in recordings.episodes)
     long = [e for e in recordings.episodes if len(e.samples) >= min(longest, LEAST_RATED)]
-    rates = {e.id: found for e in long if (found := recorded_as.frame_rate_hz(e.samples)) is not None}
+    rates = {e.id: rate_hz for e in long if (rate_hz := recorded_as.frame_rate_hz(e.samples)) is not None}
     if not rates:
         raise EpisodeError(f"{recordings.root}: no episode of two frames", remedy="record longer ones")
     usual_hz = float(np.median(list(rates.values())))
-    if odd := {name: found for name, found in rates.items() if recorded_as.is_another_rate(found, usual_hz)}:
-        what = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
+    if odd := {name: rate_hz for name, rate_hz in rates.items() if recorded_as.is_another_rate(rate_hz, usual_hz)}:
+        problem = f"{recordings.root}: most episodes have {usual_hz:.1f} frames a second, {len(odd)} have another rate"
         name, odd_hz = next(iter(odd.items()))
-        raise EpisodeError(what, found=f"{odd_hz:.1f} in {name}", remedy="export those of each rate by themselves")
+        raise EpisodeError(problem, found=f"{odd_hz:.1f} in {name}", remedy="export those of each rate by themselves")
     return recorded_as.round_rate_hz(usual_hz)
 
 
@@ -134,7 +135,7 @@ def _write(
         image_writer_threads=min(4, os.cpu_count() or 1),  # half of the time goes into compressing PNG
     )
     left_out: Counter[str] = Counter(too_short=0, nobody_drove=0)
-    written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
+    rows_written: list[tuple[Episode, int, int]] = []  # the episode, the first frame, how many frames
     with warnings.catch_warnings():
         # numpy warns when LeRobot computes statistics of yes and no
         warnings.filterwarnings("ignore", "Converting input from bool")
@@ -148,29 +149,29 @@ def _write(
                         row = _row(episode, sample, frame)
                         dataset.add_frame({k: v for k, v in row.items() if k in dataset.features or k == "task"})
                     dataset.save_episode()
-                    written.append((episode, rows[0][0].row, len(rows)))
+                    rows_written.append((episode, rows[0][0].row, len(rows)))
         finally:  # else it would be done at some later time, in a folder that is gone
             if hasattr(dataset, "stop_image_writer"):  # else finalize() does it
                 dataset.stop_image_writer()
             dataset.finalize()
-    if not written:
+    if not rows_written:
         raise EpisodeError(f"{recordings.root}: no two whole frames in a row", remedy="record again")
-    lengths = [count for _, _, count in written]
+    lengths = [count for _, _, count in rows_written]
     return {
         "dataset": "LeRobotDataset v3, images",
         "pictures": f"{shape[1]}x{shape[0]}" + ("" if shape == recorded else f", recorded {recorded[1]}x{recorded[0]}"),
-        "episodes": len(written),
+        "episodes": len(rows_written),
         "frames": sum(lengths),
         "frames_in_a_usual_episode": int(np.median(lengths)),
         "frames_a_second": rate_hz,
         "recorded_episodes": len(episodes),
-        **{f"left_out_{what}": count for what, count in left_out.items()},
+        **{f"left_out_{reason}": count for reason, count in left_out.items()},
         "recomputed": recordings.recomputed() or "no action",
         "steering": measure_sides(recordings, progress).words(),
         "faults": recordings.faults_by_kind(),
         "faults_while_reading": [asdict(fault) for fault in recordings.faults],
-        "episodes_are": [f"{episode.id} from frame {first}" for episode, first, _ in written],
-        DRIVEN_BY: [POLICY if episode.by_policy else HUMAN for episode, _, _ in written],
+        "episodes_are": [f"{episode.id} from frame {first}" for episode, first, _ in rows_written],
+        DRIVEN_BY: [POLICY if episode.by_policy else HUMAN for episode, _, _ in rows_written],
     }
 
 

@@ -23,7 +23,10 @@ PANEL = 118  # rows below the picture
 FULL_THROTTLE = 0.25  # the throttle that fills the bar
 WHO = {"M": "the human drives", "A": "the policy drives", "S": "stopped"}
 GREEN_BGR = (113, 204, 46)
-INK, BAR, FILL, PIN = (232, 232, 232), (42, 47, 52), (59, 143, 212), (255, 255, 255)
+INK = (232, 232, 232)
+BAR = (42, 47, 52)
+FILL = (59, 143, 212)
+PIN = (255, 255, 255)
 RATE_HZ = 30
 
 
@@ -56,7 +59,8 @@ def write_film(path: Path, flight: Flight, progress: Progress = silent) -> int:
 
 def _pictures(flight: Flight, moments: list[Moment], progress: Progress) -> Iterator[np.ndarray]:
     """Yield (h, WIDTH, 3) uint8 RGB, even sides, all of one size, for each time step whose picture is whole."""
-    times_s, step_s = np.array([m.t_s for m in moments]), (flight.period_ms or PERIOD_MS) / 1000
+    times_s = np.array([m.t_s for m in moments])
+    step_s = (flight.period_ms or PERIOD_MS) / 1000
     height: int | None = None
     for at_s in progress(np.arange(times_s[0], times_s[-1] + 1e-9, 1 / RATE_HZ), desc="drawing"):
         moment = moments[int(np.searchsorted(times_s, at_s + 1e-9, side="right")) - 1]
@@ -92,11 +96,13 @@ def draw_moment(moment: Moment, frame_bgr: np.ndarray, car: Car, step_s: float) 
 
 def _draw_panel(draw: ImageDraw.ImageDraw, moment: Moment, top: int, car: Car) -> None:
     """Draw each action as a bar, what the pin did as a line in it, and both as numbers."""
-    tick, font = moment.tick, ImageFont.load_default(14)
+    tick = moment.tick
+    font = ImageFont.load_default(14)
     # The columns of an action of 0 and of 1: steering starts in the middle of the bar.
     scales = {"steering": (174, 174 - 90 * car.left), "throttle": (84, 84 + 180 / FULL_THROTTLE)}
     for y, (name, (zero, one)) in zip((top + 10, top + 40), scales.items(), strict=True):
-        action, pin_us = tick[name] or 0.0, tick[f"pins_{name}_us"]
+        action = tick[name] or 0.0
+        pin_us = tick[f"pins_{name}_us"]
         column = float(np.clip(zero + (one - zero) * action, 84, 264))
         draw.rectangle((84, y, 264, y + 18), BAR)
         draw.rectangle((min(zero, column), y, max(zero, column), y + 18), FILL)

@@ -23,7 +23,8 @@ HEIGHTS = {"driven by": 0.4, "steering": 1.6, "throttle": 1.6, "plan (ms)": 1.6,
 
 def flight_figure(flight: Flight) -> Figure:
     """Draw one drive: panels over the same seconds, and a dotted line for each event."""
-    ticks, t_s = flight.ticks, flight.ticks["t_s"]
+    ticks = flight.ticks
+    t_s = flight.ticks["t_s"]
     height_in = sum(HEIGHTS.values()) + 3
     fig, axes = new_figure(len(HEIGHTS), height_in=height_in, height_ratios=[*HEIGHTS.values()], sharex=True)
     who, steering, throttle, plan, late = axes[:, 0]
@@ -54,8 +55,8 @@ def flight_figure(flight: Flight) -> Figure:
 def _draw_who(ax: Axes, ticks: Mapping[str, np.ndarray]) -> None:
     """Draw who drove, as coloured bands."""
     for state, (label, colour) in STATES.items():
-        if (driven := ticks["state"] == state).any():
-            until_next = driven | np.append(False, driven[:-1])
+        if (active := ticks["state"] == state).any():
+            until_next = active | np.append(False, active[:-1])
             ax.fill_between(ticks["t_s"], 0, 1, where=until_next, step="post", color=colour, lw=0, label=label)
     ax.set_yticks([])
     ax.set_ylim(0, 1)
@@ -63,13 +64,15 @@ def _draw_who(ax: Axes, ticks: Mapping[str, np.ndarray]) -> None:
 
 def _draw_pulses(ax: Axes, channel: Channel, ticks: Mapping[str, np.ndarray], colour: str) -> None:
     """Draw one channel's pulses, commanded and on the pin. The axis on the right shows the same lines as actions."""
-    t_s, commanded, pins = ticks["t_s"], ticks[f"{channel.name}_us"], ticks[f"pins_{channel.name}_us"]
+    t_s = ticks["t_s"]
+    commanded = ticks[f"{channel.name}_us"]
+    pins = ticks[f"pins_{channel.name}_us"]
     neutral_us = channel.pulse_us(0.0)
     ax.plot(t_s, commanded, color=colour, lw=2.2, alpha=0.7, label="commanded, us", drawstyle="steps-post")
     ax.plot(t_s, pins, color=BLACK, lw=0.9, label="the Arduino's pin", drawstyle="steps-post")
     ax.axhline(neutral_us, color=GREY, lw=0.8, ls="--", label=f"neutral, {neutral_us} us")
-    known = np.concatenate([commanded, pins, [neutral_us]])
-    low, high = np.nanmin(known), np.nanmax(known)
+    pulses = np.concatenate([commanded, pins, [neutral_us]])
+    low, high = np.nanmin(pulses), np.nanmax(pulses)
     room = max(0.08 * (high - low), 6)  # or the noise of a standing car would fill the panel
     ax.set_ylim(low - room, high + room)
     scale = (lambda us: (us - neutral_us) / channel.us_per_unit, lambda a: neutral_us + a * channel.us_per_unit)

@@ -45,7 +45,8 @@ def moments_of(flight: Flight) -> list[Moment]:
     this drive.
     """
     ticks = flight.ticks
-    t_s, period_ms = ticks["t_s"], flight.period_ms or PERIOD_MS
+    t_s = ticks["t_s"]
+    period_ms = flight.period_ms or PERIOD_MS
     if not len(t_s):
         raise RoverError(f"{flight.path}: nothing was driven in this drive", remedy="choose another by --drive")
     begin_s = began_s(flight)

@@ -43,8 +43,8 @@ def onnx_model(graph: GraphModule, inputs: Mapping[str, Tensor], outputs: Sequen
     """
     writer = _Writer(graph, inputs, outputs)
     with torch.inference_mode():
-        made = writer.run(*inputs.values())
-    model = writer.model(_as_list(made))
+        results = writer.run(*inputs.values())
+    model = writer.model(_as_list(results))
     onnx.checker.check_model(model, full_check=True)
     return model
 
@@ -96,8 +96,8 @@ class _Writer(Interpreter):
         kind = n.target if module is None else type(module)
         write = WRITERS.get(kind) or WRITERS.get(getattr(kind, "__name__", ""))
         if write is None:
-            what = getattr(kind, "__name__", kind)
-            raise ArtifactError(f"{n.name}: {what} has no form in ONNX here", remedy="add it to onnx_graph.py")
+            kind_name = getattr(kind, "__name__", kind)
+            raise ArtifactError(f"{n.name}: {kind_name} has no form in ONNX here", remedy="add it to onnx_graph.py")
         return write(self, n, result, module)
 
     def add(self, kind: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
@@ -156,10 +156,13 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     Runtime's kernels are made for 64 channels. In a row, the windows p, p + 4, p + 8, ... follow each other without a
     gap, so the row from pixel 2 p on is a quarter of its windows, and the four quarters are then interleaved.
     """
-    frame, name = n.all_input_nodes[0], n.name
+    frame = n.all_input_nodes[0]
+    name = n.name
     height, width, channels = w.env[frame].shape
     flat = w.add("Reshape", [w.names[frame], w.ints(f"{name}_rows", [height, width * channels])], f"{name}_pixels")
-    fours, phases, out_rows = -(-m.out_width // 4), m.WINDOW // 2, (m.rows - 5) // 2
+    fours = -(-m.out_width // 4)
+    phases = m.WINDOW // 2
+    out_rows = (m.rows - 5) // 2
     stacks = out_rows + STRIDE  # each of 4 rows; a row of the output reads two of them
     surplus = 4 * fours - m.out_width  # windows that are cut off again, if their number is no multiple of four
     right = torch.cat([m.right, m.top[:1, : 6 * surplus].expand(height, -1)], 1)
@@ -174,7 +177,8 @@ def _columns(w: _Writer, n: Node, result: Tensor, m: Columns) -> str:
     rows = w.add("Concat", [before, flat, after], f"{name}_wide", axis=1)
     rows = w.add("Concat", [above, rows, below], f"{name}_high", axis=0)
     shape = w.ints(f"{name}_part", [stacks, fours, 1, 3 * m.WINDOW])
-    axes, steps = w.ints(f"{name}_axes", [0, 1]), w.ints(f"{name}_steps", [STRIDE, 1])
+    axes = w.ints(f"{name}_axes", [0, 1])
+    steps = w.ints(f"{name}_steps", [STRIDE, 1])
     parts = []
     for p, r in itertools.product(range(phases), range(STACK)):
         start = w.ints(f"{name}_from_{p}_{r}", [r, 6 * p])
@@ -210,12 +214,16 @@ def _conv(w: _Writer, n: Node, result: Tensor, m: nn.Conv2d) -> str:
 
 def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
     """Write a convolution between DequantizeLinear and QuantizeLinear. Engines compute it in INT8 with INT32 sums."""
-    source, weight, bias = n.all_input_nodes[0], m.weight(), m.bias()
+    source = n.all_input_nodes[0]
+    weight = m.weight()
+    bias = m.bias()
     assert bias is not None
-    scales, zeros = weight.q_per_channel_scales(), weight.q_per_channel_zero_points()
+    scales = weight.q_per_channel_scales()
+    zeros = weight.q_per_channel_zero_points()
     sums = scales * w.env[source].q_scale()
     whole_bias = torch.quantize_per_channel(bias.detach(), sums, torch.zeros_like(zeros), 0, torch.qint32).int_repr()
-    whole_weight, geometry = weight.int_repr(), _geometry(m)
+    whole_weight = weight.int_repr()
+    geometry = _geometry(m)
     if source.op == "call_module" and isinstance(w.fetch_attr(str(source.target)), Columns):
         whole_weight = stack_stem(whole_weight)
         geometry = {"kernel_shape": [2, 1], "strides": [1, 1], "pads": [0] * 4, "dilations": [STACK // STRIDE, 1]}
@@ -227,11 +235,11 @@ def _int8_conv(w: _Writer, n: Node, result: Tensor, m: int8.Conv2d) -> str:
         ("bias", whole_bias, sums, np.int32),
     ):
         # The backbone runs once for each camera: one weight, and a bias for each, whose scale is that of its pixels.
-        made = f"{n.target}.{part}{again}"
-        name = f"{n.target}.{part}" if part == "weight" else made
+        node_name = f"{n.target}.{part}{again}"
+        name = f"{n.target}.{part}" if part == "weight" else node_name
         scale = w.constant(f"{name}_scale", steps.float())
         zero = w.constant(f"{name}_zero_point", np.zeros(len(steps), zero_type))
-        inputs.append(w.add("DequantizeLinear", [w.constant(name, values), scale, zero], f"{made}_floats", axis=0))
+        inputs.append(w.add("DequantizeLinear", [w.constant(name, values), scale, zero], f"{node_name}_floats", axis=0))
     sums_name = w.add("Conv", inputs, f"{n.name}_sums", **geometry)
     return _rounded(w, n, result, sums_name, relu=isinstance(m, fused_int8.ConvReLU2d))
 
@@ -272,7 +280,8 @@ def _same(w: _Writer, n: Node, result: Any, m: Any) -> str:
 
 
 def _getitem(w: _Writer, n: Node, result: Any, m: None) -> Any:
-    source, index = n.args[0], _as_list(n.args[1])
+    source = n.args[0]
+    index = _as_list(n.args[1])
     if isinstance(names := w.names[source], list):
         return names[index[0]]
     if any(p is not None and p != slice(None) for p in index):

@@ -39,22 +39,22 @@ def without_channels(
     weights: by LeRobot's names without `model.`, of a backbone of basic blocks. share: above 0, at most 1. pictures:
     (B, height, width, 3) uint8 RGB each, of the policy's size. rng: chooses where in the pictures. Returns float32.
     """
-    made = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
+    narrowed = {name: weight.detach().float().cpu().clone() for name, weight in weights.items()}
     names = backbone_blocks(config.backbone)
-    widths = {name: len(made[f"{name}.bn1.weight"]) for name in names}
+    widths = {name: len(narrowed[f"{name}.bn1.weight"]) for name in names}
     names = [name for name in names if kept_of(widths[name], share) < widths[name]]
-    policy = BatchedPolicy(config, made)
+    policy = BatchedPolicy(config, narrowed)
     readers = {name: policy.backbone.get_submodule(f"{name.removeprefix('backbone.')}.conv2") for name in names}
 
     def some_patches(x: Tensor) -> Iterator[Tensor]:
         for patches in F.unfold(x, 3, padding=1).transpose(1, 2):  # (B, places, channels * TAPS)
             yield patches[rng.permutation(len(patches))[:PATCHES]]
 
-    grams = grams_of(readers, some_patches, lambda: [policy.features(shown).shape for shown in pictures])
+    grams = grams_of(readers, some_patches, lambda: [policy.features(images).shape for images in pictures])
     for name, gram in grams.items():
-        kept = _choose(gram, made[f"{name}.conv2.weight"], kept_of(widths[name], share))
-        _leave_out(made, name, kept, gram)
-    return made
+        indices = _choose(gram, narrowed[f"{name}.conv2.weight"], kept_of(widths[name], share))
+        _leave_out(narrowed, name, indices, gram)
+    return narrowed
 
 
 def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:
@@ -66,14 +66,14 @@ def _choose(gram: Tensor, reader: Tensor, count: int) -> Tensor:
     centres = torch.cat([torch.arange(channels) * TAPS + CENTRE, torch.tensor([len(gram) - 1])])
     rest = gram[centres][:, centres]
     read = reader.double().square().sum((0, 2, 3))
-    chosen: list[int] = []
+    picked: list[int] = []
     for _ in range(count + 1):
-        last = chosen[-1] if chosen else channels  # first the 1: a channel that never changes is in the bias
+        last = picked[-1] if picked else channels  # first the 1: a channel that never changes is in the bias
         rest -= torch.outer(rest[:, last], rest[last]) / rest[last, last].clamp(min=1e-12)
         unexplained = rest.diagonal()[:-1] * read
-        unexplained[chosen] = -torch.inf
-        chosen.append(int(unexplained.argmax()))
-    return torch.tensor(chosen[:count]).sort().values
+        unexplained[picked] = -torch.inf
+        picked.append(int(unexplained.argmax()))
+    return torch.tensor(picked[:count]).sort().values
 
 
 def _leave_out(weights: dict[str, Tensor], name: str, kept: Tensor, gram: Tensor) -> None:

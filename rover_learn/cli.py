@@ -14,7 +14,7 @@ from rover_lib.onboard.kinds import Number, Output, Preset
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
-    from rover_lib.workshop.recordings.samples import Source
+    from rover_lib.workshop.recordings.source import Source
 
 
 def _by_recipe(value_of: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -89,14 +89,14 @@ def distill(checkpoint: Path, episodes: "Source", size: tuple[int, int] | None, 
     Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and distill.json in the run's folder. Run it
     again to resume.
     """
+    from rover_learn import distill
     from rover_learn.distill import DistillRecipe, summary
-    from rover_learn.distill import distill as teach
     from rover_learn.student import StudentShape
 
     parts = {name: options.pop(name) for name in ("decoder_layers", "feedforward", "backbone_channels")}
     recipe = DistillRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
     options |= {"shape": StudentShape(*(size or (None, None)), **parts), "recipe": recipe}
-    folder = teach(checkpoint, episodes, progress=terminal_bar(), **options)
+    folder = distill.distill(checkpoint, episodes, progress=terminal_bar(), **options)
     show_stage(folder, "distill", summary)
 
 
@@ -113,13 +113,13 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, throttle:
     imitated. Leaves best_model.pth for `rover run`, pretrained_model/ for LeRobot and finetune.json in the run's
     folder, and says on which held-out episodes it came closer to the human. Run it again to resume.
     """
+    from rover_learn import finetune
     from rover_learn.finetune import FinetuneRecipe, summary
-    from rover_learn.finetune import finetune as learn_on
-    from rover_lib.workshop.recordings.samples import Source
+    from rover_lib.workshop.recordings.source import Source
 
     recipe = FinetuneRecipe.of(steps=options.pop("steps"), batch=options.pop("batch"))
-    sources = [Source.of(each, facts=facts, throttle=throttle or "") for each in episodes]
-    folder = learn_on(checkpoint, sources, recipe=recipe, progress=terminal_bar(), **options)
+    sources = [Source.of(path, facts=facts, throttle=throttle or "") for path in episodes]
+    folder = finetune.finetune(checkpoint, sources, recipe=recipe, progress=terminal_bar(), **options)
     show_stage(folder, "finetune", summary)
 
 
@@ -153,14 +153,14 @@ def train(episodes: "Source", output: Path, backbone: str, **options: Any) -> No
     part is left for `rover run`. Beside OUTPUT are its curves, and pretrained_model/ for LeRobot. Run it again to
     resume; for that it keeps up to 5 GB in the cache, $ROVER_CACHE or ~/.cache/rover.
     """
+    from rover_learn import train
     from rover_learn.curves import read_actions
     from rover_learn.judges import not_learned
     from rover_learn.train import curves_of
-    from rover_learn.train import train as train_policy
     from rover_lib.workshop.installed import typed
 
     options |= {"backbone": None if backbone == "none" else backbone}
-    click.echo(f"trained: {train_policy(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
+    click.echo(f"trained: {train.train(episodes, output, progress=terminal_bar(), say=click.echo, **options)}")
     actions = read_actions(curves_of(output))
     if lacking := not_learned(actions):
         return click.echo("\n".join(lacking))

@@ -30,11 +30,11 @@ def leave_curves(
         ax.plot(values)
         ax.set(title=phase, xlabel="step", yscale="log")
     rows[0][0].set_ylabel("loss")
-    for ax, (phase, judged) in zip(rows[1], errors.items(), strict=False):
-        steps = [row[0] for row in judged]
-        for i, (name, found) in enumerate(actions.items(), 1):
-            (line,) = ax.plot(steps, [row[i] for row in judged], "o-", label=name)
-            ax.axhline(found["blind_pct"], color=line.get_color(), linestyle=":", label=f"{name}, without eyes")
+    for ax, (phase, rows_of_phase) in zip(rows[1], errors.items(), strict=False):
+        steps = [row[0] for row in rows_of_phase]
+        for i, (name, entry) in enumerate(actions.items(), 1):
+            (line,) = ax.plot(steps, [row[i] for row in rows_of_phase], "o-", label=name)
+            ax.axhline(entry["blind_pct"], color=line.get_color(), linestyle=":", label=f"{name}, without eyes")
         ax.set(title=phase, xlabel="step, or round")
         ax.legend()
     rows[1][0].set_ylabel("held-out error, % of the range")
@@ -47,8 +47,8 @@ def leave_curves(
         for phase, values in losses.items():
             for step, value in enumerate(values):
                 writer.add_scalar(f"loss/{phase}", value, step)
-        for phase, judged in errors.items():
-            for at, *by_action in judged:
+        for phase, rows_of_phase in errors.items():
+            for at, *by_action in rows_of_phase:
                 for name, error in zip(actions, by_action, strict=True):
                     writer.add_scalar(f"held-out error, %/{phase}/{name}", error, int(at))
 

@@ -28,7 +28,8 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import Source, pick_evenly
+from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import Opened, load
 
 SLOWER = 10  # the last phase's rate is this much smaller
@@ -42,7 +43,8 @@ class DistillRecipe(LessonRecipe):
     absolute errors in units of the recorded range. unit_frames: choose a feed-forward's units.
     """
 
-    SECTION, PHASES = "distill", ("backbone", "transformer", "together")
+    SECTION = "distill"
+    PHASES = ("backbone", "transformer", "together")
 
     backbone_steps: int
     transformer_steps: int
@@ -69,7 +71,8 @@ def distill(
     again with the same arguments, it goes on and gives the same student. The folder appears only when it is complete.
     Raises TrainingError for a student, a device or recordings that cannot be, and for a run that is there.
     """
-    folder, machine = free_folder(runs_dir, name), machine or Machine.of()
+    folder = free_folder(runs_dir, name)
+    machine = machine or Machine.of()
     recipe = recipe or DistillRecipe.of()
     opened = load(checkpoint, episodes, progress)
     teacher = opened.checkpoint
@@ -77,9 +80,9 @@ def distill(
     share = None if shape.backbone_channels == 1 else shape.backbone_channels
     if share is None and config == replace(teacher.config, vae_layers=0):
         raise TrainingError("this student would be its teacher", remedy="give it a smaller picture or fewer layers")
-    given: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "opened": opened}
-    given |= {"share": share, "action_range": opened.recordings.action_range()}
-    return Distillation(origin=teacher, config=config, **given).make(folder)
+    options: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "opened": opened}
+    options |= {"share": share, "action_range": opened.recordings.action_range()}
+    return Distillation(origin=teacher, config=config, **options).make(folder)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,14 +96,17 @@ class Distillation(Work):
 
     def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """plans: (B, C, A), the student's. Mean absolute errors to the teacher's and to what was recorded, weighted."""
-        recipe, driven, units = self.recipe, ~batch[IS_PAD][..., None], self.units
+        recipe = self.recipe
+        present = ~batch[IS_PAD][..., None]
+        units = self.units
         to_teacher = ((plans - batch[PLANNED]).abs() * units).mean()
-        to_recorded = ((plans - batch[ACTION]).abs() * units * driven).sum() / (driven.sum() * len(units))
+        to_recorded = ((plans - batch[ACTION]).abs() * units * present).sum() / (present.sum() * len(units))
         return recipe.to_teacher * to_teacher + recipe.to_recorded * to_recorded
 
     def learn(self) -> Learned:
         """Train all phases. What depends on teacher, picture and samples alone stays cached for the next student."""
-        samples, recipe = pick_evenly(self.opened.parts.calibration, self.recipe.samples), self.recipe
+        samples = pick_evenly(self.opened.parts.calibration, self.recipe.samples)
+        recipe = self.recipe
         first_phase = [recipe.batch, recipe.backbone_steps, recipe.rate]
         sees = self.sees(samples) | {"size": self.config.image_sizes, "recipe": first_phase}
         folder = cache_for("lessons", sees)
@@ -130,11 +136,12 @@ class Distillation(Work):
         policy.thaw()
 
         def off(batch: Batch) -> Tensor:
-            shown = batch["maps"].float()
-            return (policy.features(lit(batch)) - shown).square().mean() / shown.square().mean()
+            maps = batch["maps"].float()
+            return (policy.features(lit(batch)) - maps).square().mean() / maps.square().mean()
 
         if self.config.image_sizes != self.origin.config.image_sizes:
-            pool, rate = Pool([(lessons, False)]), self.recipe.rate
+            pool = Pool([(lessons, False)])
+            rate = self.recipe.rate
             self.train(saved, "backbone", policy.backbone, rate, pool, off, "frames", "maps")
         if self.share is None:
             lessons.see(saved, policy, self.rng("tokens"))
@@ -149,25 +156,28 @@ class Distillation(Work):
         weights = initial_weights(seeing, self.config, inputs)
         if self.share is not None:
             blocks = self.progress(lessons.blocks, desc="channels", total=len(lessons.blocks))
-            shown = (torch.from_numpy(lessons.pictures(rows, rows % len(VIEWS))) for rows in blocks)
-            weights = without_channels(weights, self.config, self.share, shown, self.rng("channels"))
+            images = (torch.from_numpy(lessons.pictures(rows, rows % len(VIEWS))) for rows in blocks)
+            weights = without_channels(weights, self.config, self.share, images, self.rng("channels"))
         return weights
 
     def leave(self, new: Path, name: str, learned: Learned) -> None:
         """Judge the student, and write its files and distill.json."""
-        teacher, parts, recordings = self.origin, self.opened.parts, self.opened.recordings
-        held_out, choosing = (pick_evenly(each, self.recipe.judged_frames) for each in (parts.held_out, parts.choosing))
+        teacher = self.origin
+        parts = self.opened.parts
+        recordings = self.opened.recordings
+        held_out, choosing = (pick_evenly(part, self.recipe.judged_frames) for part in (parts.held_out, parts.choosing))
         of_teacher = "teacher", teacher.config, teacher.weights, None
-        every, students = [], []
+        teacher_plans, students = [], []
         for named, config, weights, share in (of_teacher, (name, self.config, learned.weights, self.share)):
             policy = self.machine.taking(BatchedPolicy(config, weights))
             row = {"name": named, **dict(zip(("height", "width"), config.image_sizes[0], strict=True))}
             row |= {"decoder_layers": config.decoder_layers, "feedforward": config.feedforward}
             row |= {"backbone_channels": share, "gmac": gmac(config, weights)}
-            every.append(plans_of(policy, held_out, self.progress))
-            students.append(row | errors_of(every[-1], every[0], held_out, self.action_range))
-        chosen, driven = plans_of(policy, choosing, self.progress), ~np.stack([s.is_pad for s in choosing])
-        loss = float(np.abs(chosen - np.stack([s.chunk for s in choosing]))[driven].mean())
+            teacher_plans.append(plans_of(policy, held_out, self.progress))
+            students.append(row | errors_of(teacher_plans[-1], teacher_plans[0], held_out, self.action_range))
+        choosing_plans = plans_of(policy, choosing, self.progress)
+        present = ~np.stack([s.is_pad for s in choosing])
+        loss = float(np.abs(choosing_plans - np.stack([s.chunk for s in choosing]))[present].mean())
         hashes = self.write_policy(new, name, learned, loss, recordings.root.name)
         metrics: dict[str, Any] = {"students": students, "losses": learned.losses, "files_sha256": hashes}
         metrics |= {"judged_frames": len(held_out), "held_out_episodes": parts.episodes["held_out"]}
@@ -181,8 +191,8 @@ def errors_of(
 ) -> dict[str, float | None]:
     """teacher_<action>_pct over whole plans and recorded_<action>_pct over the recorded steps. plans: (n, C, A)."""
     to_teacher = np.abs(plans.astype(np.float64) - taught).mean((0, 1))
-    driven = ~np.stack([s.is_pad for s in samples])
-    to_recorded = np.abs(plans.astype(np.float64) - np.stack([s.chunk for s in samples]))[driven].mean(0)
+    present = ~np.stack([s.is_pad for s in samples])
+    to_recorded = np.abs(plans.astype(np.float64) - np.stack([s.chunk for s in samples]))[present].mean(0)
     errors = {}
     for i, (action, recorded) in enumerate(action_range.items()):
         errors[f"teacher_{action}_pct"] = pct_of_range(to_teacher[i], recorded)

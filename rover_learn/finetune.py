@@ -39,9 +39,17 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of, pick_evenly
+from rover_lib.workshop.recordings.samples import (
+    Episode,
+    Recordings,
+    Sample,
+    block_of,
+    frame_rate_hz,
+    is_another_rate,
+    pick_evenly,
+)
+from rover_lib.workshop.recordings.source import Source
 
 SLOWER = 50  # the second phase's rate is this much smaller, so that the backbone does not unlearn to see
 DEMONSTRATIONS, ADDITIONS, CORRECTIONS = TAUGHT = ("demonstrations", "new_demonstrations", "corrections")
@@ -56,7 +64,8 @@ OLD, NEW = KINDS = ("old", "new")
 class FinetuneRecipe(LessonRecipe):
     """How a policy goes on learning: the section `finetune` of params.yml, which explains each number."""
 
-    SECTION, PHASES = "finetune", ("transformer", "together")
+    SECTION = "finetune"
+    PHASES = ("transformer", "together")
 
     transformer_steps: int
     together_steps: int
@@ -83,14 +92,15 @@ def finetune(
     params.yml. machine: None takes the best that there is. It resumes as `distill` does.
     Raises TrainingError for a name, a device or recordings that cannot be used; CheckpointError, EpisodeError.
     """
-    folder, machine = free_folder(runs_dir, name), machine or Machine.of()
+    folder = free_folder(runs_dir, name)
+    machine = machine or Machine.of()
     recipe = recipe or FinetuneRecipe.of()
-    parent, read = _open(checkpoint, [Source.of(each) for each in episodes], progress)
+    parent, read = _open(checkpoint, [Source.of(path) for path in episodes], progress)
     material = _part_episodes(read, recipe)
     ranges = [r.action_range() for r in read]
     both = {name: (min(r[name][0] for r in ranges), max(r[name][1] for r in ranges)) for name in ranges[0]}
-    given: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "action_range": both}
-    return Finetuning(origin=parent, config=parent.config, material=material, **given).make(folder)
+    options: dict[str, Any] = {"recipe": recipe, "machine": machine, "progress": progress, "action_range": both}
+    return Finetuning(origin=parent, config=parent.config, material=material, **options).make(folder)
 
 
 # --- what is learned from ---------------------------------------------------------------------------------------------
@@ -103,14 +113,14 @@ def human_samples(episode: Episode) -> tuple[Sample, ...]:
     """
     if all(s.driver == HUMAN for s in episode.samples):
         return episode.samples
-    driven: list[Sample] = []
+    samples: list[Sample] = []
     lasts, following = 0, None  # for how many frames from each one on a human drives
     for s in reversed(episode.samples):
         if s.driver == HUMAN:
             lasts = lasts + 1 if following == s.row + 1 else 1
             following = s.row
-            driven.append(replace(s, is_pad=s.is_pad | (np.arange(len(s.is_pad)) >= lasts)))
-    return tuple(reversed(driven))
+            samples.append(replace(s, is_pad=s.is_pad | (np.arange(len(s.is_pad)) >= lasts)))
+    return tuple(reversed(samples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +160,8 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
     """Split the old and the new episodes into those to learn from and those that judge."""
     old = [e for e in read[0].episodes if not e.by_policy]
     new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
-    driven = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
-    if not driven:
+    corrected = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
+    if not corrected:
         remedy = "give the new recordings after the old ones, with drives in which a human took over"
         raise TrainingError("no human drove in a new episode", found=f"{len(new)} new episodes", remedy=remedy)
     taught: list[tuple[str, tuple[Sample, ...]]] = []
@@ -163,43 +173,48 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
         judging = (*parts.choosing, *parts.held_out)
         for name in dict.fromkeys(map(block_of, judging)):
             held_out.append((name, OLD, _driven_by_humans([s for s in judging if block_of(s) == name], old)))
-    count = max(round(len(driven) * recipe.held_out_share), 1) if recipe.held_out_share and len(driven) > 1 else 0
-    judges = set(np.random.default_rng(recipe.seed).permutation(len(driven))[:count].tolist())
-    held_out += [(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (driven[i] for i in judges)]
+    count = max(round(len(corrected) * recipe.held_out_share), 1) if recipe.held_out_share and len(corrected) > 1 else 0
+    judges = set(np.random.default_rng(recipe.seed).permutation(len(corrected))[:count].tolist())
+    held_out += [(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (corrected[i] for i in judges)]
     for recordings in read:
-        own = [e for i, (r, e) in enumerate(driven) if r is recordings and i not in judges]
+        own = [e for i, (r, e) in enumerate(corrected) if r is recordings and i not in judges]
         for kind, by_policy in ((ADDITIONS, False), (CORRECTIONS, True)):
             taught.append((kind, tuple(s for e in own if e.by_policy == by_policy for s in human_samples(e))))
     return _Material(
         read,
         tuple((kind, pick_evenly(samples, recipe.samples)) for kind, samples in taught if samples),
-        tuple(each for each in held_out if each[2]),
+        tuple(entry for entry in held_out if entry[2]),
         sum(s.driver != HUMAN for e in (*old, *(e for _, e in new)) for s in e.samples),
     )
 
 
 def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) -> tuple[Sample, ...]:
     """Return those of the samples that a human drove, with chunks as `human_samples` pads them."""
-    wanted = {(s.episode, s.row) for s in samples}
-    return tuple(s for e in episodes for s in human_samples(e) if (s.episode, s.row) in wanted)
+    keys = {(s.episode, s.row) for s in samples}
+    return tuple(s for e in episodes for s in human_samples(e) if (s.episode, s.row) in keys)
 
 
 def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
     """Raise TrainingError for recordings of another car, camera or rate than the first's, or the policy's plans."""
     shapes = [r.episodes[0].samples[0].frame_bgr().shape[1::-1] for r in read]  # all pictures of a set have one
     for recordings, (width, height) in zip(read, shapes, strict=True):
-        what = ""
+        problem = ""
         if is_squeezed((width, height), shapes[0]):
-            what, found = "another camera", f"{width}x{height} beside {shapes[0][0]}x{shapes[0][1]}"
+            problem = "another camera"
+            actual = f"{width}x{height} beside {shapes[0][0]}x{shapes[0][1]}"
         for episode in recordings.episodes:
-            rate_hz = recorded.frame_rate_hz(episode.samples)
+            rate_hz = frame_rate_hz(episode.samples)
             if unlike := episode.samples[0].car.unlike(read[0].episodes[0].samples[0].car):
-                what, found = "another car", f"{episode.id}: {unlike}"
-            elif recorded.is_another_rate(rate_hz, plans_hz):
-                what, found = "another rate", f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan"
-        if what:
+                problem = "another car"
+                actual = f"{episode.id}: {unlike}"
+            elif is_another_rate(rate_hz, plans_hz):
+                problem, actual = (
+                    "another rate",
+                    f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan",
+                )
+        if problem:
             remedy = f"give recordings of one car, one camera and {plans_hz:g} Hz; in the dark, a camera is slower"
-            raise TrainingError(f"{recordings.root}: was recorded with {what}", found=found, remedy=remedy)
+            raise TrainingError(f"{recordings.root}: was recorded with {problem}", found=actual, remedy=remedy)
 
 
 # --- learning ---------------------------------------------------------------------------------------------------------
@@ -216,42 +231,51 @@ class Finetuning(Work):
     def learn(self) -> Learned:
         """Train both phases. What the policy sees in each of the recordings stays cached for its next training."""
         recipe, parent = self.recipe, self.origin
-        every = []
+        all_lessons = []
         for kind, samples in self.material.taught:
             folder = cache_for("lessons", self.sees(samples) | {"kind": kind})
             with Resumable(folder, self.machine, self.progress) as saved:
                 lessons = Lessons.open(folder, samples, parent.config, parent, self.rng(f"states, {kind}"))
                 lessons.ask(saved, parent, self.rng(kind))
-            every.append((kind, lessons))
-        whole = {"lessons": [[kind, each.frames.path.parent.name] for kind, each in every], "recipe": asdict(recipe)}
-        weights = np.concatenate([_weights(recipe, kind, each, 1 / self.ranges) for kind, each in every])
-        pool = Pool([(each, kind != DEMONSTRATIONS) for kind, each in every], weights)
+            all_lessons.append((kind, lessons))
+        whole = {
+            "lessons": [[kind, lessons_of.frames.path.parent.name] for kind, lessons_of in all_lessons],
+            "recipe": asdict(recipe),
+        }
+        weights = np.concatenate(
+            [_weights(recipe, kind, lessons_of, 1 / self.ranges) for kind, lessons_of in all_lessons]
+        )
+        pool = Pool([(lessons_of, kind != DEMONSTRATIONS) for kind, lessons_of in all_lessons], weights)
         with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
             policy = self.machine.taking(BatchedPolicy(parent.config, parent.weights))
             policy.thaw()
             self.train_policy(saved, policy, pool, self.loss, seen="maps", slower=SLOWER)
-        made = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
-        return Learned(made, dict(saved.losses), saved.folder)
+        trained = {name: weight.float() for name, weight in parent.weights.items()} | policy.weights()
+        return Learned(trained, dict(saved.losses), saved.folder)
 
     def loss(self, plans: Tensor, batch: Batch) -> Tensor:
         """The mean absolute error, in units of the recorded range. plans: (B, C, A)."""
-        units, share, driven = self.units, self.recipe.to_parent * batch[IS_OLD], ~batch[IS_PAD][..., None]
+        units = self.units
+        share = self.recipe.to_parent * batch[IS_OLD]
+        present = ~batch[IS_PAD][..., None]
         to_parent = ((plans - batch[PLANNED]).abs() * units * share).sum()
-        to_recorded = ((plans - batch[ACTION]).abs() * units * driven * (1 - share)).sum()
-        counted = (share + driven * (1 - share)).expand(*plans.shape[:2], 1).sum()
-        return (to_parent + to_recorded) / (counted * len(units))
+        to_recorded = ((plans - batch[ACTION]).abs() * units * present * (1 - share)).sum()
+        weights_sum = (share + present * (1 - share)).expand(*plans.shape[:2], 1).sum()
+        return (to_parent + to_recorded) / (weights_sum * len(units))
 
     def judge(self, weights: dict[str, Tensor]) -> list[dict[str, Any]]:
         """Judge each held-out episode with the policy as it was before and after: finetune.json's rows."""
-        held_out, rows = self.material.held_out, []
+        held_out = self.material.held_out
+        rows = []
         policies = {"before": self.origin.weights, "after": weights}
-        asked = {when: self.machine.taking(BatchedPolicy(self.config, each)) for when, each in policies.items()}
-        for name, kind, every in self.progress(held_out, desc="judging", total=len(held_out)):
-            samples = pick_evenly(every, self.recipe.judged_frames)
-            driven, actions = ~np.stack([s.is_pad for s in samples]), np.stack([s.chunk for s in samples])
+        candidates = {when: self.machine.taking(BatchedPolicy(self.config, state)) for when, state in policies.items()}
+        for name, kind, samples_of in self.progress(held_out, desc="judging", total=len(held_out)):
+            samples = pick_evenly(samples_of, self.recipe.judged_frames)
+            present = ~np.stack([s.is_pad for s in samples])
+            actions = np.stack([s.chunk for s in samples])
             row: dict[str, Any] = {"episode": name, "kind": kind, "frames": len(samples)}
-            for when, policy in asked.items():
-                off = np.abs(plans_of(policy, samples).astype(np.float64) - actions)[driven].mean(0)
+            for when, policy in candidates.items():
+                off = np.abs(plans_of(policy, samples).astype(np.float64) - actions)[present].mean(0)
                 for error, (action, ends) in zip(off, self.action_range.items(), strict=True):
                     row[f"{when}_{action}_pct"] = pct_of_range(error, ends)
             rows.append(row)
@@ -259,7 +283,8 @@ class Finetuning(Work):
 
     def leave(self, new: Path, name: str, learned: Learned) -> None:
         """Judge the policy, and write its files and finetune.json."""
-        material, rows = self.material, self.judge(learned.weights)
+        material = self.material
+        rows = self.judge(learned.weights)
         old = [(key, row[key]) for row in rows if row["kind"] == OLD for key in row]
         errors = [error for key, error in old if key.startswith("after_") and error is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
@@ -279,9 +304,10 @@ def _weights(recipe: FinetuneRecipe, kind: str, lessons: Lessons, units: np.ndar
     """Return how often each sample is drawn, relative to a demonstration's 1, (n,)."""
     if kind == DEMONSTRATIONS:
         return np.ones(len(lessons))
-    planned, driven = lessons.plans[2 * np.arange(len(lessons))], ~lessons.data.is_pad
+    planned = lessons.plans[2 * np.arange(len(lessons))]
+    present = ~lessons.data.is_pad
     off = (np.abs(planned - lessons.data.chunks) * units).mean(2)
-    off = ((off * driven).sum(1) / driven.sum(1)) ** recipe.focus
+    off = ((off * present).sum(1) / present.sum(1)) ** recipe.focus
     return (recipe.correction_weight if kind == CORRECTIONS else 1.0) * off / max(off.mean(), 1e-9) + 1e-6
 
 
@@ -302,14 +328,14 @@ def change_points(row: Mapping[str, Any]) -> float:
 
 def chance_of(changes: Sequence[float]) -> float:
     """The two-sided p-value: how often changes with random signs have a mean at least as far from 0."""
-    found = np.asarray(changes, float)
-    if len(found) <= EXACT:
-        signs = np.array(list(product((-1.0, 1.0), repeat=len(found))))
+    differences = np.asarray(changes, float)
+    if len(differences) <= EXACT:
+        signs = np.array(list(product((-1.0, 1.0), repeat=len(differences))))
     else:
-        drawn = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWN, len(found)))
-        signs = np.vstack([np.ones(len(found)), drawn])
-    least = abs(found.sum()) * (1 - 1e-9)  # the last bit of a sum depends on the order of adding
-    return float((np.abs(signs @ found) >= least).mean())
+        drawn = np.random.default_rng(0).choice([-1.0, 1.0], (DRAWN, len(differences)))
+        signs = np.vstack([np.ones(len(differences)), drawn])
+    threshold = abs(differences.sum()) * (1 - 1e-9)  # the last bit of a sum depends on the order of adding
+    return float((np.abs(signs @ differences) >= threshold).mean())
 
 
 def verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -330,17 +356,17 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
-    few = {k: f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES}
-    moved = {k: kinds[k]["change_points"] for k in KINDS if k not in few and kinds[k]["chance"] < CHANCE}
-    if moved.get(OLD, 0) > 0:
-        return False, f"not better: on the old episodes it is {moved[OLD]:.2f} points further from the human"
-    if moved.get(NEW, 0) > 0:
-        return False, f"worse: on the new episodes it is {moved[NEW]:.2f} points further from the human"
-    if few:
-        return None, f"undecided: {' and '.join(few.values())} held-out episodes, of at least {LEAST_EPISODES} each"
-    if NEW not in moved:
+    scarce = {k: f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES}
+    improved = {k: kinds[k]["change_points"] for k in KINDS if k not in scarce and kinds[k]["chance"] < CHANCE}
+    if improved.get(OLD, 0) > 0:
+        return False, f"not better: on the old episodes it is {improved[OLD]:.2f} points further from the human"
+    if improved.get(NEW, 0) > 0:
+        return False, f"worse: on the new episodes it is {improved[NEW]:.2f} points further from the human"
+    if scarce:
+        return None, f"undecided: {' and '.join(scarce.values())} held-out episodes, of at least {LEAST_EPISODES} each"
+    if NEW not in improved:
         return None, "undecided: on the new episodes the difference may be chance"
-    why = f"better: on the new episodes it is {-moved[NEW]:.2f} points nearer to the human, and no worse on the old"
+    why = f"better: on the new episodes it is {-improved[NEW]:.2f} points nearer to the human, and no worse on the old"
     return True, why
 
 

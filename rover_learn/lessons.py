@@ -132,17 +132,17 @@ class Lessons:
         """Open the lessons in a folder of these arguments. config: the student's. rng: draws the states."""
         (size,) = config.image_sizes
         data = Frames.of(samples, size)
-        seen = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
+        shape = teacher.weights["encoder_img_feat_input_proj.weight"].shape[1], *config.grid(*size)
         rows = np.arange(len(data))
-        asked = np.stack([training.swap_states(data, rows, rng) for _ in VIEWS], 1)
-        asked[:, MIRRORED] *= MIRROR
+        states = np.stack([training.swap_states(data, rows, rng) for _ in VIEWS], 1)
+        states[:, MIRRORED] *= MIRROR
         return cls(
             data,
-            asked.reshape(-1, 2),
+            states.reshape(-1, 2),
             RowFile(folder / "frames", (*size, 3), np.uint8),
-            RowFile(folder / "maps", seen, np.float16),
+            RowFile(folder / "maps", shape, np.float16),
             RowFile(folder / "plans", data.chunks.shape[1:]),
-            RowFile(folder / "tokens", seen, np.float16),
+            RowFile(folder / "tokens", shape, np.float16),
         )
 
     def __len__(self) -> int:
@@ -170,7 +170,8 @@ class Lessons:
         With the state of new recordings goes a random share of the steering, because if nothing to steer to is in
         sight, only the state says on which side it was.
         """
-        both, mirror = 2 * rows + views, np.where((views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
+        both = 2 * rows + views
+        mirror = np.where((views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
         states = self.asked[both]
         if new:
             states = self.data.states[rows] * mirror
@@ -184,7 +185,9 @@ class Lessons:
     @torch.inference_mode()
     def ask(self, saved: Resumable, teacher: Checkpoint, rng: np.random.Generator) -> None:
         """Let the teacher see and plan on every sample that is missing. Raises EpisodeError if a picture is lost."""
-        policy, blocks, grid = None, self.blocks, (self.maps.shape[1], self.maps.shape[2])
+        policy = None
+        blocks = self.blocks
+        grid = (self.maps.shape[1], self.maps.shape[2])
         parts: dict[str, Any] = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
         (size,), device = teacher.config.image_sizes, saved.machine.device
 
@@ -196,10 +199,10 @@ class Lessons:
             policy = policy or saved.machine.taking(BatchedPolicy(teacher.config, teacher.weights))
             rows = blocks[block]
             self.frames.append(own)
-            seen = policy.features(_in_both_views(teachers, device))
+            features = policy.features(_in_both_views(teachers, device))
             states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
-            self.maps.append(F.adaptive_avg_pool2d(seen, grid).half().cpu())
-            self.plans.append(policy.plan(seen, states).cpu())
+            self.maps.append(F.adaptive_avg_pool2d(features, grid).half().cpu())
+            self.plans.append(policy.plan(features, states).cpu())
 
     @torch.inference_mode()
     def see(self, saved: Resumable, student: BatchedPolicy, rng: np.random.Generator) -> None:
@@ -224,7 +227,7 @@ class Pool:
 
     def __init__(self, lessons: Sequence[tuple[Lessons, bool]], weights: np.ndarray | None = None):
         self.lessons = lessons
-        counts = [len(each) for each, _ in lessons]
+        counts = [len(lessons_of) for lessons_of, _ in lessons]
         self._places = np.repeat(np.arange(len(lessons)), counts)
         self._rows = np.concatenate([np.arange(count) for count in counts])
         self._shares = None if weights is None else weights / weights.sum()
@@ -236,18 +239,18 @@ class Pool:
         IS_PAD: (B, C). OLD: (B, 1, 1), 0 for new recordings, else 1. shown: `frames` become IMAGE and GAIN, its light
         and tint, for `lit`; `maps` and `tokens` stay what they are.
         """
-        most = len(self._rows)
-        chosen = rng.choice(most, min(count, most), replace=False, p=self._shares)
-        views = rng.integers(len(VIEWS), size=len(chosen))
+        count_all = len(self._rows)
+        drawn = rng.choice(count_all, min(count, count_all), replace=False, p=self._shares)
+        views = rng.integers(len(VIEWS), size=len(drawn))
         arrays = {}
         if "frames" in shown:
-            gain = rng.uniform(*LIGHT, (len(chosen), 1, 1, 1)) * rng.uniform(*COLOUR, (len(chosen), 1, 1, 3))
+            gain = rng.uniform(*LIGHT, (len(drawn), 1, 1, 1)) * rng.uniform(*COLOUR, (len(drawn), 1, 1, 3))
             arrays[GAIN] = gain.astype(np.float32)
         parts = []
         for place, (lessons, new) in enumerate(self.lessons):
-            own = self._places[chosen] == place
+            own = self._places[drawn] == place
             if own.any():
-                parts.append(lessons.show(self._rows[chosen][own], views[own], new, rng, *shown))
+                parts.append(lessons.show(self._rows[drawn][own], views[own], new, rng, *shown))
         return training.on_device(
             arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device
         )

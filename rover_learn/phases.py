@@ -36,7 +36,8 @@ from rover_lib.workshop.run.session import SMALL_GMAC
 
 MOST = {"to_parent": 1.0, "held_out_share": 0.999, "mirrored": 0.5, "blur": 1.0, "shift": 0.2}
 MAY_BE_ZERO = ("seed", "transformer_warmup")
-LEAST_RATE, LARGE = 1e-9, 10**9
+LEAST_RATE = 1e-9
+LARGE = 10**9
 VERSIONS = ("torch", "lerobot", "torchvision", "numpy")
 
 
@@ -62,14 +63,14 @@ class Recipe:
     @classmethod
     def read(cls, where: str, values: Mapping[str, Any]) -> Self:
         """Make a recipe of values. where: in params.yml. Raises TrainingError for a name or a value that cannot be."""
-        known = {each.name: each for each in fields(cls)}
-        needed = {name for name, each in known.items() if each.default is MISSING}
-        if wrong := sorted(set(values) - set(known) | needed - set(values)):
+        by_name = {entry.name: entry for entry in fields(cls)}
+        needed = {name for name, entry in by_name.items() if entry.default is MISSING}
+        if wrong := sorted(set(values) - set(by_name) | needed - set(values)):
             raise TrainingError(f"params.yml: {where}: missing or unknown", found=wrong[0])
-        rules = {name: _rule(each) for name, each in known.items() if name in values and each.type in (int, float)}
+        rules = {name: _rule(entry) for name, entry in by_name.items() if name in values and entry.type in (int, float)}
         if broken := broken_rule(values, rules):
-            name, words, found = broken
-            raise TrainingError(f"params.yml: {where}: {name} must be {words}", found=found)
+            name, words, actual = broken
+            raise TrainingError(f"params.yml: {where}: {name} must be {words}", found=actual)
         return cls(**values)
 
     def of_steps(self, steps: int) -> Self:
@@ -185,7 +186,9 @@ class Work(ABC):
         *shown: str,
     ) -> None:
         """Train a module for the phase's number of steps in the recipe, or continue where that was interrupted."""
-        rng, steps, count = self.rng(phase), getattr(self.recipe, f"{phase}_steps"), self.recipe.batch
+        rng = self.rng(phase)
+        steps = getattr(self.recipe, f"{phase}_steps")
+        count = self.recipe.batch
         draw = functools.partial(pool.batch, count, rng, self.machine.device, *shown)
         saved.train(Phase(phase, steps, rate), module, rng, lambda _: draw(), loss)
 

@@ -54,9 +54,9 @@ def student_config(teacher: Checkpoint, shape: StudentShape) -> ActConfig:
     ((height, width),) = c.image_sizes
     own = (shape.height, shape.width, shape.decoder_layers, shape.feedforward)
     teachers = (height, width, c.decoder_layers, c.feedforward)
-    for name, value, most in zip(("height", "width", "decoder layers", "feed-forward"), own, teachers, strict=True):
-        if value is not None and not 1 <= value <= most:
-            raise TrainingError(f"a student's {name} must be from 1 to its teacher's, {most}", found=value)
+    for name, value, upper in zip(("height", "width", "decoder layers", "feed-forward"), own, teachers, strict=True):
+        if value is not None and not 1 <= value <= upper:
+            raise TrainingError(f"a student's {name} must be from 1 to its teacher's, {upper}", found=value)
     if (share := shape.backbone_channels) is not None:
         if not 0 < share <= 1:
             raise TrainingError("the share of the backbone's channels must be above 0, at most 1", found=share)
@@ -78,9 +78,9 @@ def refuse_no_car(policy: Checkpoint) -> None:
     """
     c = policy.config
     if len(c.cameras) != 1 or not c.state_names == c.action_names == ACTION_NAMES:
-        found = f"{len(c.cameras)} cameras, states {quote_all(c.state_names)}, actions {quote_all(c.action_names)}"
+        actual = f"{len(c.cameras)} cameras, states {quote_all(c.state_names)}, actions {quote_all(c.action_names)}"
         remedy = "if it is of one camera, steering and throttle, name them so in the dataset's meta/info.json"
-        raise TrainingError(f"{policy.path}: is not a car's policy", found=found, remedy=remedy)
+        raise TrainingError(f"{policy.path}: is not a car's policy", found=actual, remedy=remedy)
 
 
 def gmac(config: ActConfig, weights: dict[str, Tensor] | None = None) -> float:
@@ -94,17 +94,20 @@ def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tup
 
     inputs: calibration frames as the student sees them (`act.inputs_of`); they are only run if units are left out.
     """
-    kept = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
+    weights = {
+        name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)
+    }
     if config.feedforward == teacher.config.feedforward:
-        return kept
-    wide, downs = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights), {}
+        return weights
+    wide = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights)
+    downs = {}
     for name, module in wide.named_modules():
         if isinstance(module, FeedForward):
             part, index, _ = name.split(".")
             downs[f"{part}.layers.{index}"] = module.down
     for name, gram in grams_of(downs, lambda x: x[:1], lambda: [wide(*x)[0] for x in inputs]).items():
-        kept |= _narrow(kept, name, gram, config.feedforward)
-    return kept
+        weights |= _narrow(weights, name, gram, config.feedforward)
+    return weights
 
 
 def _is_kept(name: str, config: ActConfig) -> bool:
@@ -119,7 +122,8 @@ def _narrow(weights: dict[str, Tensor], layer: str, gram: Tensor, units: int) ->
 
     A unit's importance is its mean magnitude, or, where activations may be negative, the root of its mean square.
     """
-    down, bias = weights[f"{layer}.linear2.weight"].double(), weights[f"{layer}.linear2.bias"].double()
+    down = weights[f"{layer}.linear2.weight"].double()
+    bias = weights[f"{layer}.linear2.bias"].double()
     magnitude = gram[-1, :-1].abs() if (gram[-1, :-1] >= 0).all() else gram.diagonal()[:-1].sqrt()
     best = (magnitude * down.norm(dim=0)).topk(units).indices.sort().values
     refit = refit_layer(torch.cat([down, bias[:, None]], 1).T, gram, best)
@@ -153,7 +157,8 @@ class Gram:
         if self._waiting:
             self._multiply()
         assert self._sum is not None
-        mean, self._sum = self._sum.div_(self._count), None
+        mean = self._sum.div_(self._count)
+        self._sum = None
         return mean
 
     def _multiply(self) -> None:

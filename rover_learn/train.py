@@ -34,8 +34,9 @@ from rover_lib.workshop import act as act_module
 from rover_lib.workshop import act_config
 from rover_lib.workshop.act import ActConfig
 from rover_lib.workshop.cache import cache_folder, cache_root, key_of
-from rover_lib.workshop.checkpoint.files import save_torch, trainer_config
+from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
+from rover_lib.workshop.checkpoint.trainer import trainer_config
 from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
@@ -43,7 +44,8 @@ from rover_lib.workshop.recordings import episodes as episodes_module
 from rover_lib.workshop.recordings import samples as recorded
 from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Source
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings
+from rover_lib.workshop.recordings.source import Source
 
 if TYPE_CHECKING:
     pass

@@ -30,7 +30,8 @@ from rover_learn.augment import Augmentation, vary
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
 from rover_lib.onboard.stage import private_lock
-from rover_lib.workshop.checkpoint.files import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY, save_torch
+from rover_lib.workshop.checkpoint.files import save_torch
+from rover_lib.workshop.checkpoint.trainer import BETAS, GRAD_CLIP, KL_WEIGHT, WEIGHT_DECAY
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Sample
 from rover_lib.workshop.run.session import training_device

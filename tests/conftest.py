@@ -108,7 +108,7 @@ def made_once(tmp_path_factory) -> Callable[[str, Callable[[Path], None]], Path]
 
 @pytest.fixture(scope="session")
 def tiny_policy():
-    from policies import TINY, lerobot_policy
+    from tests.helpers.policies import TINY, lerobot_policy
 
     return lerobot_policy(**TINY)
 
@@ -117,7 +117,8 @@ def tiny_policy():
 def tiny_file(made_once, request) -> Path:
     def make(folder: Path) -> None:
         import torch
-        from policies import trainer_content
+
+        from tests.helpers.policies import trainer_content
 
         torch.save(trainer_content(request.getfixturevalue("tiny_policy")), folder / "best_model.pth")
 
@@ -133,9 +134,8 @@ def tiny(tiny_file):
 
 @pytest.fixture(scope="session")
 def calibration(tiny):
-    from policies import memory_samples
-
     from rover_lib.workshop.int8.observe import calibrate
+    from tests.helpers.policies import memory_samples
 
     return calibrate(tiny, memory_samples(12))
 
@@ -146,9 +146,8 @@ def thin(tiny):
 
     Hundreds of tests write, hash and load its artifacts, which have a tenth of the tiny policy's megabytes.
     """
-    from policies import memory_samples, with_few_channels
-
     from rover_lib.workshop.int8.observe import calibrate
+    from tests.helpers.policies import memory_samples, with_few_channels
 
     policy = replace(tiny, weights=with_few_channels(tiny.weights, 16))
     return policy, calibrate(policy, memory_samples(12))
@@ -159,12 +158,11 @@ def artifacts(made_once, request) -> dict[str, Path]:
     """One artifact of the thin policy per mode."""
 
     def make(folder: Path) -> None:
-        from policies import memory_samples
-
         from rover_lib.workshop.act import ACT
         from rover_lib.workshop.int8.export import Exporter
         from rover_lib.workshop.int8.quantize import quantize
         from rover_lib.workshop.int8.scheme import Scheme
+        from tests.helpers.policies import memory_samples
 
         thin, calibration = request.getfixturevalue("thin")
         exporter = Exporter(thin, memory_samples(4, seed=1))

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from executed import shown
 
 from balloon_world import latency, students
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.judge.compare import gates
+from tests.helpers.executed import shown
 
 ROOT = Path(__file__).parents[1]
 

@@ -7,13 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import rover
-from recorded import record_drives
 
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import load_policy
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
+from tests.helpers.command import rover
+from tests.helpers.recorded import record_drives
 
 TINY = ("--policy.chunk_size=32", "--policy.n_action_steps=32", "--policy.dim_model=64", "--policy.n_heads=4",
         "--policy.dim_feedforward=64", "--policy.n_encoder_layers=1", "--policy.n_vae_encoder_layers=1")  # fmt: skip

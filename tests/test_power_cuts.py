@@ -17,9 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from needs import Late, real_time, until
-from recorded import record_drives
-from test_tub import records, tub
 
 from rover_learn import training
 from rover_lib.cli import main
@@ -27,6 +24,9 @@ from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import episode as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, find_killed, finish_killed
+from tests.helpers.needs import Late, real_time, until
+from tests.helpers.recorded import record_drives
+from tests.helpers.tubs import records, tub
 
 HZ, LAST_S, SLOW_DISK_S = 30, 1.0, 0.3
 NAME = "episode_20260101_120000"

@@ -15,10 +15,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import needs
 import pytest
 from click.testing import CliRunner
-from executed import run_cells
 
 from balloon_world.car import CameraFeed
 from lab.arduino.emulator import EmulatedArduino
@@ -29,6 +27,8 @@ from rover_lib.onboard.car import car as car_module
 from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.recording import recorder
 from rover_lib.workshop.run import run as runs
+from tests.helpers import needs
+from tests.helpers.executed import run_cells
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tonight.md").read_text()

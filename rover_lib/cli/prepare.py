@@ -14,7 +14,7 @@ from rover_lib.onboard.kinds import Output, PathTo, Preset, check_kind, kinds_of
 from rover_lib.workshop.progress import terminal_bar
 
 if TYPE_CHECKING:
-    from rover_lib.workshop.recordings.samples import Source
+    from rover_lib.workshop.recordings.source import Source
 
 
 def size_option(_: click.Context, __: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -61,7 +61,7 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     @THROTTLE
     @functools.wraps(command)
     def called(*args: Any, episodes: Path, **options: Any) -> None:
-        from rover_lib.workshop.recordings.samples import Source
+        from rover_lib.workshop.recordings.source import Source
 
         said = {name: options.pop(name) or "" for name in ("action_names", "camera", "facts", "throttle")}
         return command(*args, episodes=Source.of(episodes, **said), **options)

@@ -245,12 +245,12 @@ def doctor(ctx: click.Context, port: str, hz: float, receiver: bool, **asked: An
     you to steer and to switch the transmitter off: do that once.
     """
     from rover_lib.onboard.car.host import default_log
-    from rover_lib.onboard.care import doctor as checking
+    from rover_lib.onboard.care import doctor
 
     if receiver:
-        found = checking.receiver(port, ask)
+        found = doctor.receiver(port, ask)
     else:
-        found = checking.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
+        found = doctor.examine(port=port, rate_hz=hz, log_folder=default_log().parent, **asked)
     failed = []
     for check in found:
         click.echo(str(check))
@@ -354,11 +354,10 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
     If it is refused, it says what the Arduino still wants. Moving a stick takes the car back;
     `sudo systemctl restart rover-drive` disarms it.
     """
-    from rover_lib.onboard.drive.service import Request, ask_service
-    from rover_lib.onboard.drive.service import arm_car as arm
+    from rover_lib.onboard.drive import service
 
     if heartbeat:
-        return click.echo(ask_service(ask="heartbeat")["text"])
+        return click.echo(service.ask_service(ask="heartbeat")["text"])
 
     def confirm(state: dict[str, Any]) -> None:
         if yes:
@@ -366,7 +365,7 @@ def arm_car(yes: bool, model: str, heartbeat: bool, **limits: Any) -> None:
         click.echo(f"model {state['model'][:12]}, {state['text']}")
         click.confirm("The car will drive now. Is the way free, and the transmitter in your hand?", abort=True)
 
-    click.echo(arm(Request(**limits), model=model, confirm=confirm))
+    click.echo(service.arm_car(service.Request(**limits), model=model, confirm=confirm))
 
 
 @main.group(short_help="Manage a rover's models: stage, switch, roll back.")

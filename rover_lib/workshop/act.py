@@ -140,7 +140,8 @@ class Columns(nn.Module):
         x = torch.cat([self.top, x, self.bottom], 0)
         if self.quantized:
             x = torch.bitwise_xor(x, 128).to(torch.int8)  # pixel - 128: the conversion keeps the bits
-        shape, strides = (self.rows, self.out_width, 3 * self.WINDOW), (3 * self.pitch, 6, 1)
+        shape = (self.rows, self.out_width, 3 * self.WINDOW)
+        strides = (3 * self.pitch, 6, 1)
         x = x.as_strided(shape, strides).contiguous()
         if self.quantized:
             x = torch._make_per_tensor_quantized_tensor(x, self.scale, self.zero_pixel - 128)
@@ -209,7 +210,8 @@ class Backbone(nn.Module):
         def stage(i: int) -> nn.Sequential:
             # torchvision's replace_stride_with_dilation: in the last stage all blocks but the first dilate
             dilated = config.dilation and i == 4
-            stride, dilation = 1 if i == 1 or dilated else 2, 2 if dilated else 1
+            stride = 1 if i == 1 or dilated else 2
+            dilation = 2 if dilated else 1
             geometry = [(stride, 1), *[(1, dilation)] * (depths[i - 1] - 1)]
             return nn.Sequential(*(Residual(w.at(f"layer{i}.{j}"), kind, *g) for j, g in enumerate(geometry)))
 
@@ -249,7 +251,8 @@ class Attention(Pointwise):
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, *, cross: bool = False):
         super().__init__(as_conv)
-        self.heads, self.cross = config.heads, cross
+        self.heads = config.heads
+        self.cross = cross
         inputs = zip(w["in_proj_weight"].split(config.dim), w["in_proj_bias"].split(config.dim), strict=True)
         self.q, self.k, self.v = (self.project(weight, bias) for weight, bias in inputs)
         self.o = self.project(w["out_proj.weight"], w["out_proj.bias"])
@@ -341,7 +344,8 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool, q_pos: Tensor, first: bool):
         super().__init__()
-        self.pre_norm, self.first = config.pre_norm, first
+        self.pre_norm = config.pre_norm
+        self.first = first
         self.norm1, self.norm2, self.norm3 = (layer_norm(w.at(f"norm{i}")) for i in (1, 2, 3))
         self.attention = Attention(w.at("self_attn"), config, as_conv)
         self.cross_attention = Attention(w.at("multihead_attn"), config, as_conv, cross=True)
@@ -490,8 +494,8 @@ def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
 
 def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
     """Return a sample as the graph's inputs: state (1, S) float32, then (height, width, 3) uint8 RGB of each camera."""
-    seen: Any = sample.frame_bgr()
-    frames = seen if isinstance(seen, Mapping) else {config.cameras[0]: seen}
+    frame: Any = sample.frame_bgr()
+    frames = frame if isinstance(frame, Mapping) else {config.cameras[0]: frame}
     prepared = (prepare_frame(frames[n], *size) for n, size in zip(config.cameras, config.image_sizes, strict=True))
     state = torch.from_numpy(np.asarray(sample.state, np.float32))[None]
     return state, *map(torch.from_numpy, prepared)

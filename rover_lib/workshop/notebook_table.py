@@ -35,5 +35,5 @@ class Table:
 
 def _line(cells: Sequence[str], tag: str) -> str:
     styles = ["text-align: left", *["text-align: right"] * (len(cells) - 1)]
-    told = (f'<{tag} style="{style}">{escape(cell)}</{tag}>' for cell, style in zip(cells, styles, strict=True))
-    return f"<tr>{''.join(told)}</tr>"
+    cells_html = (f'<{tag} style="{style}">{escape(cell)}</{tag}>' for cell, style in zip(cells, styles, strict=True))
+    return f"<tr>{''.join(cells_html)}</tr>"

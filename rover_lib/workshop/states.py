@@ -26,12 +26,12 @@ def last_actions(actions: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 def explain_state(states: np.ndarray, actions: np.ndarray, names: Sequence[str]) -> str:
     """Say what an episode's states are, if they are not the action before; empty if they are. Both are (n, A)."""
-    found: dict[str, list[str]] = {}
+    names_by_words: dict[str, list[str]] = {}
     if len(states) > LEAST_ROWS and np.isfinite(states).all() and np.isfinite(actions).all():
         for name, state, action in zip(names, states.T.astype(float), actions.T.astype(float), strict=True):
             if words := _explain(state, action):
-                found.setdefault(words, []).append(name)
-    return ", ".join(f"{' and '.join(which)}: {words}" for words, which in found.items())
+                names_by_words.setdefault(words, []).append(name)
+    return ", ".join(f"{' and '.join(names_alike)}: {words}" for words, names_alike in names_by_words.items())
 
 
 def _explain(state: np.ndarray, action: np.ndarray) -> str:

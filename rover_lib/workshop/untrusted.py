@@ -39,8 +39,8 @@ def limited_memory(more_bytes: int = 0) -> Iterator[None]:
         return
     with _LOCK:
         before = resource.getrlimit(resource.RLIMIT_DATA)  # of private memory, without reserved addresses
-        taken = int(STATM.read_text().split()[5]) * resource.getpagesize()
-        ends = [end for end in (taken + MEMORY_BYTES + more_bytes, *before) if end != resource.RLIM_INFINITY]
+        used_bytes = int(STATM.read_text().split()[5]) * resource.getpagesize()
+        ends = [end for end in (used_bytes + MEMORY_BYTES + more_bytes, *before) if end != resource.RLIM_INFINITY]
         resource.setrlimit(resource.RLIMIT_DATA, (min(ends), before[1]))
         try:
             yield
@@ -50,7 +50,8 @@ def limited_memory(more_bytes: int = 0) -> Iterator[None]:
 
 def check_inside(root: Path, path: Path) -> None:
     """Raise EpisodeError for a path that leads out of a dataset's folder; the Hub's cache keeps files beside it."""
-    real, home = path.resolve(), root.resolve()
+    real = path.resolve()
+    home = root.resolve()
     in_hub = home.parent.name == "snapshots" and path.is_file() and real.is_relative_to(home.parents[1] / "blobs")
     if not real.is_relative_to(home) and not in_hub:
         raise EpisodeError(f"{path}: leads out of the dataset", found=quote(str(real)), remedy="copy the files into it")
@@ -62,17 +63,18 @@ def check_encoded(data: bytes, size: tuple[int, int]) -> str:
 
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
-            found, mode = (picture.height, picture.width), picture.mode
+            size_found = (picture.height, picture.width)
+            mode = picture.mode
             if picture.format == "PNG":
                 picture.verify()  # its checksums; no pixel is computed
-        if found == size and picture.format == "JPEG":
+        if size_found == size and picture.format == "JPEG":
             check_jpeg(data)
     except CameraError as e:
         return str(e)
     except (OSError, TypeError, ValueError, SyntaxError, Image.DecompressionBombError):
         return "missing or damaged, or neither PNG nor JPEG"
-    if found != size:
-        return f"of another shape than {size} in meta/info.json, found {found}"
+    if size_found != size:
+        return f"of another shape than {size} in meta/info.json, found {size_found}"
     return "" if mode == "RGB" else f"not in colours (RGB), found {quote(mode)}"
 
 
@@ -86,10 +88,10 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
         raise EpisodeError(f"{path}: cannot be decoded: not an MP4", found=quote(begins), remedy="record it again")
     with av.open(str(path), format="mp4") as container:
         stream = container.streams.video[0]
-        found = stream.codec_context.name, stream.height, stream.width
-    if found[0] not in CODECS or found[1:] != size:
-        what = f"{path}: has another shape or codec than {size} in h264, hevc or av1"
-        raise EpisodeError(what, found=found, remedy="encode it anew")
+        stream_form = stream.codec_context.name, stream.height, stream.width
+    if stream_form[0] not in CODECS or stream_form[1:] != size:
+        problem = f"{path}: has another shape or codec than {size} in h264, hevc or av1"
+        raise EpisodeError(problem, found=stream_form, remedy="encode it anew")
 
 
 def scan_video(path: Path) -> tuple[list[float], set[float]]:
@@ -105,11 +107,11 @@ def scan_video(path: Path) -> tuple[list[float], set[float]]:
         packets: list[Any] = [packet for packet in container.demux(stream) if packet.pts is not None]
         begins = [k for k, packet in enumerate(packets) if packet.is_keyframe or k == 0]
         groups = [packets[a:b] for a, b in pairwise([*begins, len(packets)])]
-        every = max(1, round(len(packets) * stream.height * stream.width / MOST_DECODED))
+        stride = max(1, round(len(packets) * stream.height * stream.width / MOST_DECODED))
         torn: set[int] = set()
         for number, (group, first) in enumerate(zip(groups, begins, strict=True)):
             bad = next((k for k, packet in enumerate(group) if ZEROS in bytes(packet)), len(group))
-            if bad == len(group) and number % every == 0:
+            if bad == len(group) and number % stride == 0:
                 bad = _decoded(stream.codec_context, group)
             if bad < len(group):
                 torn |= {*range(max(0, first + bad - AHEAD), first + len(group))}
@@ -121,12 +123,12 @@ def _decoded(decoder: Any, packets: list[Any]) -> int:
     """Return how many of a group of pictures can be decoded before the first that cannot."""
     import av
 
-    shown = set()
+    times = set()
     decoder.flush_buffers()
     for packet in (*packets, None):  # decoders keep some pictures back until the end
         with suppress(av.FFmpegError):
-            shown |= {frame.pts for frame in decoder.decode(packet) if not frame.is_corrupt}
-    return next((k for k, packet in enumerate(packets) if packet.pts not in shown), len(packets))
+            times |= {frame.pts for frame in decoder.decode(packet) if not frame.is_corrupt}
+    return next((k for k, packet in enumerate(packets) if packet.pts not in times), len(packets))
 
 
 def check_table(path: Path) -> list[str]:
@@ -135,8 +137,8 @@ def check_table(path: Path) -> list[str]:
 
     table = parquet.read_metadata(path)
     if (size := path.stat().st_size) < ROW_BYTES * table.num_rows:
-        what = f"{path}: its footer says {table.num_rows} rows"
-        raise EpisodeError(what, found=f"{size} bytes", remedy="copy the dataset again")
+        problem = f"{path}: its footer says {table.num_rows} rows"
+        raise EpisodeError(problem, found=f"{size} bytes", remedy="copy the dataset again")
     return table.schema.to_arrow_schema().names
 
 

@@ -24,11 +24,12 @@ def match_pictures(path: Path, wanted_s: np.ndarray, rate_hz: float, tolerance_s
 
     Frames after the last picture, of a video that was cut, keep their times. Raises what PyAV raises.
     """
-    found, torn = scan_video(path)
-    there_s = np.array([*found, np.inf])
-    after = np.searchsorted(there_s, wanted_s).clip(1, len(found))
-    before_s, after_s = there_s[after - 1], there_s[after]
+    frames, torn = scan_video(path)
+    there_s = np.array([*frames, np.inf])
+    after = np.searchsorted(there_s, wanted_s).clip(1, len(frames))
+    before_s = there_s[after - 1]
+    after_s = there_s[after]
     nearest_s = np.where(wanted_s - before_s < after_s - wanted_s, before_s, after_s)
-    off_s = np.where(wanted_s < found[-1] + 0.5 / rate_hz, np.abs(nearest_s - wanted_s), 0.0)
-    is_torn = np.isin(nearest_s, list(torn)) & (wanted_s < found[-1] + 0.5 / rate_hz)
+    off_s = np.where(wanted_s < frames[-1] + 0.5 / rate_hz, np.abs(nearest_s - wanted_s), 0.0)
+    is_torn = np.isin(nearest_s, list(torn)) & (wanted_s < frames[-1] + 0.5 / rate_hz)
     return Matched(np.where(off_s > tolerance_s, nearest_s, wanted_s), off_s, is_torn)

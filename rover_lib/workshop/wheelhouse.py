@@ -82,6 +82,6 @@ def _fetch(folder: Path, python: str, requirements: Path) -> None:
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "download", "--dest", folder]
         platforms = [o for p in PLATFORMS for o in ("--platform", p)]
         target = ["--python-version", python, "--implementation", "cp", *platforms]
-        what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
+        pins = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--requirement", f.name]
         remedy = f"is there internet here? pip fetches the wheels of {requirements.name} for Python {python}"
-        run(*pip, *target, *what, error=RoverError, remedy=remedy)
+        run(*pip, *target, *pins, error=RoverError, remedy=remedy)

@@ -14,12 +14,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_playbooks import programs
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.care.release import Releases
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.judge.advice import Names, list_next
+from tests.helpers.command import programs
 
 ROOT = Path(__file__).parents[2]
 NAMES = ("canary", "second", "third")

@@ -17,6 +17,7 @@ from click.testing import CliRunner
 
 from rover_lib.cli import main
 from rover_lib.onboard.drive.watch import PRIORITY
+from tests.helpers.command import programs
 
 pytestmark = pytest.mark.slow  # Ansible takes a second to start
 
@@ -122,14 +123,6 @@ def test_wrong_arguments_and_machines_are_refused_before_anything_is_done(tmp_pa
 
 
 # What must not be stopped or lost
-
-
-def programs(folder: Path, bodies: dict[str, str]) -> None:
-    """Write shell scripts."""
-    for name, body in bodies.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(f"#!/bin/sh\n{body}\n")
-        (folder / name).chmod(0o755)
 
 
 def test_a_car_that_drives_is_not_stopped_unless_that_is_asked_for(tmp_path):

@@ -1,7 +1,5 @@
 """The car's loop in virtual time: against the expert, the arithmetic of plans' ages, and itself."""
 
-import copy
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,37 +11,10 @@ from balloon_world.world import World, expert
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import PolicyError, TrainingError
 from rover_lib.onboard.params import params
+from tests.helpers.worlds import Foresees, Seen
 
 SETTINGS = Settings.of(params()["drive"])
 CURVE = 10_003  # the balloon is 23 degrees aside
-
-
-class Seen(World):
-    """A policy is shown the world itself, not a picture of it: nothing is drawn, and the expert can plan."""
-
-    def render(self):
-        return copy.copy(self)
-
-
-class Foresees:
-    """Plans what the expert will do, and knows what it will see then. fails_at: the plan that is not finite."""
-
-    rate_hz, chunk = 30.0, 32
-
-    def __init__(self, fails_at=0):
-        self.planned, self.fails_at = 0, fails_at
-
-    def predict_unclipped(self, world, state):
-        # the state is what was commanded before the frame
-        assert state.tolist() == pytest.approx([world.state.steering_command, world.state.throttle_command], abs=1e-6)
-        self.planned += 1
-        world.trajectory, world.outcome = [], None
-        plan = []
-        for _ in range(self.chunk):
-            plan.append(expert(world))
-            if not world.done:
-                world.step(*plan[-1])
-        return np.array(plan, np.float32) * (math.nan if self.planned == self.fails_at else 1)
 
 
 class Strange(Foresees):

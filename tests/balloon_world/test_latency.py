@@ -1,13 +1,13 @@
 """Notebook 07's study: its rows, and its gate, which is of compensated drives."""
 
 import pytest
-from test_drives import Foresees, Seen
 
 from balloon_world import drives, latency
 from balloon_world.drives import SEED
 from balloon_world.latency import gates, table
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import read_stage, sha256_of
+from tests.helpers.worlds import Foresees, Seen
 
 
 @pytest.fixture

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from interrupted import interrupt
-from policies import of_a_cars_size
 
 from balloon_world import drives, learn
 from balloon_world.learn import Experiment, demonstrate, drive_corrected, gates, human_beside, run_experiment
@@ -22,6 +20,8 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.run.pipeline import make_artifact
 from rover_lib.workshop.run.session import load
+from tests.helpers.interrupted import interrupt
+from tests.helpers.policies import of_a_cars_size
 
 CURVE = 10_003  # the balloon is 23 degrees aside
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded import record_drives
 
 from balloon_world import drives, students
 from balloon_world.drives import SEED
@@ -14,6 +13,7 @@ from balloon_world.students import gates_of, judge_students, recommendation, tab
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage, sha256_of, write_stage
+from tests.helpers.recorded import record_drives
 
 
 class Policy:

@@ -8,10 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
-import needs
 import numpy as np
 import pytest
-from needs import ended, until
 
 from balloon_world.car import HOLD_S, STAND_IN, VirtualCar, _Car
 from balloon_world.simulated_arduino import PinEvent
@@ -20,6 +18,8 @@ from lab.arduino.emulator import BOARD
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import CameraError, TrainingError
+from tests.helpers import needs
+from tests.helpers.needs import ended, until
 
 BOARDS = [
     pytest.param(STAND_IN, id="stand-in"),

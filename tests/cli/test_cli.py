@@ -6,7 +6,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command import rover
 
 from rover_lib.cli import main
 from rover_lib.cli.prepare import Resumable
@@ -14,6 +13,7 @@ from rover_lib.onboard.cli import show
 from rover_lib.onboard.columns import in_words
 from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import atomic_path, read_stage
+from tests.helpers.command import rover
 
 
 def test_a_run_ends_with_its_verdict(tmp_path, monkeypatch):

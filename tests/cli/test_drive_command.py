@@ -10,13 +10,13 @@ import time
 from pathlib import Path
 
 import pytest
-from needs import real_time, until
 
 from balloon_world.car import CameraFeed, VirtualCar
 from lab.driving.policy import make_artifact, pictures
 from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.workshop.recordings.episodes import load_recordings
+from tests.helpers.needs import real_time, until
 
 pytestmark = pytest.mark.slow
 ROVER = [str(Path(sys.executable).parent / "rover"), "drive"]

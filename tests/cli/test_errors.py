@@ -4,7 +4,8 @@ import json
 import zipfile
 
 import pytest
-from command import rover
+
+from tests.helpers.command import rover
 
 
 @pytest.fixture

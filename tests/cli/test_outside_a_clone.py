@@ -15,8 +15,9 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from recorded import record_drives
-from test_installed import ELSEWHERE, ROOT, Installed, with_needs
+
+from tests.helpers.installed import ELSEWHERE, ROOT, Installed, with_needs
+from tests.helpers.recorded import record_drives
 
 pytestmark = pytest.mark.slow
 FEW = "--samples 6 --iterations 2 -p choosing_frames 2 -p held_out_frames 4 -p modes '[static]'"

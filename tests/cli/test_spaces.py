@@ -8,10 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import rover
 
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.workshop.run import run_report
+from tests.helpers.command import rover
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "ansible" / "README.md"]

@@ -3,12 +3,12 @@
 import zlib
 from pathlib import Path
 
-import needs
 import pytest
 
 from lab.driving.native import STEERING, THROTTLE, NativeArduino
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.servo_link import State
+from tests.helpers import needs
 
 CARS = Path(__file__).parents[2] / "lab" / "cars"
 pytestmark = needs.gcc

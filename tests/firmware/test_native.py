@@ -4,15 +4,14 @@ import re
 import subprocess
 from dataclasses import replace
 
-import needs
 import pytest
-import uno
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
 from lab.driving.native import NativeArduino
 from rover_lib.onboard.car import car, servo_link
 from rover_lib.onboard.errors import RoverError
+from tests.helpers import needs, uno
 
 pytestmark = needs.gcc
 FOLDER = uno.REPOSITORY / "firmware" / "rover"

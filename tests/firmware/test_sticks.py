@@ -1,11 +1,11 @@
 """A gamepad's sticks, which the host sends: the firmware built with HUMAN=gamepad, in virtual time."""
 
-import needs
 import pytest
-from test_vehicle import CAP_US, NEUTRAL, moved_after_ms
 
 from lab.driving.native import THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State, frame
+from tests.helpers import needs
+from tests.helpers.vehicle import CAP_US, NEUTRAL, moved_after_ms
 
 pytestmark = needs.gcc
 

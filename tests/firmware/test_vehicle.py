@@ -5,15 +5,14 @@ Each attack here moved the car on firmware 1.0.0, or kept it from its human; wha
 
 import itertools
 
-import needs
 import pytest
 
 from lab.driving.native import THROTTLE, NativeArduino
 from rover_lib.onboard.car.servo_link import State
+from tests.helpers import needs
+from tests.helpers.vehicle import CAP_US, NEUTRAL, moved_after_ms, throttles
 
 pytestmark = needs.gcc
-NEUTRAL = (1456, 120)
-CAP_US = 238
 HUMAN_MS = 100  # until the car is the human's, whatever happened
 
 
@@ -31,15 +30,6 @@ def armed(board):
     board.wiggle()
     assert board.command("A") == "k"
     return board
-
-
-def throttles(pins):
-    return [throttle_us for _, throttle_us in pins]
-
-
-def moved_after_ms(pins):
-    """How long the throttle was above neutral."""
-    return max((n + 1 for n, us in enumerate(throttles(pins)) if us > 120), default=0)
 
 
 # ---- a receiver that goes on without its transmitter

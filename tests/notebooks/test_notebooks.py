@@ -6,7 +6,6 @@ import shutil
 
 import nbformat
 import pytest
-from executed import run_cells
 
 from rover_lib.onboard.errors import ParamsError
 from rover_lib.onboard.params import params
@@ -14,6 +13,7 @@ from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.run import run as runs
 from rover_lib.workshop.run import run_report
 from rover_lib.workshop.run.run import NOTEBOOKS, parameters_of
+from tests.helpers.executed import run_cells
 
 
 def written(folder, parameters='run_dir = "."  # here', work="pass"):

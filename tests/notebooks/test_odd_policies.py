@@ -3,9 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from executed import run_cells
-from policies import TINY, lerobot_policy, saved
-from recorded import lerobot_dataset
 
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import PolicyError
@@ -13,6 +10,9 @@ from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.run.run import NAMES
 from rover_lib.workshop.run.session import load
+from tests.helpers.executed import run_cells
+from tests.helpers.policies import TINY, lerobot_policy, saved
+from tests.helpers.recorded import lerobot_dataset
 
 pytestmark = pytest.mark.slow
 RELATIVE = 1e-5  # of the largest action: LeRobot's own forward, processors included, against our FP32 artifact

@@ -7,13 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from recorded import names_in
 
 from rover_lib.onboard import durable
 from rover_lib.onboard.durable import ASKED, build_folder
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.run import run_folder
+from tests.helpers.recorded import names_in
 
 
 def whole(folder):

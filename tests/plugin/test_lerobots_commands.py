@@ -14,7 +14,6 @@ import zipfile
 from functools import partial
 from pathlib import Path
 
-import needs
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,6 +27,7 @@ from lerobot_robot_rover.line import ENDING
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US, PwmCalibration
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.workshop.recordings.episodes import load_recordings
+from tests.helpers import needs
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
-from needs import Late, real_time, until
 
 from lerobot_robot_rover import Rover, RoverConfig, RoverTransmitter, RoverTransmitterConfig, ride
 from lerobot_robot_rover.line import FEATURES, named
@@ -17,6 +16,7 @@ from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.car.servo_link import LinkError
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, PolicyError
+from tests.helpers.needs import Late, real_time, until
 
 GO = {"steering": 0.2, "throttle": 0.15}
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from policies import memory_samples
 
 from research import donkey_cnn
 from research.donkey_cnn import AHEAD_S, linear, predict, r2, tensors, train
+from tests.helpers.policies import memory_samples
 
 RATE_HZ = 20.0
 
@@ -36,6 +36,7 @@ def test_r2_by_hand():
     assert r2(torch.full((4,), 1.5), wanted) == 0
 
 
+@pytest.mark.research
 def test_it_learns_what_can_be_seen(monkeypatch):
     monkeypatch.setattr(donkey_cnn, "EPOCHS", 6)
     learning, choosing = tensors(samples(500, 0), RATE_HZ), tensors(samples(100, 1), RATE_HZ)

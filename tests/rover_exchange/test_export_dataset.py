@@ -11,15 +11,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import rover
-from recorded import record_there_and_back
-from test_episodes import burst, edit, load, record, redrawn
 
 from rover_exchange.export_dataset import _parts, export_dataset, lerobot_video
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.recordings.samples import car_of
+from tests.helpers.command import rover
+from tests.helpers.episodes import burst, edit, load, record, redrawn
+from tests.helpers.recorded import record_there_and_back
 
 CRAWLER = read_car(Path(__file__).parents[2] / "lab/cars/crawler.yml")
 

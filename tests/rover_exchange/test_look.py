@@ -7,7 +7,6 @@ import av
 import cv2
 import numpy as np
 import pytest
-from command import rover
 
 from rover_exchange import film
 from rover_exchange.flight import flight_figure
@@ -16,6 +15,7 @@ from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
 from rover_lib.onboard.errors import EpisodeError, RoverError
+from tests.helpers.command import rover
 
 ROOT = Path(__file__).parents[2]
 SECONDS, HZ, PICTURES_HZ = 2.0, 30, 10

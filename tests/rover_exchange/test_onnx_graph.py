@@ -5,8 +5,6 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from command import rover
-from policies import TINY, MemorySample, lerobot_policy, memory_samples, saved, saved_normalised, smooth_frame
 from torch import nn
 
 from rover_exchange.onnx_graph import onnx_model, stack_stem
@@ -17,6 +15,16 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import graph_of, int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
+from tests.helpers.command import rover
+from tests.helpers.policies import (
+    TINY,
+    MemorySample,
+    lerobot_policy,
+    memory_samples,
+    saved,
+    saved_normalised,
+    smooth_frame,
+)
 
 SHAPES = {
     "tiny": TINY,

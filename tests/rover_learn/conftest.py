@@ -1,5 +1,6 @@
 import pytest
-from policies import of_a_cars_size
+
+from tests.helpers.policies import of_a_cars_size
 
 
 @pytest.fixture(scope="session")

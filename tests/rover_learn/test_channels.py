@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from policies import memory_samples
 
 from rover_learn.channels import _leave_out, without_channels
 from rover_learn.lessons import BatchedPolicy
@@ -16,6 +15,7 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.int8.observe import calibrate
 from rover_lib.workshop.int8.quantize import int8_layers, quantize
 from rover_lib.workshop.int8.scheme import Scheme
+from tests.helpers.policies import memory_samples
 
 BLOCKS = [f"backbone.layer{stage}.{block}" for stage in (1, 2, 3, 4) for block in (0, 1)]
 PARTS = ("conv1.weight", "bn1.weight", "bn1.bias")

@@ -4,8 +4,6 @@ import json
 
 import pytest
 import torch
-from interrupted import interrupt, save_each_step
-from recorded import record_drives
 
 from rover_learn import distill as distill_module
 from rover_learn import training
@@ -15,6 +13,8 @@ from rover_learn.student import StudentShape
 from rover_learn.training import Machine
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from tests.helpers.interrupted import interrupt, save_each_step
+from tests.helpers.recorded import record_drives
 
 SHAPE = StudentShape(54, 96, decoder_layers=1, feedforward=64)
 

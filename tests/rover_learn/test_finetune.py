@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import smooth_frame
 
 from rover_learn.finetune import FinetuneRecipe, chance_of, change_points, finetune, human_samples, verdict
 from rover_learn.training import Machine
@@ -21,6 +20,7 @@ from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY, About, Ep
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.recordings.samples import Episode, Sample
+from tests.helpers.policies import smooth_frame
 
 FRAMES = 24
 TAKEN_OVER = [POLICY] * 8 + [HUMAN] * 12 + [NOBODY] * 4

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from policies import memory_samples
 
 from rover_learn.student import StudentShape, initial_weights, student_config
 from rover_lib.onboard.errors import CheckpointError, TrainingError
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.act_config import lerobot_act
+from tests.helpers.policies import memory_samples
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torchvision
-from command import rover
-from interrupted import interrupt
 from lerobot.policies.act.modeling_act import ACTPolicy
-from recorded import record_drives
 
 from rover_learn import act_phases
 from rover_learn import train as train_module
@@ -21,6 +18,9 @@ from rover_learn.training import Machine
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from tests.helpers.command import rover
+from tests.helpers.interrupted import interrupt
+from tests.helpers.recorded import record_drives
 
 pytestmark = pytest.mark.slow
 CPU, READING_AHEAD = Machine.of("cpu"), Machine.of("cpu", workers=2)

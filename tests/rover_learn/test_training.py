@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from policies import normalise
 from torch import nn
 
 from rover_learn import training
@@ -26,6 +25,7 @@ from rover_learn.training import (
     normalised,
 )
 from rover_lib.onboard.errors import TrainingError
+from tests.helpers.policies import normalise
 
 STEPS, CPU = 6, Machine(torch.device("cpu"))
 

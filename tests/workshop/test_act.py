@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import FULL, TINY, lerobot_config, lerobot_policy, normalise, saved_processors, smooth_frame
 from torch.utils.flop_counter import FlopCounterMode
 
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD
@@ -25,6 +24,7 @@ from rover_lib.workshop.act import (
 )
 from rover_lib.workshop.act_config import imagenet
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from tests.helpers.policies import FULL, TINY, lerobot_config, lerobot_policy, normalise, saved_processors, smooth_frame
 
 SHAPES = {
     "the user's": FULL,

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import av
 import cv2
-import hostile
 import numpy as np
 import pyarrow
 import pytest
@@ -20,6 +19,7 @@ from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.untrusted import check_encoded, check_inside, check_table, check_video, limited_memory
+from tests.helpers import hostile
 
 SIZE = (54, 96)
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 54\nshowpage\n"

@@ -36,4 +36,4 @@ def find_port(dev: Path = DEV) -> str:
     found = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
     if not ports:
         raise RoverError("no Arduino is plugged in", remedy="plug it in; dmesg | tail says what the kernel saw")
-    raise RoverError("which port is the Arduino's?", found=found, remedy=f"say it: --port {next(iter(ports))}")
+    raise RoverError("which port is the Arduino's?", found=found, remedy=f"pass it: --port {next(iter(ports))}")

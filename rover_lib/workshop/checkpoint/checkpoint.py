@@ -20,9 +20,11 @@ from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
 from rover_lib.workshop.act import ACT, ACTIVATIONS, BACKBONES, ActConfig, Affine, inputs_of, predictions
 from rover_lib.workshop.act_config import imagenet, lerobot_act
-from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
+from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
+from rover_lib.workshop.checkpoint.trainer import read_trainer, trainer_config
+from rover_lib.workshop.checkpoint.weights import Weights, tensor_bytes
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -68,13 +70,13 @@ class Checkpoint:
         How well it still drives must be measured. Raises CheckpointError for several cameras, for a side of less than
         one feature (32 pixels), and if the aspect ratio changes by more than 5 %.
         """
-        (trained_height, trained_width), *others = self.config.image_sizes
+        (trained_height, trained_width), *other_sizes = self.config.image_sizes
         sides = all(is_whole(side, FEATURE_PX) for side in (height, width))
-        if others or not sides or is_squeezed((width, height), (trained_width, trained_height)):
-            what = f"{self.path}: cannot run at {quote(width)}x{quote(height)}"
+        if other_sizes or not sides or is_squeezed((width, height), (trained_width, trained_height)):
+            problem = f"{self.path}: cannot run at {quote(width)}x{quote(height)}"
             trained = f"{len(self.config.cameras)} cameras, the first of {trained_width}x{trained_height}"
             remedy = f"one camera, whole sides of at least {FEATURE_PX}, and an aspect ratio within 5 %"
-            raise CheckpointError(what, found=trained, remedy=remedy)
+            raise CheckpointError(problem, found=trained, remedy=remedy)
         return replace(self, config=replace(self.config, image_sizes=((height, width),)))
 
     def recorded_as(self, layout: Layout, samples: Sequence[Sample] = ()) -> "Checkpoint":
@@ -86,45 +88,49 @@ class Checkpoint:
         Raises CheckpointError for another number of cameras, states or actions, for another rate or names than the
         policy's own, where nothing says the order or the rate, and for keys of LeRobot's config that may matter.
         """
-        c, facts, given = self.config, self.facts, layout.rate_hz is not None
+        c = self.config
+        facts = self.facts
+        has_rate = layout.rate_hz is not None
         has = len(c.cameras), len(c.state_names) if c.sees_state else 0, len(c.action_names)
         recorded = len(layout.cameras), len(layout.state_names) if c.sees_state else 0, len(layout.action_names)
         if has != recorded:
-            what = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
-            raise CheckpointError(what, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
+            problem = f"{self.path}: a policy of cameras, states and actions {', '.join(map(str, has))}"
+            raise CheckpointError(problem, found=f"recordings of {', '.join(map(str, recorded))}", remedy=TRAINED_ON)
         for key, value in facts.unknown.items():
             if self.format == "lerobot" and value is not None:
                 raise facts.refusal(key, value, "and nobody here knows what that does")
         guessed = [fact for fact in ("actions", "rate") if facts.source(fact) == GUESS]
-        if guessed and not given:  # our own recordings, which it was not trained on
+        if guessed and not has_rate:  # our own recordings, which it was not trained on
             say = " ".join({"actions": "actions=steering,throttle", "rate": "rate=30"}[fact] for fact in guessed)
-            what = f"{self.path}: nothing says its {' and '.join(guessed)}"
+            problem = f"{self.path}: nothing says its {' and '.join(guessed)}"
             # Both orders: the user must not just copy one.
             other = say.replace("steering,throttle", "throttle,steering")
-            options = " or ".join(f'{USER} "{each}"' for each in dict.fromkeys((say, other)))
-            raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say them in its numbers' order: {options}")
-        if given and "rate" not in guessed and layout.rate_hz != c.rate_hz:
-            found = f"recordings of {layout.rate_hz:g} frames a second"
-            what = f"{self.path}: plans {c.rate_hz:g} steps a second"
-            raise CheckpointError(what, found=found, remedy="give recordings of that rate")
+            options = " or ".join(f'{USER} "{option}"' for option in dict.fromkeys((say, other)))
+            raise CheckpointError(problem, remedy=f"{TRAINED_ON}, or say them in its numbers' order: {options}")
+        if has_rate and "rate" not in guessed and layout.rate_hz != c.rate_hz:
+            actual = f"recordings of {layout.rate_hz:g} frames a second"
+            problem = f"{self.path}: plans {c.rate_hz:g} steps a second"
+            raise CheckpointError(problem, found=actual, remedy="give recordings of that rate")
         numbers = {"state": (c.state_names, layout.state_names), "action": (c.action_names, layout.action_names)}
-        for what, (own, theirs) in numbers.items():
-            known = "actions" not in guessed and (c.sees_state or what == "action")
-            if known and set(own) != set(theirs) and set(ACTION_NAMES) in (set(own), set(theirs)):
+        for problem, (own, theirs) in numbers.items():
+            settled = "actions" not in guessed and (c.sees_state or problem == "action")
+            if settled and set(own) != set(theirs) and set(ACTION_NAMES) in (set(own), set(theirs)):
                 remedy = "if they are the same, rename them in the dataset's meta/info.json, or by --action-names"
-                found = f"recordings whose {what} is {quote_all(theirs)}"
-                raise CheckpointError(f"{self.path}: the {what} is {quote_all(own)}", found=found, remedy=remedy)
+                actual = f"recordings whose {problem} is {quote_all(theirs)}"
+                raise CheckpointError(f"{self.path}: the {problem} is {quote_all(own)}", found=actual, remedy=remedy)
         ordered = self._reordered(layout, samples, guessed)
-        of_car, norm = set(ordered.config.action_names) == set(ACTION_NAMES), ordered.config.action_unnorm
+        of_car = set(ordered.config.action_names) == set(ACTION_NAMES)
+        norm = ordered.config.action_unnorm
         if of_car and norm and max(map(abs, norm.scale + norm.shift)) > FAR:
-            what = f"{self.path}: the statistics of its actions are of other units than a rover's, from -1 to 1"
+            problem = f"{self.path}: the statistics of its actions are of other units than a rover's, from -1 to 1"
             remedy = "train on such actions; a throttle forward is from 0 to 1"
-            raise CheckpointError(what, found=ordered.report["normalisation"]["action"], remedy=remedy)
+            raise CheckpointError(problem, found=ordered.report["normalisation"]["action"], remedy=remedy)
         return ordered._at_trained_size(layout, samples)
 
     def _reordered(self, layout: Layout, samples: Sequence[Sample], guessed: Sequence[str]) -> "Checkpoint":
         """Return the policy with the order of numbers, and LeRobot's with the cameras and the rate of the dataset."""
-        c, notes = self.config, list[str]()
+        c = self.config
+        notes = list[str]()
         states, actions = layout.state_order, layout.action_order
         if "actions" not in guessed:
             if set(c.action_names) != set(layout.action_names):
@@ -137,7 +143,7 @@ class Checkpoint:
         # A state that is not looked at may as well be the car's.
         state_names = ACTION_NAMES if not c.sees_state and len(layout.state_names) == 2 else layout.state_names
         config = replace(ordered.config, state_names=state_names, action_names=layout.action_names)
-        known: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
+        facts: dict[str, tuple[Any, str]] = {"actions": (layout.action_names, self.facts.source("actions"))}
         if guessed:
             same = self._varies_as(samples, actions, "actions" in guessed)
             cameras = c.cameras if set(c.cameras) == set(layout.cameras) else layout.cameras
@@ -148,9 +154,9 @@ class Checkpoint:
                 notes.append(f"its actions are {quote_all(layout.action_names)}, which no rover has; {option}")
             rate_hz = (layout.rate_hz if "rate" in guessed else None) or c.rate_hz
             config = replace(config, cameras=cameras, rate_hz=rate_hz)
-            given: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}
-            known |= {fact: (given[fact], INFO if same else f"{GUESS}, {INFO}") for fact in guessed}
-        return ordered._told(config, known, notes)
+            recorded: dict[str, Any] = {"actions": config.action_names, "rate": config.rate_hz}
+            facts |= {fact: (recorded[fact], INFO if same else f"{GUESS}, {INFO}") for fact in guessed}
+        return ordered._told(config, facts, notes)
 
     def _in_order(self, states: tuple[int, ...], actions: tuple[int, ...]) -> "Checkpoint":
         """Return the policy with its numbers in another order. states, actions: for each number, where it is now."""
@@ -158,7 +164,8 @@ class Checkpoint:
         def reorder(norm: Affine | None, order: tuple[int, ...]) -> Affine | None:
             return norm and Affine(tuple(norm.scale[i] for i in order), tuple(norm.shift[i] for i in order))
 
-        c, weights = self.config, dict(self.weights)
+        c = self.config
+        weights = dict(self.weights)
         for name, order, axis in (
             ("encoder_robot_state_input_proj.weight", states, 1),
             ("vae_encoder_robot_state_input_proj.weight", states, 1),
@@ -174,18 +181,19 @@ class Checkpoint:
     def _varies_as(self, samples: Sequence[Sample], order: tuple[int, ...], guessed: bool) -> bool:
         """Whether its actions vary as the samples', whose places in the policy are `order`: then it learned from them.
 
-        Raises CheckpointError if that clearly denies the order of two actions that was guessed.
+        Raises CheckpointError if that clearly contradicts the order of two actions that was guessed.
         """
         theirs = self.facts.value("action std")
         if not samples or theirs is None:
             return False
         recorded = np.std([s.chunk[0].astype(np.float64) for s in samples], 0) + 1e-3
         own = np.array(theirs)[list(order)] + 1e-3
-        apart, turned = np.abs(np.log(own / recorded)), np.abs(np.log(own[::-1] / recorded))
-        if guessed and len(order) == 2 and turned.sum() + CLEARLY < apart.sum():
+        apart = np.abs(np.log(own / recorded))
+        swapped = np.abs(np.log(own[::-1] / recorded))
+        if guessed and len(order) == 2 and swapped.sum() + CLEARLY < apart.sum():
             other = ",".join(ACTION_NAMES[i] for i in order[::-1])
-            what = f"{self.path}: the statistics of its actions deny the order in {INFO}"
-            raise CheckpointError(what, remedy=f"{TRAINED_ON}, or say the policy's: {USER} actions={other}")
+            problem = f"{self.path}: the statistics of its actions contradict the order in {INFO}"
+            raise CheckpointError(problem, remedy=f"{TRAINED_ON}, or pass the policy's: {USER} actions={other}")
         return bool(apart.max() < SAME)
 
     def _at_trained_size(self, layout: Layout, samples: Sequence[Sample]) -> "Checkpoint":
@@ -194,39 +202,44 @@ class Checkpoint:
         LeRobot never resizes, and a fine-tuned policy has its base's config.json, so the recordings' size may be right;
         but one that was trained on a smaller copy needs that. No weight depends on it: both are tried on samples.
         """
-        c, few = self.config, pick_evenly(samples, FRAMES)
+        c = self.config
+        tried = pick_evenly(samples, FRAMES)
         recorded = dict(layout.image_sizes)
-        if few and not recorded and len(c.cameras) == 1:
-            recorded = {c.cameras[0]: few[0].frame_bgr().shape[:2]}
+        if tried and not recorded and len(c.cameras) == 1:
+            recorded = {c.cameras[0]: tried[0].frame_bgr().shape[:2]}
         sizes = tuple(recorded.get(name, size) for name, size in zip(c.cameras, c.image_sizes, strict=True))
         pairs = list(zip(c.image_sizes, sizes, strict=True))
         squeezed = any(is_squeezed(there[::-1], own[::-1]) for own, there in pairs)
-        said = ", ".join(f"{w}x{h} for pictures of {width}x{height}" for (h, w), (height, width) in pairs)
+        sizes_told = ", ".join(f"{w}x{h} for pictures of {width}x{height}" for (h, w), (height, width) in pairs)
         if self.facts.source("size") != SIZE_OF_BASE or self.report["written_here"] or not layout.image_sizes:
-            note = f"{GUESS}, that pictures were squeezed in training too: {said}"
+            note = f"{GUESS}, that pictures were squeezed in training too: {sizes_told}"
             guessed = squeezed and not self.report["written_here"]  # our trainings squeeze theirs to this size
             return self._told(c, {"size": (c.image_sizes[0], note)}, [note]) if guessed else self
         if sizes == c.image_sizes:
             return self
         config = replace(c, image_sizes=sizes)
-        own, other = (planned_error(replace(self, config=each), few) if few else 1.0 for each in (c, config))
+        own, other = (
+            planned_error(replace(self, config=candidate), tried) if tried else 1.0 for candidate in (c, config)
+        )
         # Nobody squeezes a copy, so then the recordings' size is likelier.
-        taken = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
-        note = f"{GUESS}: config.json says {said}; tried on {len(few)} frames, they are {own:.3g} and {other:.3g} off"
-        return self._told(taken, {"size": (taken.image_sizes[0], note)}, [note])
+        best = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
+        errors = f"they are {own:.3g} and {other:.3g} off"
+        note = f"{GUESS}: config.json says {sizes_told}; tried on {len(tried)} frames, {errors}"
+        return self._told(best, {"size": (best.image_sizes[0], note)}, [note])
 
     def _told(self, config: ActConfig, known: dict[str, tuple[Any, str]], notes: Sequence[str]) -> "Checkpoint":
         """Return the same weights with another config, of which other facts are known."""
         facts = copy(self.facts)
-        facts.known, facts.notes = facts.known | known, [*facts.notes, *notes]
+        facts.known = facts.known | known
+        facts.notes = [*facts.notes, *notes]
         return replace(self, config=config, facts=facts, report=self.report | _words(config, facts))
 
 
 def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | None = None) -> float:
     """The mean error of one action, or of all, against the recorded ones."""
     plans = predictions(ACT(policy.config, policy.weights), [inputs_of(s, policy.config) for s in samples]).numpy()
-    known = ~np.stack([s.is_pad for s in samples])
-    errors = np.abs(plans - np.stack([s.chunk for s in samples]))[known]
+    present = ~np.stack([s.is_pad for s in samples])
+    errors = np.abs(plans - np.stack([s.chunk for s in samples]))[present]
     return float((errors if action is None else errors[:, action]).mean())
 
 
@@ -244,14 +257,16 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
     path = Path(path)
     if path.is_dir():
         path = lerobot_folder(path)
-        kind, file = "lerobot", path / "model.safetensors"
+        kind = "lerobot"
+        file = path / "model.safetensors"
     elif path.is_file():
-        kind, file = "trainer", path
+        kind = "trainer"
+        file = path
     else:
         remedy = "give the trainer's .pth file, or LeRobot's pretrained_model folder"
         raise CheckpointError(f"{path}: not found, or neither a file nor a folder", remedy=remedy)
     facts = Facts(path, said)
-    config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else files.read_trainer(path, facts)
+    config, weights, extra = read_lerobot(path, facts) if kind == "lerobot" else read_trainer(path, facts)
     check_limits(path, config)
     if (sha256 := sha256_of(file)) != checked:
         check_weights(path, config, weights, facts.unknown)
@@ -261,7 +276,7 @@ def load_checkpoint(path: Path | str, checked: str | None = None, said: str = ""
     report = {
         "format": kind,
         "file_mb": file.stat().st_size / 1e6,
-        "weights_mb": files.tensor_bytes(weights) / 1e6,
+        "weights_mb": tensor_bytes(weights) / 1e6,
         "parameters": sum(weight.numel() for weight in weights.values()),
         "parameters_acting": acts,
         "int8_floor_mb": acts / 1e6,
@@ -294,9 +309,9 @@ def _words(c: ActConfig, facts: Facts) -> dict[str, Any]:
     """What reports say of a policy beyond its weights, and who says it."""
     sizes = ", ".join(f"{name} {w}x{h}" for name, (h, w) in zip(c.cameras, c.image_sizes, strict=True))
     words = {"size": sizes, "actions": ", ".join(c.action_names), "rate": f"{c.rate_hz:g} steps a second"}
-    known = {fact: f"{words.get(fact, value)} ({by})" for fact, (value, by) in facts.known.items()}
+    facts_in_words = {fact: f"{words.get(fact, value)} ({by})" for fact, (value, by) in facts.known.items()}
     guesses = [f"its {fact}: {by}" for fact, (_, by) in facts.known.items() if by.startswith(GUESS)]
-    return {"known": known, "guesses": guesses, "normalisation": normalisation(c), "notes": facts.notes}
+    return {"known": facts_in_words, "guesses": guesses, "normalisation": normalisation(c), "notes": facts.notes}
 
 
 def check_limits(path: Path, c: ActConfig) -> None:
@@ -308,8 +323,8 @@ def check_limits(path: Path, c: ActConfig) -> None:
     names = {"state_names": list(c.state_names), "action_names": list(c.action_names)}
     values = {"cameras": cameras, **names, "chunk": c.chunk, "rate_hz": c.rate_hz}
     if broken := broken_rule(values, {name: RULES[name] for name in values}):
-        name, must, found = broken
-        raise CheckpointError(f"{path}: {name} must be {must}", found=found, remedy=files.CORRECT_IT)
+        name, must, actual = broken
+        raise CheckpointError(f"{path}: {name} must be {must}", found=actual, remedy=CORRECT_IT)
 
 
 def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown: Iterable[str] = ()) -> None:
@@ -318,29 +333,29 @@ def check_weights(path: Path, c: ActConfig, weights: dict[str, Tensor], unknown:
     What is checked first either cannot run here, or would let LeRobot build something without end. unknown: keys that
     nobody here knows, and that may be why.
     """
-    for key, value, known in (("backbone", c.backbone, BACKBONES), ("activation", c.activation, ACTIVATIONS)):
-        if not isinstance(value, str) or value not in known:
-            what = f"{path}: {key} {quote(value)} is not known here"
-            raise CheckpointError(what, remedy=f"known are {', '.join(sorted(known))}")
+    for key, value, choices in (("backbone", c.backbone, BACKBONES), ("activation", c.activation, ACTIVATIONS)):
+        if not isinstance(value, str) or value not in choices:
+            problem = f"{path}: {key} {quote(value)} is not known here"
+            raise CheckpointError(problem, remedy=f"known are {', '.join(sorted(choices))}")
     sizes = (c.chunk, c.dim, c.heads, c.feedforward, c.encoder_layers, c.decoder_layers)
     positions = tuple(weights["decoder_pos_embed.weight"].shape) if "decoder_pos_embed.weight" in weights else None
     whole = all(is_whole(size, 1) for size in sizes)  # LeRobot 0.6 lets None pass
     deep = not whole or c.encoder_layers + c.decoder_layers > len(weights)
     if deep or positions != (c.chunk, c.dim) or c.dim % 4:  # a quarter of the width for each sine and cosine
-        what = f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)"
-        found = f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}"
-        raise CheckpointError(what, found=found, remedy=files.CORRECT_IT)
+        problem = f"{path}: config and weights do not agree (decoder_pos_embed is {positions}, {len(weights)} weights)"
+        actual = f"chunk, width, heads, feed-forward, encoder and decoder layers of {quote_all(sizes)}"
+        raise CheckpointError(problem, found=actual, remedy=CORRECT_IT)
     keys = quote_all(unknown)
     forked = f"; nobody here knows {keys}: train with LeRobot's own ACT if that asks for other weights" if keys else ""
-    with files.as_checkpoint_error(path, files.CORRECT_IT + forked):
+    with as_checkpoint_error(path, CORRECT_IT + forked):
         lerobot_act(c, {}).model.load_state_dict(weights, assign=True)
     if bad := [k for k, v in weights.items() if not torch.isfinite(v.float()).all()]:
-        what = f"{path}: NaN or Inf in {quote_all(bad)}"
-        raise CheckpointError(what, remedy="training diverged, take an earlier checkpoint")
+        problem = f"{path}: NaN or Inf in {quote_all(bad)}"
+        raise CheckpointError(problem, remedy="training diverged, take an earlier checkpoint")
 
 
 def write_both(
-    folder: Path, config: ActConfig, weights: files.Weights, loss: float, origin: dict[str, Any], **settings: Any
+    folder: Path, config: ActConfig, weights: Weights, loss: float, origin: dict[str, Any], **settings: Any
 ) -> dict[str, str]:
     """Write pretrained_model/ into a folder, and best_model.pth where the trainer's format can hold the policy.
 
@@ -349,18 +364,18 @@ def write_both(
 
     Returns sha256 by name: of the weights' file of the one, and of the other. Raises as `atomic_path`.
     """
-    written = [folder / "pretrained_model" / "model.safetensors"]
+    paths = [folder / "pretrained_model" / "model.safetensors"]
     write_lerobot(folder / "pretrained_model", config, weights, origin)
     norms = config.image_norm, config.state_norm, config.action_unnorm
-    if (*norms, config.rate_hz) == ((imagenet(),), None, None, files.RATE_HZ):
+    if (*norms, config.rate_hz) == ((imagenet(),), None, None, RATE_HZ):
         content = {
             "epoch": 0,
             "model_state_dict": {f"model.{name}": weight.cpu() for name, weight in weights.items()},
             "optimizer_state_dict": {},  # the training's was of another loss
             "scheduler_state_dict": {},
             "best_val_loss": np.float64(loss),
-            "config": files.trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
+            "config": trainer_config(config, **settings) | {"use_vae": config.vae_layers > 0, "origin": origin},
         }
-        written.append(folder / "best_model.pth")
-        files.save_torch(written[-1], content)
-    return {path.name: sha256_of(path) for path in written}
+        paths.append(folder / "best_model.pth")
+        save_torch(paths[-1], content)
+    return {path.name: sha256_of(path) for path in paths}

@@ -1,7 +1,7 @@
 """What is known of a policy, and by whom: each fact once, with its source, from all files that are there.
 
 facts = Facts(path, said)              # what the user says by --facts
-facts.say("rate", 15.0, "config.fps")  # CheckpointError, if another source denies it
+facts.say("rate", 15.0, "config.fps")  # CheckpointError, if another source contradicts it
 facts.read(content, "config.")         # keys that nobody here knows, by the words of their names in keys.yml
 """
 
@@ -42,13 +42,13 @@ class Facts:
         self.path, self.notes = path, list[str]()
         self.known, self.unknown = dict[str, tuple[Any, str]](), dict[str, Any]()
         try:
-            given = dict(part.split("=", 1) for part in said.split())
-            self.ignored = {*given.pop("ignore", "").split(",")}
-            for fact, text in given.items():
+            overrides = dict(part.split("=", 1) for part in said.split())
+            self.ignored = {*overrides.pop("ignore", "").split(",")}
+            for fact, text in overrides.items():
                 parts = re.split("[x,]", text)
                 value: Any = tuple(parts) if fact == "actions" else float(parts[0])
                 self.say(fact, (int(parts[1]), int(parts[0])) if fact == "size" else value, USER)
-            if given.keys() - {"rate", "actions", "size"}:
+            if overrides.keys() - {"rate", "actions", "size"}:
                 raise ValueError
         except (ValueError, IndexError):
             remedy = f'as in {USER} "rate=20 actions=throttle,steering size=64x48 ignore=KEY"'
@@ -65,15 +65,19 @@ class Facts:
         return self.known.setdefault(fact, (value, source))[0]
 
     def say(self, fact: str, value: Any, source: str) -> None:
-        """Add a fact. Raises CheckpointError if another source denies it, and the user ignores neither."""
-        before, by = (value, source) if source in self.ignored else self.known.setdefault(fact, (value, source))
-        if not _same(before, value):
-            which = " or ".join(f"{USER} {shlex.quote(f'ignore={each}')}" for each in (source, by) if each != USER)
-            what = f"{self.path}: {by} and {source} deny each other on its {fact}"
-            raise CheckpointError(what, found=f"{quote(str(before))} and {quote(str(value))}", remedy=f"say {which}")
+        """Add a fact. Raises CheckpointError if another source contradicts it, and the user ignores neither."""
+        if source in self.ignored:
+            return
+        earlier, by = self.known.setdefault(fact, (value, source))
+        if not _same(earlier, value):
+            origins = [shlex.quote(f"ignore={origin}") for origin in (source, by) if origin != USER]
+            options = " or ".join(f"{USER} {origin}" for origin in origins)
+            problem = f"{self.path}: {by} and {source} contradict each other on its {fact}"
+            actual = f"{quote(str(earlier))} and {quote(str(value))}"
+            raise CheckpointError(problem, found=actual, remedy=f"pass {options}")
 
     def compare(self, fact: str, said: Mapping[str, Any]) -> None:
-        """Raise CheckpointError, as `say` does, if two sources deny each other: {source: value}. Nothing is kept."""
+        """Raise CheckpointError, as `say` does, if two of {source: value} contradict each other. Nothing is kept."""
         for source, value in said.items():
             self.say(fact, value, source)
         self.known.pop(fact, None)
@@ -94,13 +98,13 @@ class Facts:
                 self.unknown[key.name] = None if key.harmless else key.value
         if refused:
             key, why = next(iter(refused.items()))
-            shown = f"{len(key.value)} values" if key.of_network or isinstance(key.value, Mapping) else key.value
-            raise self.refusal(key.name, shown, why, ",".join(each.name for each in refused))
+            value = f"{len(key.value)} values" if key.of_network or isinstance(key.value, Mapping) else key.value
+            raise self.refusal(key.name, value, why, ",".join(key_refused.name for key_refused in refused))
 
     def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:
         """Return the error of a key that cannot be used, for the caller to raise. ignored: all such keys."""
         option = shlex.quote(f"ignore={ignored or key}")
-        remedy = f"save the policy without it, or if it changes no action, say {USER} {option}"
+        remedy = f"save the policy without it, or if it changes no action, pass {USER} {option}"
         return CheckpointError(f"{self.path}: '{key}' is {quote(str(value))}, {why}", remedy=remedy)
 
     def _read_key(self, key: "_Key") -> bool:
@@ -109,15 +113,16 @@ class Facts:
         named = value
         if isinstance(value, str) and key.has("order"):
             named = [word for word in re.findall("[a-z]+", value.lower()) if word in CHANNELS]
-        names, meant = flat_names(named), read_as_car(flat_names(named))
+        names = flat_names(named)
+        meant = read_as_car(flat_names(named))
         if len(names) > 1 and key.has("states"):
             if meant != names:
                 raise self.refusal(name, value, f"{quote_all(names)}, and here the state is the last action")
             self.say("state", names, name)
         elif len(names) > 1 and (meant or key.words & {"action", "actions"}):
             if meant and meant != names and self.value("actions") is None:
-                what = f"{self.path}: '{name}' is {quote_all(names)}: are they steering and throttle?"
-                raise CheckpointError(what, remedy=f"if they are, say {USER} actions={','.join(meant)}")
+                problem = f"{self.path}: '{name}' is {quote_all(names)}: are they steering and throttle?"
+                raise CheckpointError(problem, remedy=f"if they are, pass {USER} actions={','.join(meant)}")
             self.say("actions", meant or names, name)
         elif (key.has("rate") or "rate" in key.last <= {*WORDS["of_rate"]}) and is_number(value, 1, 1000):
             self.say("rate", float(value), name)
@@ -126,7 +131,7 @@ class Facts:
         elif self.value("size") and key.words & {*WORDS["image"]} and key.has("size"):
             height, width = self.value("size")
             if not {*map(int, re.findall("[0-9]+", str(value)))} <= {1, 3, height, width}:
-                raise self.refusal(name, value, f"and its pictures are {width}x{height}: say {USER} size=WxH")
+                raise self.refusal(name, value, f"and its pictures are {width}x{height}: pass {USER} size=WxH")
         else:
             return False
         return True
@@ -141,7 +146,7 @@ class _Key:
         self.several = isinstance(value, (list, tuple)) and len(value) > 1
         self.is_label = self.has("labels") and not self.several  # the name of a run may have any words
         self.of_network = count_floats(value) >= NETWORK
-        done = any(self.last >= {*these} for these in WORDS["done"])
+        done = any(self.last >= {*words} for words in WORDS["done"])
         self.done = done or (self.has("image") and "normali" in name)  # always, here
 
     def has(self, kind: str) -> bool:
@@ -162,7 +167,7 @@ class _Key:
     def changes(self) -> str:
         """Say what it may change by the words of its name, or "" if they say nothing of the kind."""
         words = words_of(self.name) if self.is_label else self.words
-        meaning = next((meaning for meaning, these in WORDS["changes"].items() if words & {*these}), "")
+        meaning = next((meaning for meaning, verbs in WORDS["changes"].items() if words & {*verbs}), "")
         one_for_each = self.several and len(self.value) == 2
         of_numbers = self.value is True or one_for_each or words & {*WORDS["numbers"]}
         plain = meaning and (of_numbers or not {"units", "actions"} & words_of(meaning))
@@ -176,8 +181,8 @@ class _Key:
             isinstance(self.value, Mapping) and any(isinstance(v, Tensor) for v in self.value.values())
         ):
             return "which may be the weights that should drive"
-        about = self.has("image") or self.has("numbers") or (self.several and self.last & {"camera", "cameras"})
-        if about and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
+        relevant = self.has("image") or self.has("numbers") or (self.several and self.last & {"camera", "cameras"})
+        if relevant and not self.is_label and self.value not in (2, 3, chunk):  # counts that it has
             return "and nobody here knows what that does to its numbers or pictures"
         return ""
 

@@ -20,15 +20,28 @@ from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.workshop.act import ActConfig, Affine
 from rover_lib.workshop.act_config import LEROBOTS, lerobot_act
-from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
+from rover_lib.workshop.checkpoint.files import (
+    CORRECT_IT,
+    JSON_BYTES,
+    MOST,
+    RATE_HZ,
+    Contents,
+    as_checkpoint_error,
+    check_beside,
+    name_numbers,
+)
+from rover_lib.workshop.checkpoint.weights import Weights, check_weights_are_whole, name_weights
 from rover_lib.workshop.recordings.names import CAMERA, camera_names
+from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote, quote_all, read_json
 
 if TYPE_CHECKING:
     from lerobot.policies.act.configuration_act import ACTConfig
 
-PRETRAINED, CONFIG, ADAPTER = "pretrained_model", "config.json", "adapter_config.json"
+PRETRAINED = "pretrained_model"
+CONFIG = "config.json"
+ADAPTER = "adapter_config.json"
 WEIGHTS, TRAINED = "model.safetensors", "train_config.json"
 SIZE_OF_BASE = f"{CONFIG}:input_features"  # if it was fine-tuned
 IN_WEIGHTS = r"^(un)?normalize_(inputs|outputs|targets)\.buffer_{key}\.\w+$"
@@ -54,39 +67,43 @@ def lerobot_folder(path: Path) -> Path:
         if (path / inner / "config.json").exists():
             return path / inner
     places = (f"*/{PRETRAINED}", f"checkpoints/*/{PRETRAINED}", "snapshots/*", "*.pth")
-    found = sorted(p.relative_to(path).as_posix() for place in places for p in path.glob(place))
-    what = f"{path}: no config.json, nor a link to the last checkpoint"
+    actual = sorted(p.relative_to(path).as_posix() for place in places for p in path.glob(place))
+    problem = f"{path}: no config.json, nor a link to the last checkpoint"
     remedy = "give best_model.pth, or one pretrained_model folder with config.json; merge an adapter before"
-    raise CheckpointError(what, found=quote_all(found) or "none", remedy=remedy)
+    raise CheckpointError(problem, found=quote_all(actual) or "none", remedy=remedy)
 
 
-def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
+def read_lerobot(folder: Path, facts: Facts) -> Contents:
     """facts: what its files say is added. Raises CheckpointError for missing, damaged or other policies' files."""
     if (folder / ADAPTER).exists():
-        what = f"{folder}: {ADAPTER} is beside the weights, so that an adapter changes what they compute"
-        raise CheckpointError(what, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
+        problem = f"{folder}: {ADAPTER} is beside the weights, so that an adapter changes what they compute"
+        raise CheckpointError(problem, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
-    said = _act_config(folder, raw, facts)
+    settings = _act_config(folder, raw, facts)
     tensors, inside = (
-        files.name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored),
+        name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored),
         dict[str, Tensor](),
     )
     # Statistics of before LeRobot had processors.
-    for key in () if (folder / OUTER[0]).exists() else (*said.input_features, *said.output_features):
+    for key in () if (folder / OUTER[0]).exists() else (*settings.input_features, *settings.output_features):
         for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
             inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
-    weights = files.check_weights_are_whole(folder, tensors)
-    inner, outer = Normaliser(folder, *INNER, said, inside), Normaliser(folder, *OUTER, said, inside)
+    weights = check_weights_are_whole(folder, tensors)
+    inner, outer = Normaliser(folder, *INNER, settings, inside), Normaliser(folder, *OUTER, settings, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
-    images, numbers, actions = said.image_features, said.robot_state_feature, said.action_feature
-    with files.as_checkpoint_error(folder):
+    images = settings.image_features
+    numbers = settings.robot_state_feature
+    actions = settings.action_feature
+    with as_checkpoint_error(folder):
         sizes = _trained_sizes(folder, raw, tuple((f.shape[1], f.shape[2]) for f in images.values()), facts)
         by = ORIGIN if origin else GUESS
         if origin:
-            facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
+            facts.say("rate", float(origin.get("rate_hz", RATE_HZ)), ORIGIN)
         in_both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
         steps = {INNER[0]: inner, OUTER[0]: outer} if in_both else {}
-        norms = {file: each.affine("action", "ACTION", actions.shape, inverse=True) for file, each in steps.items()}
+        norms = {
+            file: steps_of.affine("action", "ACTION", actions.shape, inverse=True) for file, steps_of in steps.items()
+        }
         facts.compare("normalisation of actions", {file: norm and astuple(norm) for file, norm in norms.items()})
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
@@ -94,49 +111,50 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         config = ActConfig(
             cameras=tuple(camera_names(images)),
             image_sizes=sizes,
-            state_names=files.name_numbers(numbers.shape[0] if numbers else 2, "state"),
-            action_names=facts.default("actions", files.name_numbers(actions.shape[0], "action"), by),
-            chunk=facts.default("chunk", said.chunk_size, CONFIG),
-            vae_layers=said.n_vae_encoder_layers if said.use_vae else 0,
-            backbone=facts.default("backbone", said.vision_backbone, CONFIG),
-            dilation=bool(said.replace_final_stride_with_dilation),
-            rate_hz=facts.default("rate", files.RATE_HZ, by),
+            state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
+            action_names=facts.default("actions", name_numbers(actions.shape[0], "action"), by),
+            chunk=facts.default("chunk", settings.chunk_size, CONFIG),
+            vae_layers=settings.n_vae_encoder_layers if settings.use_vae else 0,
+            backbone=facts.default("backbone", settings.vision_backbone, CONFIG),
+            dilation=bool(settings.replace_final_stride_with_dilation),
+            rate_hz=facts.default("rate", RATE_HZ, by),
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
             action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
-            **{ours: getattr(said, theirs) for ours, theirs in LEROBOTS.items()},
+            **{ours: getattr(settings, theirs) for ours, theirs in LEROBOTS.items()},
         )
         if config.state_norm is not None:
             config, weights = _without_constants(config, weights, inner, facts)
         _compare_statistics(config, inner, outer, facts)
-    files.check_beside(folder, facts)
+    check_beside(folder, facts)
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
-    return config, weights, report | {"license": said.license, "base_model": said.repo_id}  # on the Hub
+    return config, weights, report | {"license": settings.license, "base_model": settings.repo_id}  # on the Hub
 
 
 def _without_constants(
-    config: ActConfig, weights: files.Weights, inner: "Normaliser", facts: Facts
-) -> tuple[ActConfig, files.Weights]:
+    config: ActConfig, weights: Weights, inner: "Normaliser", facts: Facts
+) -> tuple[ActConfig, Weights]:
     """Return a policy to which numbers of the state that never varied in its training are what they were then.
 
     Its network learned nothing from them, and their scale of 1e8 would make anything of a car's last action.
     """
-    norm, constants = config.state_norm, inner.constants("observation.state", config.state_norm)
+    norm = config.state_norm
+    constants = inner.constants("observation.state", config.state_norm)
     if norm is None or not constants:
         return config, weights
-    weights, chosen = dict(weights), list(constants)
+    weights, dropped = dict(weights), list(constants)
     for stem in ("encoder_robot_state_input_proj", "vae_encoder_robot_state_input_proj"):
         if f"{stem}.weight" in weights:
             columns = weights[f"{stem}.weight"].clone()
-            weights[f"{stem}.bias"] = weights[f"{stem}.bias"] + columns[:, chosen].sum(1) * constants[chosen[0]]
-            columns[:, chosen] = 0
+            weights[f"{stem}.bias"] = weights[f"{stem}.bias"] + columns[:, dropped].sum(1) * constants[dropped[0]]
+            columns[:, dropped] = 0
             weights[f"{stem}.weight"] = columns
-    scale = tuple(1.0 if i in constants else each for i, each in enumerate(norm.scale))
-    shift = tuple(0.0 if i in constants else each for i, each in enumerate(norm.shift))
-    which = quote_all(config.state_names[i] for i in chosen)
+    scale = tuple(1.0 if i in constants else factor for i, factor in enumerate(norm.scale))
+    shift = tuple(0.0 if i in constants else factor for i, factor in enumerate(norm.shift))
+    names = quote_all(config.state_names[i] for i in dropped)
     facts.notes.append(
-        f"its state ({which}) never varied in its training, so that it learned nothing from it: whatever a car gives, "
+        f"its state ({names}) never varied in its training, so that it learned nothing from it: whatever a car gives, "
         "the network is given what it was then; to use it, train on a state that is the last action"
     )
     return replace(config, state_norm=Affine(scale, shift)), weights
@@ -145,14 +163,14 @@ def _without_constants(
 def _compare_statistics(config: ActConfig, inner: "Normaliser", outer: "Normaliser", facts: Facts) -> None:
     """Note a state of two numbers whose statistics are not those of the actions: a car's state is its last action."""
     state, action = inner.statistics("observation.state"), outer.statistics("action")
-    if config.action_names != files.ACTION_NAMES or not (len(state) == len(action) == 2):
+    if config.action_names != ACTION_NAMES or not (len(state) == len(action) == 2):
         return
     for name, (mean, std), (own_mean, own_std) in zip(config.state_names, state, action, strict=True):
         alike = abs(mean - own_mean) <= APART * own_std and own_std <= APART * std and std <= APART * own_std
         if min(std, own_std) > VARIES and not alike:
-            what = f"mean {mean:.3g}, deviation {std:.3g}, and its action's {own_mean:.3g}, {own_std:.3g}"
+            problem = f"mean {mean:.3g}, deviation {std:.3g}, and its action's {own_mean:.3g}, {own_std:.3g}"
             facts.notes.append(
-                f"the state that it learned from was not its last action, which a car gives: {name} {what}"
+                f"the state that it learned from was not its last action, which a car gives: {name} {problem}"
             )
             return
 
@@ -161,10 +179,12 @@ def _of_today(folder: Path, raw: dict[str, Any]) -> dict[str, Any]:
     """Return a config.json of 2024, which had shapes and modes by feature and no type, as LeRobot writes it now."""
     if "type" in raw or not {"input_shapes", "output_shapes"} <= raw.keys():
         return raw
-    raw, mapping = raw | {"type": "act"}, dict[str, str]()
-    with files.as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
+    raw = raw | {"type": "act"}
+    mapping = dict[str, str]()
+    with as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
         for part in ("input", "output"):
-            shapes, modes = raw.pop(f"{part}_shapes"), raw.pop(f"{part}_normalization_modes", {})
+            shapes = raw.pop(f"{part}_shapes")
+            modes = raw.pop(f"{part}_normalization_modes", {})
             kinds = {k: "ACTION" if k == "action" else "VISUAL" if "image" in k else "STATE" for k in shapes}
             raw[f"{part}_features"] = {k: {"type": kinds[k], "shape": shape} for k, shape in shapes.items()}
             for key, kind in kinds.items():
@@ -180,20 +200,21 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     Raises CheckpointError where the two deny each other, and for what was done to pictures and is not done here.
     """
     path = folder / TRAINED
-    said = _read_json(path) if path.exists() else {}
-    policy, dataset = said.get("policy") or {}, dict(said.get("dataset") or {})
+    content = _read_json(path) if path.exists() else {}
+    policy = content.get("policy") or {}
+    dataset = dict(content.get("dataset") or {})
     for key in SAME & raw.keys() & policy.keys():
         facts.compare(key, {f"{CONFIG}:{key}": raw[key], f"{TRAINED}:policy.{key}": policy[key]})
     transforms = dataset.pop("image_transforms", None) or {}
-    rest = {k: v for k, v in said.items() if k not in NOT_OF_POLICY} | {"dataset": dataset}
+    rest = {k: v for k, v in content.items() if k not in NOT_OF_POLICY} | {"dataset": dataset}
     facts.read(rest | {"policy": {k: v for k, v in policy.items() if k not in raw}}, f"{TRAINED}:", noted=False)
     steps = [t for t in (transforms.get("tfs") or {}).values() if t.get("weight", 1) > 0]
     for step in (t for t in steps if t["type"] not in WORDS["random"] and transforms.get("enable")):
         to = step["kwargs"].get("size")
-        whole = all(is_whole(n, 1, files.MOST) for n in (to if isinstance(to, list) else [to]))
+        whole = all(is_whole(n, 1, MOST) for n in (to if isinstance(to, list) else [to]))
         if step["type"] != "Resize" or not whole or len(steps) > transforms.get("max_num_transforms", 3):
-            what = f"{path}: some or all of its pictures were changed by {quote(step['type'])}"
-            raise CheckpointError(what, remedy=f"train without it, or if it is another training's, remove {TRAINED}")
+            problem = f"{path}: some or all of its pictures were changed by {quote(step['type'])}"
+            raise CheckpointError(problem, remedy=f"train without it, or if it is another training's, remove {TRAINED}")
         from torchvision.transforms.v2 import Resize  # here, because it takes a second
 
         sizes = tuple((h, w) for _, h, w in (Resize(to)(torch.empty(1, *size)).shape for size in sizes))
@@ -205,31 +226,31 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
     """Return the config as LeRobot reads it; a note says what it asks for beyond the network."""
     path = folder / CONFIG
     if raw.get("type") != "act":
-        what = f"{path}: policy type is {quote(raw.get('type'))}"
-        raise CheckpointError(what, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
-    with files.as_checkpoint_error(path, files.CORRECT_IT):
+        problem = f"{path}: policy type is {quote(raw.get('type'))}"
+        raise CheckpointError(problem, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
+    with as_checkpoint_error(path, CORRECT_IT):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
 
-        known = {field.name for field in fields(ACTConfig)}
+        options = {field.name for field in fields(ACTConfig)}
         # LeRobot 0.4 refuses what 0.6 added, and whether the training had CUDA is nothing to us.
-        said = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in known} | {"device": "cpu"})
-        cameras = [tuple(camera.shape) for camera in said.image_features.values()]
-        rows = [tuple(row.shape) for row in (said.robot_state_feature, said.action_feature) if row]
-        whole = all(is_whole(n, 1, files.MOST) for shape in (*cameras, *rows) for n in shape)
+        decoded = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in options} | {"device": "cpu"})
+        cameras = [tuple(camera.shape) for camera in decoded.image_features.values()]
+        rows = [tuple(row.shape) for row in (decoded.robot_state_feature, decoded.action_feature) if row]
+        whole = all(is_whole(n, 1, MOST) for shape in (*cameras, *rows) for n in shape)
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
-    if not (cameras and said.action_feature and whole and right) or said.env_state_feature:
-        features = {**said.input_features, **said.output_features}
-        found = quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items())
+    if not (cameras and decoded.action_feature and whole and right) or decoded.env_state_feature:
+        features = {**decoded.input_features, **decoded.output_features}
+        actual = quote_all(f"{name} {feature.type.value} {feature.shape}" for name, feature in features.items())
         remedy = "train with cameras (3, height, width), numbers in 'action', and in 'observation.state' or none"
-        raise CheckpointError(f"{folder}: its features are not a car's", found=found, remedy=remedy)
-    if said.temporal_ensemble_coeff is not None:
-        coefficient = f"temporal_ensemble_coeff is {said.temporal_ensemble_coeff}"
+        raise CheckpointError(f"{folder}: its features are not a car's", found=actual, remedy=remedy)
+    if decoded.temporal_ensemble_coeff is not None:
+        coefficient = f"temporal_ensemble_coeff is {decoded.temporal_ensemble_coeff}"
         facts.notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
     facts.default("size", cameras[0][1:], SIZE_OF_BASE)
-    with files.as_checkpoint_error(path):
-        facts.read({k: v for k, v in raw.items() if k not in {*known, "type", "pretrained_revision"}}, "")
-    return said
+    with as_checkpoint_error(path):
+        facts.read({k: v for k, v in raw.items() if k not in {*options, "type", "pretrained_revision"}}, "")
+    return decoded
 
 
 class Normaliser:
@@ -250,10 +271,12 @@ class Normaliser:
             self.step = NormalizerProcessorStep(features, said.normalization_mapping)
             self.step.load_state_dict(inside)
             return
-        content, read = _read_json(self.where), []
-        with files.as_checkpoint_error(self.where):
+        content = _read_json(self.where)
+        read = []
+        with as_checkpoint_error(self.where):
             for step in content["steps"]:
-                name, config = step.get("registry_name") or step["class"], step.get("config") or {}
+                name = step.get("registry_name") or step["class"]
+                config = step.get("config") or {}
                 if config.get("enabled") is False:
                     continue  # as LeRobot writes steps that others of its policies use
                 if name == normalises:
@@ -261,11 +284,11 @@ class Normaliser:
                     if file := step.get("state_file"):
                         read[-1].load_state_dict(_read_safetensors(folder / Path(file).name))
                 elif name not in HARMLESS or config.get("rename_map"):
-                    what = f"{self.where}: has a processor step that is not known here: {quote(name)}"
-                    raise CheckpointError(what, remedy="train without it, or do in the recordings what it does")
+                    problem = f"{self.where}: has a processor step that is not known here: {quote(name)}"
+                    raise CheckpointError(problem, remedy="train without it, or do in the recordings what it does")
         if len(read) != 1 or read[0].normalize_observation_keys is not None:
-            what = f"{self.where}: normalises {len(read)} times, or some of the observations only"
-            raise CheckpointError(what, remedy="copy the folder again, or train with LeRobot's own single step")
+            problem = f"{self.where}: normalises {len(read)} times, or some of the observations only"
+            raise CheckpointError(problem, remedy="copy the folder again, or train with LeRobot's own single step")
         self.step = read[0]
 
     def statistics(self, key: str) -> list[tuple[float, float]]:
@@ -281,13 +304,15 @@ class Normaliser:
         """
         if norm is None:
             return {}
-        found = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
+        indices = [
+            i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1
+        ]
         mode = self.step.norm_map[self.step.features[key].type].value
-        varied = [i for i in found if (each := self.statistics(key)) and each[i][1] > VARIES]
+        varied = [i for i in indices if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]
         if varied and mode.startswith("QUANTILE"):
-            what = f"{self.where}: most values of '{key}' were equal, so that {mode} is no range for the others"
-            raise CheckpointError(what, found=f"scale {norm.scale[varied[0]]:.3g}", remedy="train with MEAN_STD")
-        return dict.fromkeys(found, 0.0 if mode == "MEAN_STD" else -1.0)
+            problem = f"{self.where}: most values of '{key}' were equal: {mode} gives no range for the others"
+            raise CheckpointError(problem, found=f"scale {norm.scale[varied[0]]:.3g}", remedy="train with MEAN_STD")
+        return dict.fromkeys(indices, 0.0 if mode == "MEAN_STD" else -1.0)
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.
@@ -295,7 +320,8 @@ class Normaliser:
         key, kind, shape: the feature's. inverse: undo the normalisation, as for an output. Raises CheckpointError for
         missing or wrong statistics.
         """
-        step, own = self.step, self.step.features.get(key)
+        step = self.step
+        own = self.step.features.get(key)
         if own and not inverse:
             kind = own.type.value  # by which LeRobot chooses the mode, whatever the config says
         mode = {k.value: m.value for k, m in step.norm_map.items()}.get(kind)
@@ -303,36 +329,37 @@ class Normaliser:
             return None
         stats = [name for name in step.state_dict() if name.startswith(f"{key}.")]
         if mode is None or not stats or not (inverse or (own and kind != "ACTION")):
-            found = f"mode {quote(mode)}, statistics {quote_all(stats) or 'none'}"
+            actual = f"mode {quote(mode)}, statistics {quote_all(stats) or 'none'}"
             remedy = "copy all policy_preprocessor* and policy_postprocessor* files, or say IDENTITY for raw values"
-            raise CheckpointError(f"{self.where}: '{key}' would not be normalised", found=found, remedy=remedy)
+            raise CheckpointError(f"{self.where}: '{key}' would not be normalised", found=actual, remedy=remedy)
         x = torch.stack([torch.zeros(shape), torch.ones(shape)]).double()
         y = step._normalize_action(x, True) if inverse else step._normalize_observation({key: x}, False)[key]
-        shift, scale = y[0].flatten(), (y[1] - y[0]).flatten()
+        shift = y[0].flatten()
+        scale = (y[1] - y[0]).flatten()
         finite = torch.isfinite(scale.float()).all() and torch.isfinite(shift.float()).all()  # used as float32
         if y.shape != x.shape or not finite or (scale < 0).any() or not (inverse or scale.all()):
-            what = f"{self.where}: statistics of '{key}' have another shape, are not finite, or would turn it around"
-            raise CheckpointError(what, found=f"scales {scale.tolist()[:3]}", remedy="compute them again")
+            problem = f"{self.where}: statistics of '{key}' have another shape, are not finite, or would turn it around"
+            raise CheckpointError(problem, found=f"scales {scale.tolist()[:3]}", remedy="compute them again")
         if not inverse:
             # LeRobot subtracts first, so a feature that never changes becomes -1, or 0. With scale and shift that is
             # only so while the last digit of x * scale in float32 is far below 1; a larger scale was off by up to 16.
             end = 0.0 if mode == "MEAN_STD" else -1.0
             usual = (end - shift) / scale
-            most = torch.exp2((21 - usual.abs().log2()).floor())
-            scale, shift = scale.minimum(most), torch.where(scale > most, end - usual * most, shift)
+            largest = torch.exp2((21 - usual.abs().log2()).floor())
+            scale, shift = scale.minimum(largest), torch.where(scale > largest, end - usual * largest, shift)
         return Affine(tuple(scale.tolist()), tuple(shift.tolist()))
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    with files.as_checkpoint_error(path):
-        return dict(read_json(path, files.JSON_BYTES))
+    with as_checkpoint_error(path):
+        return dict(read_json(path, JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
-        what = f"{printable(str(path))}: not found, or not a file"
-        raise CheckpointError(what, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
-    with files.as_checkpoint_error(path):
+        problem = f"{printable(str(path))}: not found, or not a file"
+        raise CheckpointError(problem, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
+    with as_checkpoint_error(path):
         return load_file(path)
 
 

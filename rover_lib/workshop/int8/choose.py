@@ -43,7 +43,11 @@ USUAL_PCT = (99, 95, 90, 75, 50)  # tried by the observer `frames`, if there are
 ALL_WIDER = (0.9, 0.8, 0.7, 0.5, 0.3)
 # Then the ranges of the tensors whose odd frames reach furthest are widened by WIDER of the way at a time, if the error
 # is at most WIDENING_PAYS times what it was, and that of usual frames WIDENING_COSTS times what it was without any.
-WIDENED, WIDER, WIDENING_PAYS, WIDENING_COSTS, WIDENING_ROUNDS = 8, 0.2, 0.99, 1.1, 3
+WIDENED = 8
+WIDER = 0.2
+WIDENING_PAYS = 0.99
+WIDENING_COSTS = 1.1
+WIDENING_ROUNDS = 3
 
 
 def mae_pct(errors: Tensor, weights: Tensor, action_range: Mapping[str, Range]) -> Errors:
@@ -76,7 +80,9 @@ class Chooser:
         if len(constant_actions(action_range)) == len(action_range):
             raise ArtifactError("no action changes in these recordings", remedy="record episodes with steering")
         forget_graphs()  # for the first time, as nothing is converted yet
-        self.checkpoint, self.calibration, self.action_range = checkpoint, calibration, action_range
+        self.checkpoint = checkpoint
+        self.calibration = calibration
+        self.action_range = action_range
         self.warnings = not_judged(action_range)
         self.inputs = [inputs_of(s, checkpoint.config) for s in (*samples, *odd)]
         self.reference = predictions(ACT(checkpoint.config, checkpoint.weights), self.inputs)
@@ -106,7 +112,8 @@ class Chooser:
 
     def error_by_kind(self, module: nn.Module) -> dict[str, Errors]:
         """The same on usual and on odd frames, of the kinds that there are."""
-        errors, kinds = self.errors(module), {"usual": ~self.is_odd, "odd": self.is_odd}
+        errors = self.errors(module)
+        kinds = {"usual": ~self.is_odd, "odd": self.is_odd}
         there = {name: kind for name, kind in kinds.items() if kind.any()}
         return {name: mae_pct(errors[kind], kind[kind].float(), self.action_range) for name, kind in there.items()}
 
@@ -127,8 +134,8 @@ class Chooser:
         best = best_of(tried, table)
         if tried[best].observer != "frames":
             return tried[best], table
-        chosen, table[f"{best}, widened"] = self._widen(tried[best], judge, progress)
-        return chosen, table
+        best_scheme, table[f"{best}, widened"] = self._widen(tried[best], judge, progress)
+        return best_scheme, table
 
     def _candidates(self, scheme: Scheme, observers: Sequence[str]) -> dict[str, Scheme]:
         tried = {name: replace(scheme, observer=name) for name in observers if name != "frames"}
@@ -143,32 +150,42 @@ class Chooser:
 
     def _widen(self, scheme: Scheme, errors: Callable[[Scheme], Tensor], progress: Progress) -> tuple[Scheme, Errors]:
         """Let the tensors whose odd frames reach furthest reach further, one step at a time, while all frames gain."""
-        frames, kept = self.calibration.frames, usual(self.calibration.frames, scheme.usual_pct)
-        further = {place: seen.abs().max() / seen[kept].abs().max().clamp(min=1e-6) for place, seen in frames.items()}
+        frames = self.calibration.frames
+        usual_frames = usual(self.calibration.frames, scheme.usual_pct)
+        further = {
+            place: extremes.abs().max() / extremes[usual_frames].abs().max().clamp(min=1e-6)
+            for place, extremes in frames.items()
+        }
         places = sorted(further, key=lambda place: -further[place])[:WIDENED]
 
         def judge(scheme: Scheme) -> tuple[Errors, float]:
-            found = errors(scheme)
-            of_usual = mae_pct(found, self.weights * ~self.is_odd, self.action_range)
-            return mae_pct(found, self.weights, self.action_range), _worst(of_usual)
+            errors_found = errors(scheme)
+            of_usual = mae_pct(errors_found, self.weights * ~self.is_odd, self.action_range)
+            return mae_pct(errors_found, self.weights, self.action_range), _worst(of_usual)
 
         error, usually = judge(scheme)
-        best, wider, touched = scheme, dict(scheme.wider), set[str]()
+        best = scheme
+        wider = dict(scheme.wider)
+        touched = set[str]()
         for step in progress(range(WIDENING_ROUNDS), desc="widening"):
             for place in (p for p in places if not step or p in touched):
                 more = wider | {place: min(wider.get(place, 0.0) + WIDER, 1.0)}
                 trial = replace(scheme, wider=tuple(more.items()))
-                found, of_usual = judge(trial)
-                if _worst(found) <= WIDENING_PAYS * _worst(error) and of_usual <= WIDENING_COSTS * usually:
-                    best, wider, error = trial, more, found
+                actual, of_usual = judge(trial)
+                if _worst(actual) <= WIDENING_PAYS * _worst(error) and of_usual <= WIDENING_COSTS * usually:
+                    best = trial
+                    wider = more
+                    error = actual
                     touched.add(place)
         return best, error
 
     def sensitivity(self, scheme: Scheme, progress: Progress = silent) -> dict[str, Errors]:
         """Each block quantized alone, everything else in float: {block: errors}."""
-        graph, config = self._observed(scheme), self.checkpoint.config
+        graph = self._observed(scheme)
+        config = self.checkpoint.config
         plain = replace(scheme, float_blocks=())
-        some, table = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES)), {}
+        some = list(pick_evenly(range(len(self.inputs)), SENSITIVITY_FRAMES))
+        table = {}
         for block in progress(blocks(config), desc="blocks"):
             errors = self.errors(convert(graph, config, plain, only=[block]), some)
             table[block] = mae_pct(errors, self.weights[some], self.action_range)
@@ -191,7 +208,8 @@ class Chooser:
         scheme and its steps {float_blocks, cost_pct, <action>_mae_pct}, static first, the best last. Raises
         ArtifactError for an unknown block.
         """
-        graph, costs = self._observed(scheme), float_costs_pct(self.checkpoint)
+        graph = self._observed(scheme)
+        costs = float_costs_pct(self.checkpoint)
         best = replace(scheme, mode="mixed", float_blocks=())
 
         def step(*in_float: str) -> dict[str, Any]:
@@ -211,7 +229,8 @@ class Chooser:
             trial = step(*last["float_blocks"], block)
             if _worst(trial) < _worst(last):
                 steps.append(trial)
-        before, after = _worst(steps[0]), _worst(steps[-1])
+        before = _worst(steps[0])
+        after = _worst(steps[-1])
         if blocks is None and len(steps) > 1 and after > MIXED_PAYS * before:
             in_float = ", ".join(steps[-1]["float_blocks"])
             self.warnings.append(f"mixed gains nothing by {in_float} in float: {before:.3f} to {after:.3f} %")
@@ -222,8 +241,8 @@ class Chooser:
 def best_of(tried: Mapping[str, Scheme], table: Mapping[str, Errors]) -> str:
     """The name whose worse action has the least error, unless it clips more than another and does not win clearly."""
     best = min(table, key=lambda name: _worst(table[name]))
-    for name, how in tried.items():  # of these, what clips less comes first
-        rival = how.observer in ("minmax", "frames") and not how.wider
+    for name, result in tried.items():  # of these, what clips less comes first
+        rival = result.observer in ("minmax", "frames") and not result.wider
         if rival and _worst(table[best]) > CLIPPING_PAYS * _worst(table[name]):
             return name
     return best

@@ -61,7 +61,8 @@ class TorchScript:
 
 def _reread(frozen: torch.jit.ScriptModule) -> torch.jit.ScriptModule:
     """Return a frozen module as a file gives it, and empty the one that was given, whose graph torch never frees."""
-    file, graph = BytesIO(), frozen.graph
+    file = BytesIO()
+    graph = frozen.graph
     torch.jit.save(frozen, file)
     file.seek(0)
     for _ in list(graph.outputs()):
@@ -159,61 +160,64 @@ class Exporter:
         config = self.checkpoint.config
         module: nn.Module = policy.module if isinstance(policy, QuantizedPolicy) else policy
         tells = drives is not None and not drives.warnings
-        given = with_embedding(module) if tells else module
-        form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(given, config)
+        source = with_embedding(module) if tells else module
+        form: Form = (Onnx if str(path).endswith(ONNX_SUFFIX) else TorchScript)(source, config)
         with torch.inference_mode():  # the eager policy is slow, so it answers only the stored samples
-            eager = [_each(given(*self.inputs[i])) for i in self.stored]
-        expected, outputs = torch.cat([each[0] for each in eager]), [form.run(x) for x in self.inputs]
-        actions = torch.cat([each[0] for each in outputs])
+            eager = [_each(source(*self.inputs[i])) for i in self.stored]
+        expected = torch.cat([pair[0] for pair in eager])
+        outputs = [form.run(x) for x in self.inputs]
+        actions = torch.cat([pair[0] for pair in outputs])
         if not torch.isfinite(actions).all():
             raise ArtifactError(f"{path}: the policy gives NaN or Inf on recorded frames; nothing was written")
         # The limit follows from the policy's own error. Taken from the form, it would grow with the form's mistakes.
         limits = self._tolerance(policy, expected, self.stored)
         gaps = (actions[self.stored] - expected).abs().amax((0, 1)).tolist()
-        for (name, most), gap in zip(limits.items(), gaps, strict=True):
-            if not gap <= most:  # written so that NaN fails
+        for (name, limit), gap in zip(limits.items(), gaps, strict=True):
+            if not gap <= limit:  # written so that NaN fails
                 raise ArtifactError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
         manifest = self._manifest(policy, calibration, form)
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
         tolerance = {
-            name: min(most, artifact.largest_tolerance(manifest["mode"], name))
-            for name, most in self._tolerance(policy, actions, np.arange(len(actions))).items()
+            name: min(limit, artifact.largest_tolerance(manifest["mode"], name))
+            for name, limit in self._tolerance(policy, actions, np.arange(len(actions))).items()
         }
         manifest["parity"] = {"tolerance": tolerance, "reason": REASONS[isinstance(policy, QuantizedPolicy)]}
         states, *frames = zip(*(self.inputs[i] for i in self.stored), strict=True)
         vectors = {"state": np.concatenate(states), "chunk": actions[self.stored].numpy()}
-        vectors |= {f"frame_{name}": np.stack(seen) for name, seen in zip(config.cameras, frames, strict=True)}
+        vectors |= {f"frame_{name}": np.stack(images) for name, images in zip(config.cameras, frames, strict=True)}
         described: dict[str, Any] = {}
         if drives is not None and tells:
             familiar, described = fit(drives, self._embeddings(module, type(form), drives.samples).__getitem__)
             sizes = dict(zip(("directions", "size"), familiar.directions.shape, strict=True))
             manifest["familiar"] = sizes | {"drives": described["drives"]}
             vectors |= familiar.arrays() | {"embedding": np.concatenate([outputs[i][1] for i in self.stored])}
-            wanted = np.concatenate([each[1] for each in eager])
-            gap = np.abs(familiar.strange(vectors["embedding"]) - familiar.strange(wanted)).max()
+            expected_embeddings = np.concatenate([pair[1] for pair in eager])
+            gap = np.abs(familiar.strange(vectors["embedding"]) - familiar.strange(expected_embeddings)).max()
             if not gap <= TOLERANCE[True]:
-                what = f"{path}: how familiar a picture is differs by {gap:.3g} in the written graph"
-                raise ArtifactError(f"{what}; nothing was written")
+                problem = f"{path}: how familiar a picture is differs by {gap:.3g} in the written graph"
+                raise ArtifactError(f"{problem}; nothing was written")
         return form.save(path, manifest, vectors), described
 
     def _embeddings(self, module: nn.Module, form: type[Form], samples: Sequence[Sample]) -> dict[Sample, np.ndarray]:
         """Return each sample's embedding, (D,) float32. A float policy's are computed in batches: rounding differs."""
-        encoder, found = with_embedding(module, alone=True), list[Tensor]()
+        encoder = with_embedding(module, alone=True)
+        embeddings = list[Tensor]()
         if isinstance(module, ACT):
             together = torch.func.vmap(encoder)
             with torch.inference_mode(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # attention has no rule for batches
                 for i in range(0, len(samples), BATCH):
                     inputs = zip(*map(self.prepared, samples[i : i + BATCH]), strict=True)
-                    found += together(*map(torch.stack, inputs))[:, 0]
+                    embeddings += together(*map(torch.stack, inputs))[:, 0]
         else:
             run = form(encoder, self.checkpoint.config).run
-            found = [run(self.prepared(sample))[0][0] for sample in samples]
-        return dict(zip(samples, torch.stack(found).numpy(), strict=True))
+            embeddings = [run(self.prepared(sample))[0][0] for sample in samples]
+        return dict(zip(samples, torch.stack(embeddings).numpy(), strict=True))
 
     def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
         """Return the manifest without its parity."""
-        config, scheme = self.checkpoint.config, getattr(policy, "scheme", None)
+        config = self.checkpoint.config
+        scheme = getattr(policy, "scheme", None)
         mode = scheme.mode if scheme else "fp32"
         static = scheme if mode in ("static", "mixed") else None
         calibrated = calibration and {
@@ -259,10 +263,10 @@ class Exporter:
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:
     """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy."""
-    seen: Any = sample.frame_bgr()
+    frame: Any = sample.frame_bgr()
     shapes = {}
     for name, (h, w) in zip(config.cameras, config.image_sizes, strict=True):
-        height, width = (seen[name] if isinstance(seen, Mapping) else seen).shape[:2]
+        height, width = (frame[name] if isinstance(frame, Mapping) else frame).shape[:2]
         shapes[name] = {"recorded": [height, width]} if is_squeezed((width, height), (w, h)) else {}
     return shapes
 

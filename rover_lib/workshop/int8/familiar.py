@@ -47,17 +47,19 @@ class Drives:
     @classmethod
     def of(cls, parts: Split) -> "Drives":
         """Take some frames of the calibration part, and every EVERY_S a frame of the others' whole drives."""
-        names, drives, each = {block_of(s) for s in parts.calibration}, dict[str, list[Sample]](), "drives"
+        names = {block_of(s) for s in parts.calibration}
+        drives = dict[str, list[Sample]]()
+        unit = "drives"
         for sample in (*parts.choosing, *parts.held_out):
             if block_of(sample) not in names:  # else a part of a drive, where few were parted along time
                 drives.setdefault(block_of(sample), []).append(sample)
         if any(of[0].block for of in drives.values()):
             drives = _stretches(drives)
             lengths_s = [len(of) / _rate_hz(of) for of in drives.values()]
-            each = f"stretches of {np.median(lengths_s):.2g} s, of the same track and hour,"
-        chosen = {name: drives[name] for name in pick_evenly(list(drives), MOST_DRIVES)}
-        unseen = {name: tuple(of[:: max(1, round(_rate_hz(of) * EVERY_S))]) for name, of in chosen.items()}
-        return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen, each)
+            unit = f"stretches of {np.median(lengths_s):.2g} s, of the same track and hour,"
+        sampled = {name: drives[name] for name in pick_evenly(list(drives), MOST_DRIVES)}
+        unseen = {name: tuple(of[:: max(1, round(_rate_hz(of) * EVERY_S))]) for name, of in sampled.items()}
+        return cls(pick_evenly(parts.calibration, KNOWN_FRAMES), unseen, unit)
 
     @property
     def samples(self) -> tuple[Sample, ...]:
@@ -67,8 +69,10 @@ class Drives:
     def warnings(self) -> list[str]:
         if len(self.unseen) >= FEWEST_DRIVES:
             return []
-        what = f"{len(self.unseen)} {self.each} are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
-        return [f"{what}: nothing stops this policy where it has seen nothing like it"]
+        problem = (
+            f"{len(self.unseen)} {self.each} are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
+        )
+        return [f"{problem}: nothing stops this policy where it has seen nothing like it"]
 
 
 def _rate_hz(samples: list[Sample]) -> float:
@@ -81,8 +85,8 @@ def _stretches(blocks: dict[str, list[Sample]]) -> dict[str, list[Sample]]:
     count = -(-FEWEST_DRIVES // len(blocks))
     stretches = {}
     for name, of in blocks.items():
-        each = max(1, min(count, len(of) // LEAST_STRETCH))
-        for i, rows in enumerate(np.array_split(np.arange(len(of)), each)):
+        parts = max(1, min(count, len(of) // LEAST_STRETCH))
+        for i, rows in enumerate(np.array_split(np.arange(len(of)), parts)):
             stretches[f"{name}, part {i + 1}"] = [of[k] for k in rows]
     return stretches
 
@@ -93,14 +97,14 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     embed: returns a sample's embedding, (D,) float32. Described are the largest score of each unseen drive, as a share
     of the threshold, the rate of good drives that the threshold stops, and the pictures that are least familiar.
     """
-    known = np.stack([embed(sample) for sample in drives.known])
-    mean = known.mean(0)
-    _, sizes, rows = np.linalg.svd(known - mean, full_matrices=False)
+    embeddings = np.stack([embed(sample) for sample in drives.known])
+    mean = embeddings.mean(0)
+    _, sizes, rows = np.linalg.svd(embeddings - mean, full_matrices=False)
     directions = min(DIRECTIONS, (len(sizes) + 1) // 2)
-    spread = np.maximum(sizes / len(known) ** 0.5, 1e-6 * max(float(sizes[0]), 1e-6))[:directions]
+    spread = np.maximum(sizes / len(embeddings) ** 0.5, 1e-6 * max(float(sizes[0]), 1e-6))[:directions]
     familiar = Familiar(mean, rows[:directions], spread.astype(np.float32), np.ones(2, np.float32))
     # Both scores in their own unit, from drives that do not set the threshold
-    unit = np.quantile(familiar.scores(known), 0.99, axis=0).clip(1e-6)
+    unit = np.quantile(familiar.scores(embeddings), 0.99, axis=0).clip(1e-6)
     familiar.limits = unit.astype(np.float32)
     scores = {name: familiar.strange(np.stack([embed(s) for s in of])) for name, of in drives.unseen.items()}
     threshold = MARGIN * max(map(largest_smoothed, scores.values()))
@@ -108,14 +112,14 @@ def fit(drives: Drives, embed: Callable[[Sample], np.ndarray]) -> tuple[Familiar
     shares = {name: largest_smoothed(of) / threshold for name, of in scores.items()}
     # The share of new drives above the largest of n has a Beta(1, n) distribution; this is its interval.
     low, high = (1 - share ** (1 / len(shares)) for share in ((1 + BETWEEN) / 2, (1 - BETWEEN) / 2))
-    least = []
+    smallest = []
     for name in sorted(shares, key=lambda name: -shares[name])[:SHOWN]:
         sample = drives.unseen[name][int(scores[name].argmax())]
-        least.append(
+        smallest.append(
             {"episode": sample.episode, "row": sample.row, "frame": sample.frame_name, "strange": shares[name]}
         )
     rate = {"stopped_pct": 100 / (len(shares) + 1), "stopped_low_pct": 100 * low, "stopped_high_pct": 100 * high}
-    return familiar, {"drives": len(shares), "each": drives.each, **rate, "largest": shares, "least": least}
+    return familiar, {"drives": len(shares), "each": drives.each, **rate, "largest": shares, "least": smallest}
 
 
 def largest_smoothed(scores: np.ndarray) -> float:

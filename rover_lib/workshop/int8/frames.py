@@ -26,7 +26,7 @@ ODD_FRAMES = 8  # at most this many odd frames of the calibration take part in c
 
 def oddness(extremes: Extremes) -> dict[str, Tensor]:
     """How many times larger each frame's largest magnitude is than the median frame's, at each place: (frames,)."""
-    largest = {place: seen.abs().amax(1) for place, seen in extremes.items()}
+    largest = {place: extreme.abs().amax(1) for place, extreme in extremes.items()}
     return {place: x / x.median().clamp(min=1e-12) for place, x in largest.items()}
 
 
@@ -44,8 +44,8 @@ def usual(extremes: Extremes, usual_pct: float) -> Tensor:
 def range_over(extremes: Tensor, kept: Tensor, wider: float) -> tuple[float, float]:
     """The range of the frames that are kept, (frames,) bool, widened by a share of the way to all frames' range."""
     ends = []
-    for few, every in zip(_reach(extremes[kept]), _reach(extremes), strict=True):
-        ends.append(max(few, 1e-6) ** (1 - wider) * every**wider if every else 0.0)
+    for usual_reach, whole_reach in zip(_reach(extremes[kept]), _reach(extremes), strict=True):
+        ends.append(max(usual_reach, 1e-6) ** (1 - wider) * whole_reach**wider if whole_reach else 0.0)
     return -ends[0], ends[1]
 
 
@@ -57,8 +57,8 @@ def _reach(extremes: Tensor) -> tuple[float, float]:
 def odd_samples(extremes: Extremes, seen: Sequence[Frame], samples: Sequence[Sample]) -> tuple[Sample, ...]:
     """Some of the samples on which calibration met odd frames, evenly chosen. seen: the frame of each row."""
     times = dict(zip(seen, oddest(extremes).tolist(), strict=True))
-    found = [s for s in samples if times.get((s.episode, s.row), 0) > ODD]
-    return pick_evenly(sorted(found, key=lambda s: times[s.episode, s.row]), ODD_FRAMES)
+    odd = [s for s in samples if times.get((s.episode, s.row), 0) > ODD]
+    return pick_evenly(sorted(odd, key=lambda s: times[s.episode, s.row]), ODD_FRAMES)
 
 
 def odd_share(extremes: Extremes) -> float:

@@ -52,7 +52,8 @@ class RangeObserver(UniformQuantizationObserverBase):
         super().__init__(
             dtype=torch.qint8, qscheme=torch.per_tensor_affine, quant_min=LOW, quant_max=HIGH, eps=SMALLEST_SCALE
         )
-        self.choice, self.observing = choice, True
+        self.choice = choice
+        self.observing = True
         self.frames: list[Tensor] = []
         self.of_frames: tuple[float, float] | None = None
         self.min_val = nn.Buffer(torch.tensor(torch.inf))
@@ -85,7 +86,8 @@ class RangeObserver(UniformQuantizationObserverBase):
 
     def range(self) -> tuple[float, float]:
         """The range [low, high] to represent, containing 0. Raises ArtifactError if it saw nothing."""
-        low, high = self.min_val.item(), self.max_val.item()
+        low = self.min_val.item()
+        high = self.max_val.item()
         if low > high:
             raise ArtifactError("an observer saw nothing: calibration did not reach its layer", remedy=AGAIN)
         if self.choice == "histogram":
@@ -103,9 +105,11 @@ class RangeObserver(UniformQuantizationObserverBase):
         shrink = torch.linspace(1.0, 0.1, 31)
         lows, highs = low * shrink, high * shrink
         used = self.histogram > 0
-        weight, x = self.histogram[used] / self.histogram.sum(), self._centres()[used]
+        weight = self.histogram[used] / self.histogram.sum()
+        x = self._centres()[used]
         step = (highs.clamp(min=0) - lows[:, None].clamp(max=0)).clamp(min=1e-12) / 255
-        below, above = torch.relu(lows[:, None] - x) ** 2 @ weight, torch.relu(x - highs[:, None]) ** 2 @ weight
+        below = torch.relu(lows[:, None] - x) ** 2 @ weight
+        above = torch.relu(x - highs[:, None]) ** 2 @ weight
         best = divmod(int((step**2 / 12 + below[:, None] + above).argmin()), len(shrink))
         return lows[best[0]].item(), highs[best[1]].item()
 
@@ -171,8 +175,8 @@ def calibrate(
             prepared(*x)
     frames = {}
     for place, observer in _places(prepared).items():
-        each = torch.stack(observer.frames).view(len(samples), -1, 2)  # some run once for each camera
-        frames[place] = torch.stack((each[..., 0].amin(1), each[..., 1].amax(1)), 1)
+        ranges = torch.stack(observer.frames).view(len(samples), -1, 2)  # some run once for each camera
+        frames[place] = torch.stack((ranges[..., 0].amin(1), ranges[..., 1].amax(1)), 1)
     return Calibration(
         samples=len(samples),
         smooth=smooth,
@@ -203,7 +207,7 @@ def _places(prepared: GraphModule) -> dict[str, RangeObserver]:
 def times_of(prepared: GraphModule, calibration: Calibration, inputs: Sequence[tuple[Tensor, ...]]) -> Tensor:
     """(frames,) of each frame's oddness, as `frames.oddest`, against the frames that calibrated."""
     times = torch.zeros(len(inputs))
-    usually = {place: seen.abs().amax(1).median().clamp(min=1e-12) for place, seen in calibration.frames.items()}
+    usually = {place: extreme.abs().amax(1).median().clamp(min=1e-12) for place, extreme in calibration.frames.items()}
     with ExitStack() as hooks:
         for place, observer in _places(prepared).items():
 
@@ -218,10 +222,11 @@ def times_of(prepared: GraphModule, calibration: Calibration, inputs: Sequence[t
 
 def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) -> None:
     """Let the observers of a restored graph choose their ranges by this scheme."""
-    kept, wider = usual(calibration.frames, scheme.usual_pct), dict(scheme.wider)
+    usual_frames = usual(calibration.frames, scheme.usual_pct)
+    wider = dict(scheme.wider)
     for place, observer in _places(prepared).items():
         observer.choice = scheme.observer
-        observer.of_frames = range_over(calibration.frames[place], kept, wider.get(place, 0.0))
+        observer.of_frames = range_over(calibration.frames[place], usual_frames, wider.get(place, 0.0))
 
 
 def _observer(prepared: nn.Module, node: Node) -> RangeObserver | None:
@@ -242,17 +247,17 @@ def _pattern(block: str, relu: bool) -> str:
 
 def qconfig_mapping(config: ActConfig, scheme: Scheme, only: Iterable[str] | None = None) -> QConfigMapping:
     """The blocks to quantize: all but the scheme's float blocks, or `only` those. Raises ArtifactError for others."""
-    known = blocks(config)
-    if unknown := [b for b in scheme.float_blocks if b not in known]:
-        raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {known}")
-    wanted = set(known) - set(scheme.float_blocks) if only is None else set(only)
+    all_blocks = blocks(config)
+    if unknown := [b for b in scheme.float_blocks if b not in all_blocks]:
+        raise ArtifactError(f"scheme: float blocks {unknown} are not in this policy", remedy=f"known are {all_blocks}")
+    quantized = set(all_blocks) - set(scheme.float_blocks) if only is None else set(only)
     activation = RangeObserver.with_args(choice=scheme.observer)
     weight = PerChannelMinMaxObserver.with_args(
         dtype=torch.qint8, qscheme=torch.per_channel_symmetric, quant_min=-127, quant_max=127, eps=SMALLEST_SCALE
     )
     mapping = QConfigMapping().set_global(None)
-    for block in known:
-        qconfig = QConfig(activation, weight) if block in wanted else None
+    for block in all_blocks:
+        qconfig = QConfig(activation, weight) if block in quantized else None
         mapping.set_module_name_regex(_pattern(block, config.activation == "relu"), qconfig)
     return mapping
 
@@ -279,8 +284,8 @@ def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
             calls.setdefault(str(node.target), []).append(node)
     for nodes in calls.values():
         for sides in ([node.all_input_nodes for node in nodes], [node.users for node in nodes]):
-            shared, *others = (next((n for n in side if _observer(prepared, n)), None) for side in sides)
-            for other in others:
+            shared, *rest = (next((n for n in side if _observer(prepared, n)), None) for side in sides)
+            for other in rest:
                 if shared is not None and other is not None:
                     other.target = shared.target
     prepared.delete_all_unused_submodules()
@@ -290,13 +295,13 @@ def _one_scale_for_all_cameras(prepared: GraphModule) -> GraphModule:
 
 def restore_observed(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> GraphModule:
     """The observed graph as calibration left it. Raises ArtifactError for a calibration of another checkpoint."""
-    for what, made, now in (
+    for subject, stored, now in (
         ("image sizes", calibration.image_sizes, checkpoint.config.image_sizes),
         ("checkpoint", calibration.checkpoint, checkpoint.identity),
         ("smooth", calibration.smooth, scheme.smooth),
     ):
-        if made != now:
-            raise ArtifactError(f"the calibration was made with {what} {made}, not {now}", remedy=AGAIN)
+        if stored != now:
+            raise ArtifactError(f"the calibration was made with {subject} {stored}, not {now}", remedy=AGAIN)
     torch.backends.quantized.engine = ENGINE
     prepared = _prepare(scale_model(checkpoint, calibration, for_int8=True), scheme)
     state = prepared.state_dict()

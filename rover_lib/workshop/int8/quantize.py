@@ -52,7 +52,8 @@ class QuantizedPolicy:
 
 def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -> QuantizedPolicy:
     """Quantize a checkpoint by a scheme. Raises ArtifactError when not everything that it names became INT8."""
-    start, config = time.monotonic(), checkpoint.config
+    start = time.monotonic()
+    config = checkpoint.config
     static = scheme.mode != "dynamic"
     model = ACT(config, checkpoint.weights, for_int8=static)
     module: nn.Module
@@ -61,7 +62,8 @@ def quantize(checkpoint: Checkpoint, scheme: Scheme, calibration: Calibration) -
         convs = [n for n, m in model.named_modules() if isinstance(m, nn.Conv2d)]
         expected = [n for n in convs if block_of(n) not in (*scheme.float_blocks, *STAYS_FLOAT)]
     else:
-        module, expected = _dynamic(checkpoint, calibration).eval(), list(projections(model))
+        module = _dynamic(checkpoint, calibration).eval()
+        expected = list(projections(model))
     layers = int8_layers(module)
     check_acted(layers, expected)
     if static:
@@ -190,7 +192,8 @@ def most_clipped(
     samples: which calibration should not have seen.
     """
     prepared = restore_observed(checkpoint, quantized.scheme, calibration)
-    clipped, seen = Counter[str](), Counter[str]()
+    clipped = Counter[str]()
+    totals = Counter[str]()
     with ExitStack() as hooks:
         for name, m in int8_layers(quantized.module).items():
             ends = (LOW - m.zero_point - 0.5) * m.scale, (HIGH - m.zero_point + 0.5) * m.scale
@@ -198,12 +201,12 @@ def most_clipped(
             def watch(_: nn.Module, __: Any, x: Tensor, n: str = name, ends: tuple[float, float] = ends) -> None:
                 floor, ceiling = ends
                 clipped[n] += int(((x < floor) | (x > ceiling)).sum())
-                seen[n] += x.numel()
+                totals[n] += x.numel()
 
             hooks.enter_context(prepared.get_submodule(name).register_forward_hook(watch))
         for s in samples:
             prepared(*inputs_of(s, checkpoint.config))
-    shares = {name: 100 * clipped[name] / count for name, count in seen.items()}
+    shares = {name: 100 * clipped[name] / count for name, count in totals.items()}
     layer = max(shares, key=lambda name: shares[name])
     return {"layer": layer, "clipped_pct": shares[layer]}
 
@@ -224,12 +227,13 @@ def with_embedding(module: nn.Module, *, alone: bool = False) -> GraphModule:
     alone: without the actions, and what only they need. Its weights are the module's own, and its operators the same.
     """
     source = graph_of(module)
-    copied, nodes = Graph(), dict[Node, Node]()
+    copied = Graph()
+    nodes = dict[Node, Node]()
     actions = copied.graph_copy(source.graph, nodes)
     encoded = next(nodes[node] for node in source.graph.nodes if node.target == "encoder_norm")
     embedding = copied.call_method("mean", (encoded, 1))
     copied.output(embedding if alone else (actions, embedding))
-    found = GraphModule(source, copied)
-    found.graph.eliminate_dead_code()
-    found.recompile()
-    return found
+    graph = GraphModule(source, copied)
+    graph.graph.eliminate_dead_code()
+    graph.recompile()
+    return graph

@@ -62,9 +62,9 @@ def _scale_memory(model: ACT, maxima: Maxima, smooth: float) -> None:
     for p in "kv":
         even = []
         for name, cross in crosses.items():
-            seen = maxima[f"{name}.{p}"]
-            even.append(_matrix(getattr(cross, p)) / _output_scale(seen["out_max"])[:, None])
-        setattr(model.memory, f"{p}_in", _input_scale(seen["in_max"], even, smooth))
+            largest = maxima[f"{name}.{p}"]
+            even.append(_matrix(getattr(cross, p)) / _output_scale(largest["out_max"])[:, None])
+        setattr(model.memory, f"{p}_in", _input_scale(largest["in_max"], even, smooth))
 
 
 def _scale_attention(name: str, part: Any, memory: Any, maxima: Maxima, smooth: float) -> None:
@@ -91,7 +91,8 @@ def _scale_attention(name: str, part: Any, memory: Any, maxima: Maxima, smooth: 
         part.q_out = out["q"] * out["k"]
     for p, columns in (("k", k_in), ("v", v_in), ("o", o_in)):
         _rescale(getattr(part, p), 1 / out[p], 1 / columns)
-    part.v_out, part.o_out = out["v"] * o_in, out["o"]
+    part.v_out = out["v"] * o_in
+    part.o_out = out["o"]
 
 
 def _scale_feed_forward(name: str, part: FeedForward, maxima: Maxima, smooth: float) -> None:
@@ -100,7 +101,8 @@ def _scale_feed_forward(name: str, part: FeedForward, maxima: Maxima, smooth: fl
     _rescale(part.down, 1 / part.down_out, 1 / middle)
     rows = middle
     if not isinstance(part.act, nn.ReLU):
-        rows, part.down_in = torch.ones(len(middle)), middle
+        rows = torch.ones(len(middle))
+        part.down_in = middle
     part.up_in = _input_scale(maxima[f"{name}.up"]["in_max"], [_matrix(part.up) * rows[:, None]], smooth)
     _rescale(part.up, rows, 1 / part.up_in)
 

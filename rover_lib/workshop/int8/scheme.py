@@ -37,15 +37,15 @@ class Scheme:
     def of(cls, stored: Mapping[str, Any]) -> "Scheme":
         """A scheme from JSON, which has lists for its tuples, and of older versions more than a scheme has now."""
         wider = tuple((place, share) for place, share in stored.get("wider", ()))
-        known = {each.name: stored[each.name] for each in fields(cls) if each.name in stored}
-        return cls(**{**known, "float_blocks": tuple(stored["float_blocks"]), "wider": wider})
+        values = {entry.name: stored[entry.name] for entry in fields(cls) if entry.name in stored}
+        return cls(**{**values, "float_blocks": tuple(stored["float_blocks"]), "wider": wider})
 
     def __post_init__(self) -> None:
-        known = {"mode": MODES, "observer": OBSERVERS}
-        for name, values in known.items():
+        choices = {"mode": MODES, "observer": OBSERVERS}
+        for name, values in choices.items():
             if (value := getattr(self, name)) not in values:
                 raise ArtifactError(f"scheme: {name} {value!r} is not known", remedy=f"known are {list(values)}")
         shares = {"smooth": self.smooth or 0, "usual_pct": self.usual_pct / 100, **dict(self.wider)}
         if not all(0 <= share <= 1 for share in shares.values()):
-            what = "scheme: usual_pct must be in [0, 100], smooth and wider in [0, 1]"
-            raise ArtifactError(what, found=shares)
+            problem = "scheme: usual_pct must be in [0, 100], smooth and wider in [0, 1]"
+            raise ArtifactError(problem, found=shares)

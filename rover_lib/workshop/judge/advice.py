@@ -12,8 +12,8 @@ from jinja2 import ChainableUndefined, Environment, FileSystemLoader
 
 from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
 from rover_lib.onboard.columns import UNITS
-from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.compare import GATED
+from rover_lib.workshop.judge.recorded_range import worst
 
 CALLED = {"fp32": "FP32", "dynamic": "dynamic INT8", "static": "static INT8", "mixed": "mixed INT8"}
 NEXT_COMMANDS, MOST_CAUTIONS = 3, 5
@@ -50,13 +50,13 @@ def gate_in_words(gate: str) -> str:
 
 def against(row: Mapping[str, Any]) -> str:
     """Put a judged gate in words: what it limits, what was found, and the limit."""
-    most = "at least" if row["relation"] == ">=" else "at most"
-    return f"{row['words']}: {row['found']:.3g}, {most} {row['limit']:g}"
+    bound = "at least" if row["relation"] == ">=" else "at most"
+    return f"{row['words']}: {row['found']:.3g}, {bound} {row['limit']:g}"
 
 
 def error_pct(row: Mapping[str, Any]) -> float:
     """Return the larger of the actions' errors, in percent of the recorded range; 0 for FP32 or if none was judged."""
-    return judge.worst(row["errors_pct"]) or 0.0
+    return worst(row["errors_pct"]) or 0.0
 
 
 def count(number: int, what: str) -> str:
@@ -74,9 +74,7 @@ def fill_in(template: str, **values: Any) -> list[str]:
     pages = Environment(loader=FileSystemLoader(Path(__file__).parent), undefined=ChainableUndefined)
     # A name that breaks its line must not put a command of its own on the next one.
     pages.filters |= {"quote": lambda name: shlex.quote(" ".join(name.splitlines())), "against": against}
-    text = pages.get_template(template).render(
-        some=_some, count=count, error_pct=error_pct, worst=judge.worst, **values
-    )
+    text = pages.get_template(template).render(some=_some, count=count, error_pct=error_pct, worst=worst, **values)
     return [line.strip() for line in text.splitlines() if line.strip()]
 
 
@@ -84,7 +82,7 @@ def list_remedies(
     gate: str, stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
     """Say what to do about a gate that FP32 or static INT8 misses, the cheapest remedy first: remedies.txt."""
-    alone = {block: judge.worst(errors) or 0.0 for block, errors in stages["quantize"].get("sensitivity", {}).items()}
+    alone = {block: worst(errors) or 0.0 for block, errors in stages["quantize"].get("sensitivity", {}).items()}
     block = max(alone.items(), key=lambda item: item[1], default=None)
     return fill_in(
         "remedies.txt",
@@ -140,5 +138,5 @@ def _deployed(artifact: str, allow: Sequence[str]) -> str:
     """What deploy.yml is told by -e. Ansible splits name=value at spaces, and reads JSON as it is."""
     if not allow and re.fullmatch(r"[\w./-]+", artifact):
         return f"rover_artifact={artifact}"
-    told: dict[str, Any] = {"rover_artifact": artifact}
-    return json.dumps(told | ({"rover_allow": list(allow)} if allow else {}), ensure_ascii=False)
+    settings: dict[str, Any] = {"rover_artifact": artifact}
+    return json.dumps(settings | ({"rover_allow": list(allow)} if allow else {}), ensure_ascii=False)

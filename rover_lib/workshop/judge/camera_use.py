@@ -39,24 +39,24 @@ class Looking:
     def summary(self) -> dict[str, Any]:
         """Return the changes as `<action>_<way>_pct`, for compare.json."""
         summary: dict[str, Any] = {"frames": self.frames}
-        for action, moved in self.moved_pct.items():
-            summary |= {f"{action}_{way}_pct": moved[way] if moved else None for way in WAYS}
+        for action, change in self.moved_pct.items():
+            summary |= {f"{action}_{way}_pct": change[way] if change else None for way in WAYS}
         return summary
 
     def table(self) -> Table:
         """Return the changes as a table for people."""
         rows = []
-        for action, moved in self.moved_pct.items():
-            rows.append((action, *(format_pct(moved[way] if moved else None).strip() for way in WAYS)))
+        for action, change in self.moved_pct.items():
+            rows.append((action, *(format_pct(change[way] if change else None).strip() for way in WAYS)))
         return Table(("a plan moves by", "another picture", "another state too", "100 ms of delay"), rows)
 
     def warnings(self) -> list[str]:
         """Return what to know before anybody drives with this policy, if an action does not follow the camera."""
-        judged = {action: moved for action, moved in self.moved_pct.items() if moved}
-        if judged and all(moved["apart"] < FLOOR_PCT for moved in judged.values()):
+        rated = {action: change for action, change in self.moved_pct.items() if change}
+        if rated and all(change["apart"] < FLOOR_PCT for change in rated.values()):
             return ["this policy plans the same whatever it is shown, do not drive it"]
-        blind = [a for a, moved in judged.items() if not follows(moved["by_picture"], moved["apart"])]
-        if judged and len(blind) == len(judged):
+        blind = [a for a, change in rated.items() if not follows(change["by_picture"], change["apart"])]
+        if rated and len(blind) == len(rated):
             return ["this policy ignores its camera and copies its state, do not drive it"]
         return [f"{action} hardly follows the camera" for action in blind]
 
@@ -70,22 +70,24 @@ def look(policy: Any, report: Fidelity, recorded: Sequence[Any] = (), progress: 
     rows = pick_evenly(range(len(report.samples)), FRAMES)
     if len(rows) < 2:
         raise PolicyError("there are no two frames to swap", remedy="record more, or hold out a larger share")
-    others = np.roll(rows, len(rows) // 2).tolist()
-    known = {(s.episode, s.row): s for s in recorded}
-    moved, older = list[list[np.ndarray]](), [np.zeros(len(report.action_names))]
-    for row, other in progress(list(zip(rows, others, strict=True)), desc="swapping", total=len(rows)):
-        sample, plan = report.samples[row], report.reference[row].astype(np.float64)
+    partners = np.roll(rows, len(rows) // 2).tolist()
+    by_frame = {(s.episode, s.row): s for s in recorded}
+    changes = list[list[np.ndarray]]()
+    older = [np.zeros(len(report.action_names))]
+    for row, other in progress(list(zip(rows, partners, strict=True)), desc="swapping", total=len(rows)):
+        sample = report.samples[row]
+        plan = report.reference[row].astype(np.float64)
         by_picture = policy.predict_chunk(report.samples[other].frame_bgr(), sample.state)
-        moved.append([np.abs(each - plan).mean(0) for each in (by_picture, report.reference[other])])
-        before = known and known.get((sample.episode, sample.row - 1))
+        changes.append([np.abs(other_plan - plan).mean(0) for other_plan in (by_picture, report.reference[other])])
+        before = by_frame and by_frame.get((sample.episode, sample.row - 1))
         if before and sample.time_s > before.time_s:
             late = policy.predict_chunk(before.frame_bgr(), sample.state)
             older.append(np.abs(late - plan).mean(0) / (sample.time_s - before.time_s))
-    means = np.vstack([np.mean(moved, axis=0), 0.1 * np.mean(older[1:] or older, axis=0)])  # (ways, actions)
+    means = np.vstack([np.mean(changes, axis=0), 0.1 * np.mean(older[1:] or older, axis=0)])  # (ways, actions)
     moved_pct: dict[str, dict[str, float] | None] = {}
     for i, action in enumerate(report.action_names):
         pct = report.pct(action)
-        found = dict(zip(WAYS, (means[:, i] * (pct or 0)).tolist(), strict=True))
-        found["by_100_ms"] *= follows(found["by_picture"], found["apart"])
-        moved_pct[action] = None if pct is None else found
+        by_way = dict(zip(WAYS, (means[:, i] * (pct or 0)).tolist(), strict=True))
+        by_way["by_100_ms"] *= follows(by_way["by_picture"], by_way["apart"])
+        moved_pct[action] = None if pct is None else by_way
     return Looking(len(rows), moved_pct)

@@ -25,8 +25,8 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
-from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
+from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
@@ -76,7 +76,7 @@ class Fidelity:
 
     def pct(self, action: str) -> float | None:
         """One unit of an action in percent of its recorded range; None for an action that is not judged."""
-        return judge.pct_of_range(1.0, self.action_range[action])
+        return pct_of_range(1.0, self.action_range[action])
 
     def in_pct(self, errors: Any, action: str) -> Any:
         """Errors of an action, one or an array, in percent of its recorded range; None if it is not judged."""
@@ -92,11 +92,12 @@ class Fidelity:
         summary: dict[str, Any] = {}
         total = np.zeros(len(self.samples))
         for i, action in enumerate(self.action_names):
-            e, less = self.errors(mode)[..., i], self.reference[..., i] - self.chunks[mode][..., i].astype(np.float64)
+            e = self.errors(mode)[..., i]
+            less = self.reference[..., i] - self.chunks[mode][..., i].astype(np.float64)
             total += e.mean(1) * (self.pct(action) or 0)
-            found = {"mae": e.mean(), "p95": np.quantile(e, 0.95), "max": e.max(), "mae_per_step": e.mean(0)}
-            found["less"] = (np.sign(self.reference[..., i]) * less).mean()
-            summary |= {f"{action}_{name}_pct": self.in_pct(error, action) for name, error in found.items()}
+            numbers = {"mae": e.mean(), "p95": np.quantile(e, 0.95), "max": e.max(), "mae_per_step": e.mean(0)}
+            numbers["less"] = (np.sign(self.reference[..., i]) * less).mean()
+            summary |= {f"{action}_{name}_pct": self.in_pct(error, action) for name, error in numbers.items()}
         summary["worst_tenth_pct"] = np.sort(total)[-math.ceil(len(total) / 10) :].mean()
         return summary | self.recorded_error(self.chunks[mode])
 
@@ -111,12 +112,12 @@ class Fidelity:
         if not units:
             return []
         per_frame = self.errors(mode).mean(1)[:, list(units)] * list(units.values())  # (n, judged actions)
-        found = []
+        worst_frames = []
         for i in np.argsort(-per_frame.max(1), kind="stable")[:count]:
             action = self.action_names[list(units)[int(per_frame[i].argmax())]]
             plans = self.reference[i], self.chunks[mode][i]
-            found.append(WorstFrame(mode, action, float(per_frame[i].max()), self.samples[i], *plans))
-        return found
+            worst_frames.append(WorstFrame(mode, action, float(per_frame[i].max()), self.samples[i], *plans))
+        return worst_frames
 
 
 class LerobotEager:
@@ -124,7 +125,9 @@ class LerobotEager:
 
     def __init__(self, checkpoint: Checkpoint, car: Car | None = None):
         c = self.config = checkpoint.config
-        self.chunk, self.action_names, self.state_names = c.chunk, c.action_names, c.state_names
+        self.chunk = c.chunk
+        self.action_names = c.action_names
+        self.state_names = c.state_names
         self._policy = lerobot_act(c, checkpoint.weights).eval()
         self.car = car or this_car()
         self._low, self._high = action_limits(c.action_names, self.car)
@@ -185,8 +188,8 @@ def fidelity(
         raise PolicyError("there are no frames to compare on", remedy="record more, or hold out a larger share")
     for mode, policy in others.items():
         if (tuple(policy.action_names), policy.chunk) != (names, reference.chunk):
-            what = f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 other ones"
-            raise PolicyError(what, remedy="compare artifacts of one checkpoint")
+            problem = f"{mode} plans {policy.chunk} steps of {list(policy.action_names)}, FP32 other ones"
+            raise PolicyError(problem, remedy="compare artifacts of one checkpoint")
     if missing := [n for n in names if n not in action_range]:
         raise PolicyError(f"no recorded range of action {missing}", remedy="use other recordings")
     policies = {"": reference, **others}
@@ -223,21 +226,22 @@ def metrics(
             "trials": trial.trials if trial else None,
             "size_mb": policies[mode].path.stat().st_size / 1e6,
         }
-    fp32, modes = own.pop("fp32"), {}
-    for mode, found in own.items():
+    fp32 = own.pop("fp32")
+    modes = {}
+    for mode, row in own.items():
         # Both drove the same worlds, in the same order.
         pairs = compare_pairs(trials["fp32"].hit, trials[mode].hit) if trials and mode in trials else None
-        modes[mode] = found | report.summary(mode) | {"pairs": pairs}
+        modes[mode] = row | report.summary(mode) | {"pairs": pairs}
     worst = []
     for w in (w for mode in report.chunks for w in report.worst(mode)):
         at = {"episode": w.sample.episode, "frame": w.sample.frame_name}
-        found = {"mode": w.mode, "action": w.action, "error_pct": w.error_pct}
-        worst.append(found | at | {"fp32": w.reference, "int8": w.other})
+        row = {"mode": w.mode, "action": w.action, "error_pct": w.error_pct}
+        worst.append(row | at | {"fp32": w.reference, "int8": w.other})
     return {
         "fp32": fp32 | report.recorded_error(report.reference),
         "modes": modes,
         "action_range": report.action_range,
-        "warnings": judge.not_judged(report.action_range),
+        "warnings": not_judged(report.action_range),
         "frames": len(report.samples),
         "worst": worst,
     }
@@ -281,16 +285,19 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
 
     The error is judged only where worlds do not decide, in ms of delay; where none tells, in % of the recorded range.
     """
-    fp32, judged = compared["fp32"], compared["modes"][mode]
-    lost = worlds_lost(f"{mode} {WORLDS_LOST}", judged.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"])
+    fp32 = compared["fp32"]
+    mode_metrics = compared["modes"][mode]
+    lost = worlds_lost(
+        f"{mode} {WORLDS_LOST}", mode_metrics.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"]
+    )
     if (ms := error_ms(compared, mode)) is not None:
-        error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(judged, limits))
+        error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(mode_metrics, limits))
     else:
-        worst_pct = judge.worst(judged[key] for key in judged if key.endswith("_mae_pct"))
+        worst_pct = worst(mode_metrics[key] for key in mode_metrics if key.endswith("_mae_pct"))
         error = gate(f"{mode} error, % of the recorded range", worst_pct, "<=", limits["error_pct"])
     return [
         *([error] if lost["passed"] is None else []),
         gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
         lost,
-        gate(f"{mode} size_mb", judged["size_mb"], "<=", limits["size_mb"][mode]),
+        gate(f"{mode} size_mb", mode_metrics["size_mb"], "<=", limits["size_mb"][mode]),
     ]

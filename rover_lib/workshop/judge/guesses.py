@@ -27,7 +27,10 @@ DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
 SURE_PCT = 95
 MARGIN = 0.1  # a guess's error must surely be larger by this share of it: a policy of nearly the same is of no use
-MEAN, MEDIAN, MEAN_PLAN = "the mean action", "the median action", "the mean plan"  # guesses that need no eyes
+# Guesses that need no eyes.
+MEAN = "the mean action"
+MEDIAN = "the median action"
+MEAN_PLAN = "the mean plan"
 CONSTANT, LAST = "a constant", "the last action again"
 
 
@@ -79,40 +82,41 @@ class Judged:
     def table(self) -> Table:
         """The policy and the guesses beside each other, for people."""
         rows = []
-        for action, found in self.actions.items():
-            rows.append((action, "the policy", f"{found.error_pct:.2f} %", "held, not judged" if found.held else ""))
-            rows += [("", name, f"{g.error_pct:.2f} %", g.lead()) for name, g in found.guesses.items()]
+        for action, result in self.actions.items():
+            rows.append((action, "the policy", f"{result.error_pct:.2f} %", "held, not judged" if result.held else ""))
+            rows += [("", name, f"{g.error_pct:.2f} %", g.lead()) for name, g in result.guesses.items()]
         return Table(("", "", "off the driver", "the policy is better by"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each action that is no better than a guess, or if none can be judged."""
-        if all(found.held for found in self.actions.values()):
+        if all(result.held for result in self.actions.values()):
             return ["no action varies enough in these recordings to show whether the policy sees"]
         warnings = []
-        for action, found in self.actions.items():
-            if lost := found.lost():
-                where = " in the later half of a plan" if lost[0] == LAST else ""
-                name, guess = lost[0], found.guesses[lost[0]]
-                errors = f"{guess.error_pct - guess.better:.2f} % off the driver{where}, {name} {guess.error_pct:.2f} %"
+        for action, result in self.actions.items():
+            if lost := result.lost():
+                when = " in the later half of a plan" if lost[0] == LAST else ""
+                name = lost[0]
+                guess = result.guesses[lost[0]]
+                errors = f"{guess.error_pct - guess.better:.2f} % off the driver{when}, {name} {guess.error_pct:.2f} %"
                 lead = f"better by {guess.lead()} over {self.drawn}"
                 warnings.append(f"{action} is not clearly better than a guess without eyes: {errors}; {lead}")
-            if found.held and found.off > HELD_OFF:
-                off = f"its plans are {100 * found.off:.0f} % off what is usual there"
+            if result.held and result.off > HELD_OFF:
+                off = f"its plans are {100 * result.off:.0f} % off what is usual there"
                 warnings.append(f"{action} hardly varies in these recordings, and {off}")
         return warnings
 
     def notes(self) -> list[str]:
         """A sentence for each action that is held."""
-        held = {action: found for action, found in self.actions.items() if found.held}
+        constant = {action: result for action, result in self.actions.items() if result.held}
         return [
-            f"{action} hardly varies in these recordings: held, not judged ({found.error_pct:.1f} % off, "
-            f"{CONSTANT} {found.guesses[CONSTANT].error_pct:.1f} %)"
-            for action, found in held.items()
+            f"{action} hardly varies in these recordings: held, not judged ({result.error_pct:.1f} % off, "
+            f"{CONSTANT} {result.guesses[CONSTANT].error_pct:.1f} %)"
+            for action, result in constant.items()
         ]
 
     def summary(self) -> dict[str, Any]:
         """The same as plain JSON types, for compare.json."""
-        lost = {action: found.lost() for action, found in self.actions.items()}
+        lost = {action: result.lost() for action, result in self.actions.items()}
         return {**asdict(self), "lost": lost, "warnings": self.warnings(), "notes": self.notes()}
 
 
@@ -121,7 +125,8 @@ def blind_plans(chunks: np.ndarray, is_pad: np.ndarray) -> dict[str, np.ndarray]
 
     chunks: (n, C, A) recorded actions; is_pad: (n, C) bool, steps past the end of a recording.
     """
-    actions, shape = chunks[~is_pad].astype(np.float64), chunks.shape[1:]
+    actions = chunks[~is_pad].astype(np.float64)
+    shape = chunks.shape[1:]
     # At a step that no plan reaches, the mean action stands.
     padded = np.broadcast_to(is_pad[..., None], chunks.shape)
     steps = np.ma.masked_array(chunks.astype(np.float64), padded).mean(0).filled(actions.mean(0))
@@ -158,7 +163,9 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     """
     if not learned:
         return None
-    recorded, is_pad, half = report.recorded, report.is_pad, report.recorded.shape[1] // 2
+    recorded = report.recorded
+    is_pad = report.is_pad
+    half = report.recorded.shape[1] // 2
     blind = blind_plans(np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned]))
     own = frame_errors(report.reference, recorded, is_pad)
     errors = {name: frame_errors(plan, recorded, is_pad) for name, plan in blind.items()}
@@ -178,9 +185,11 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         for name, (of_guess, of_policy) in ({CONSTANT: (constant, own)} | compared).items():
             if not np.isnan(of_guess[:, i]).all():
                 guesses[name] = _guess(pct * of_guess[:, i], pct * of_policy[:, i], pieces, draws)
-        acted, error = recorded[~is_pad][:, i], own[:, i].mean()
-        held, size = hardly_varies(action, acted), usual_size(acted)
-        actions[action] = ActionJudged(float(pct * error), guesses, held, float(error / size) if size else 0.0)
+        acted = recorded[~is_pad][:, i]
+        error = own[:, i].mean()
+        is_constant = hardly_varies(action, acted)
+        size = usual_size(acted)
+        actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)
 
 
@@ -199,12 +208,12 @@ def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
     samples = report.samples
     blocks = [np.array(rows) for rows in group_by_block(samples)]
     one_drive_each = all(len({samples[i].episode for i in rows}) == 1 for rows in blocks)
-    what = "episode" if one_drive_each and len({s.episode for s in samples}) == len(blocks) else "block"
+    unit = "episode" if one_drive_each and len({s.episode for s in samples}) == len(blocks) else "block"
     if len(blocks) >= LEAST_EPISODES:
-        return f"{len(blocks)} {what}s", blocks
+        return f"{len(blocks)} {unit}s", blocks
     chunk = report.reference.shape[1]
     pieces = []
     for rows in blocks:
         parts = [(samples[row].episode, samples[row].row // chunk) for row in rows]
         pieces += [np.array(list(group)) for _, group in groupby(rows, key=dict(zip(rows, parts, strict=True)).get)]
-    return f"{len(pieces)} pieces of {len(blocks)} {what}{'s' if len(blocks) > 1 else ''}", pieces
+    return f"{len(pieces)} pieces of {len(blocks)} {unit}{'s' if len(blocks) > 1 else ''}", pieces

@@ -48,7 +48,8 @@ class Benchmarks:
                 if b is not self.by_host.get(THIS):  # on a rover the file in use is always called policy.pt
                     name = self.modes.get(b["inputs"].get(f"{name}.pt"), f"{v['mode'] or name}, another")
                 rows.append((host, name, *times, str(v["n"]), *state))
-                host, state = "", ("", "", "")  # shown only once for each host
+                host = ""
+                state = ("", "", "")  # shown only once for each host
         notes = [f"left out: {sentence}" for sentence in self.unusable]
         if not self.by_host.keys() - {THIS}:
             notes.insert(0, NO_ROVER)
@@ -86,6 +87,6 @@ def benchmark_of(run_dir: Path | str, made: Mapping[str, Mapping[str, Any]]) -> 
 
 def is_of(inputs: Mapping[str, str], made: Mapping[str, Mapping[str, Any]]) -> bool:
     """Whether a stage's inputs are some of a run's artifacts, and no others. made: quantize.json's modes."""
-    ours = {f"policy_{mode}.pt": each["content_hash"] for mode, each in made.items()}
+    ours = {f"policy_{mode}.pt": entry["content_hash"] for mode, entry in made.items()}
     named = {file: digest for file, digest in inputs.items() if file in ours}
     return bool(named) and all(ours[file] == digest for file, digest in named.items())

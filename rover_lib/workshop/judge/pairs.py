@@ -13,7 +13,8 @@ CHANCE = 0.05  # of the exact test's p: below it, a loss is not chance
 
 def sign_test(only_one: int, only_other: int) -> float:
     """Return the exact two-sided p of worlds that only one of two policies hits (McNemar's exact test)."""
-    n, fewer = only_one + only_other, min(only_one, only_other)
+    n = only_one + only_other
+    fewer = min(only_one, only_other)
     return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
 
 
@@ -32,12 +33,12 @@ def loss_interval(only_first: int, only_second: int, worlds: int) -> tuple[float
         gap = only_first - only_second - worlds * loss
         return gap / math.sqrt(spread) if spread > 0 else math.copysign(math.inf, gap)
 
-    seen = (only_first - only_second) / worlds
+    difference = (only_first - only_second) / worlds
     ends = []
-    for low, high, wanted in ((-1.0, seen, Z), (seen, 1.0, -Z)):  # the score falls from end to end
+    for low, high, target in ((-1.0, difference, Z), (difference, 1.0, -Z)):  # the score falls from end to end
         for _ in range(60):
             middle = (low + high) / 2
-            low, high = (middle, high) if score(middle) > wanted else (low, middle)
+            low, high = (middle, high) if score(middle) > target else (low, middle)
         ends.append((low + high) / 2)
     return ends[0], ends[1]
 

@@ -51,30 +51,28 @@ class Fit:
     def table(self) -> Table:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
         rows = []
-        for name, found in self.actions.items():
-            rows.append(
-                (name, *("{:.3g} to {:.3g}".format(*ends) for ends in (self.recorded[name], found["predicted"])))
-            )
+        for name, fit in self.actions.items():
+            rows.append((name, *("{:.3g} to {:.3g}".format(*ends) for ends in (self.recorded[name], fit["predicted"]))))
         return Table(("", "recorded", "predicted"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit."""
         warnings = []
-        for name, found in self.actions.items():
-            if found["beyond_pct"] > MOST_BEYOND_PCT:
-                what = f"{found['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
-                warnings.append(f"{name}: {what}; {self.remedy}")
-            elif found["spread"] < LEAST_SPREAD and not found["held"]:
-                what = f"its predictions vary {100 * found['spread']:.0f} % as much as what was recorded"
-                warnings.append(f"{name}: {what}; {self.remedy}")
+        for name, fit in self.actions.items():
+            if fit["beyond_pct"] > MOST_BEYOND_PCT:
+                problem = f"{fit['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
+                warnings.append(f"{name}: {problem}; {self.remedy}")
+            elif fit["spread"] < LEAST_SPREAD and not fit["held"]:
+                problem = f"its predictions vary {100 * fit['spread']:.0f} % as much as what was recorded"
+                warnings.append(f"{name}: {problem}; {self.remedy}")
         for name, largest in self.largest_state.items():
             if not largest <= LARGEST_STATE:
                 warnings.append(
                     f"state {name}: the policy is told up to {largest:.3g} standard deviations; {self.remedy}"
                 )
         for episode, found_hz in list(self.other_rates_hz.items())[:1]:
-            what = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
-            warnings.append(f"{what}: the car would drive at another speed than the human did")
+            problem = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
+            warnings.append(f"{problem}: the car would drive at another speed than the human did")
         return warnings
 
     def summary(self) -> dict[str, Any]:
@@ -88,23 +86,25 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     samples: of whole episodes, one after the other; each episode's rate is compared with the policy's. An action that
     never changes in the recordings is left out, because its possible range is not known.
     """
-    config, few = checkpoint.config, pick_evenly(samples, FRAMES)
-    plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in few]).numpy()
-    known = ~np.stack([s.is_pad for s in few])
-    recorded = np.stack([s.chunk for s in few])
+    config = checkpoint.config
+    tried = pick_evenly(samples, FRAMES)
+    plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in tried]).numpy()
+    present = ~np.stack([s.is_pad for s in tried])
+    recorded = np.stack([s.chunk for s in tried])
     actions = {}
     for i, (name, (low, high)) in enumerate(action_range.items()):
         if name in constant_actions(action_range):
             continue
-        values, acted = plans[..., i], recorded[..., i][known]
-        held = hardly_varies(name, acted)
-        margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if held else 0)
+        values = plans[..., i]
+        acted = recorded[..., i][present]
+        constant = hardly_varies(name, acted)
+        margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if constant else 0)
         beyond = (values < low - margin) | (values > high + margin)
         actions[name] = {
             "predicted": [float(values.min()), float(values.max())],
             "beyond_pct": 100 * float(beyond.mean()),
-            "spread": float(values[known].std() / max(acted.std(), 1e-12)),
-            "held": held,
+            "spread": float(values[present].std() / max(acted.std(), 1e-12)),
+            "held": constant,
         }
     largest: dict[str, float] = {}
     if (norm := config.state_norm) is not None:
@@ -116,4 +116,4 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
         if found_hz is not None and is_another_rate(found_hz, config.rate_hz):
             others_hz[name] = found_hz
     remedy = OURS if checkpoint.report.get("written_here") else REMEDY
-    return Fit(len(few), action_range, actions, largest, config.rate_hz, others_hz, remedy)
+    return Fit(len(tried), action_range, actions, largest, config.rate_hz, others_hz, remedy)

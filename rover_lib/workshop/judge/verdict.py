@@ -15,9 +15,9 @@ from typing import Any
 from rover_lib.onboard.artifact.acceptance import MAY_DIFFER
 from rover_lib.onboard.columns import ratio
 from rover_lib.workshop.judge import advice
-from rover_lib.workshop.judge import recorded_range as judge
 from rover_lib.workshop.judge.advice import CALLED, Names, Stages, count, error_pct, gate_in_words
 from rover_lib.workshop.judge.compare import GATED, MODES, WORLDS_LOST, error_ms, gate, gates, hits_needed
+from rover_lib.workshop.judge.recorded_range import follows, worst
 
 PREFERRED = ("fp32", "static", "mixed", "dynamic")  # between equals: the policy as trained, then the simplest
 COUNTED = "counted on an emulated Cortex-A76"
@@ -48,13 +48,13 @@ def verdict(
         best["because"] = "the best of them"
     familiar = stages["quantize"]["modes"].get(best["mode"], {}).get("familiar")
     notes = stages["compare"].get("guesses", {}).get("notes", [])
-    known = {"familiar": familiar, "counted": COUNTED, "notes": notes}
-    why = unfit or advice.fill_in("why.txt", best=best, fp32=rows["fp32"], **known)
+    context = {"familiar": familiar, "counted": COUNTED, "notes": notes}
+    why = unfit or advice.fill_in("why.txt", best=best, fp32=rows["fp32"], **context)
     if other_robot:
         robot = "A policy for another robot" if "actions" in refused else "A rover refuses it"
         why.append(f"{robot}, to benchmark only: {'; '.join(refused[kind] for kind in other_robot)}.")
     work = _work_key(_candidates(rows.values()))  # where the figures of speed come from
-    judged = {
+    result = {
         "ready": not unfit,
         "deploy": deploy,
         "artifact": None if deploy is None else f"policy_{deploy}.pt",
@@ -65,38 +65,41 @@ def verdict(
         "modes": list(rows.values()),
         "failed": failed,
     }
-    judged["cautions"] = advice.list_cautions(stages, params, judged, best, _busy(benchmark, limits))
-    return judged | {"next": advice.list_next(judged, best["mode"], stages, names)}
+    result["cautions"] = advice.list_cautions(stages, params, result, best, _busy(benchmark, limits))
+    return result | {"next": advice.list_next(result, best["mode"], stages, names)}
 
 
 def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return a row for each mode that was compared, FP32 first. Units are in the keys."""
-    compared, timed = stages["compare"], stages["benchmark"]["artifacts"]
-    counted = stages.get("arm", {}).get("artifacts", {})
+    compared = stages["compare"]
+    timed = stages["benchmark"]["artifacts"]
+    instructions = stages.get("arm", {}).get("artifacts", {})
     key = time_key(stages["benchmark"], params["verdict"])
     all_found = {"fp32": compared["fp32"]} | {m: compared["modes"][m] for m in MODES if m in compared["modes"]}
     rows = {}
-    for mode, found in all_found.items():
+    for mode, metrics in all_found.items():
         time = timed.get(mode, {})
-        judged = [] if mode == "fp32" else gates(compared, params["gates"], mode)
+        gate_rows = [] if mode == "fp32" else gates(compared, params["gates"], mode)
         rows[mode] = {
             "mode": mode,
-            "size_mb": found["size_mb"],
-            "times_smaller": compared["fp32"]["size_mb"] / found["size_mb"],
+            "size_mb": metrics["size_mb"],
+            "times_smaller": compared["fp32"]["size_mb"] / metrics["size_mb"],
             "time_ms": time.get(key),
             "times_faster": ratio(timed.get("fp32", {}).get(key), time.get(key)),
             "floor_ms": time.get("floor_ms"),
-            "instructions_g": counted.get(f"policy_{mode}", {}).get("instructions_g"),
-            "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in found.items() if k.endswith("_mae_pct")},
+            "instructions_g": instructions.get(f"policy_{mode}", {}).get("instructions_g"),
+            "errors_pct": {k.removesuffix("_mae_pct"): v for k, v in metrics.items() if k.endswith("_mae_pct")},
             "error_ms": None if mode == "fp32" else error_ms(compared, mode),
-            "recorded_pct": judge.worst(v for k, v in found.items() if k.endswith("_vs_recorded_pct")),
-            "hits": found["hits"],
-            "trials": found["trials"],
-            "pairs": found.get("pairs"),
+            "recorded_pct": worst(v for k, v in metrics.items() if k.endswith("_vs_recorded_pct")),
+            "hits": metrics["hits"],
+            "trials": metrics["trials"],
+            "pairs": metrics.get("pairs"),
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
-            "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in judged),
+            "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in gate_rows),
             "missed_gates": [
-                {**r, "words": gate_in_words(r["gate"])} for r in judged if r["passed"] is False and mode in r["gate"]
+                {**r, "words": gate_in_words(r["gate"])}
+                for r in gate_rows
+                if r["passed"] is False and mode in r["gate"]
             ],
         }
     static, mixed = rows.get("static"), rows.get("mixed")
@@ -109,15 +112,15 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
 def _best(rows: Sequence[dict[str, Any]], limits: Mapping[str, Any]) -> dict[str, Any]:
     """Return the row that the rule takes. FP32 has no gates to miss, so there always is one."""
     same = 1 + limits["worth_pct"] / 100
-    left = _candidates(rows)
-    if key := _work_key(left):
-        fastest = min(row[key] for row in left)
-        left = [row for row in left if row[key] <= fastest * same]
-    truest = min(error_pct(row) for row in left)
-    left = [row for row in left if error_pct(row) <= truest + limits["better_points"]]
-    smallest = min(row["size_mb"] for row in left)
-    left = [row for row in left if row["size_mb"] <= smallest * same]
-    return min(left, key=lambda row: PREFERRED.index(row["mode"]))
+    rest = _candidates(rows)
+    if key := _work_key(rest):
+        fastest = min(row[key] for row in rest)
+        rest = [row for row in rest if row[key] <= fastest * same]
+    truest = min(error_pct(row) for row in rest)
+    rest = [row for row in rest if error_pct(row) <= truest + limits["better_points"]]
+    smallest = min(row["size_mb"] for row in rest)
+    rest = [row for row in rest if row["size_mb"] <= smallest * same]
+    return min(rest, key=lambda row: PREFERRED.index(row["mode"]))
 
 
 def _candidates(rows: Iterable[Mapping[str, Any]]) -> list[Any]:
@@ -131,8 +134,8 @@ def _work_key(rows: Sequence[Mapping[str, Any]]) -> str | None:
 
 def time_key(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
     """Return which time of a mode is compared: the median, or the smallest if the machine was busy."""
-    least = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
-    return "latency_min_ms" if least and _busy(benchmark, limits) else "latency_p50_ms"
+    has_minimum = all("latency_min_ms" in timed for timed in benchmark["artifacts"].values())
+    return "latency_min_ms" if has_minimum and _busy(benchmark, limits) else "latency_p50_ms"
 
 
 def _busy(benchmark: Mapping[str, Any], limits: Mapping[str, Any]) -> str:
@@ -151,7 +154,9 @@ def _list_failures(
     stages: Stages, params: Mapping[str, Any], names: Names, rows: Mapping[str, Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Return each gate that FP32 or static misses, with its remedies; those of a Pi's time and memory are left out."""
-    limits, fp32, static = params["gates"], stages["compare"]["fp32"], rows.get(GATED, {})
+    limits = params["gates"]
+    fp32 = stages["compare"]["fp32"]
+    static = rows.get(GATED, {})
     promised = limits["original"]["latency_mean_ms"][1]
     trained = gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32["trials"]))
     floor = gate(f"{GATED} floor_ms", static.get("floor_ms"), "<=", promised)
@@ -165,12 +170,14 @@ def _list_failures(
 
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
-    compared, looking = stages["compare"], stages["compare"].get("looking", {})
-    guesses, fit = compared.get("guesses", {}), stages["load"].get("fit", {}).get("warnings", [])
-    held = [action for action, found in guesses.get("actions", {}).items() if found["held"]]
+    compared = stages["compare"]
+    looking = stages["compare"].get("looking", {})
+    guesses = compared.get("guesses", {})
+    fit = stages["load"].get("fit", {}).get("warnings", [])
+    constant = [action for action, guess in guesses.get("actions", {}).items() if guess["held"]]
     actions = [k.removesuffix("_apart_pct") for k, v in looking.items() if k.endswith("_apart_pct") and v is not None]
-    actions = [action for action in actions if action not in held]
-    blind = [a for a in actions if not judge.follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"])]
+    actions = [action for action in actions if action not in constant]
+    blind = [a for a in actions if not follows(looking[f"{a}_by_picture_pct"], looking[f"{a}_apart_pct"])]
     return advice.fill_in(
         "unfit.txt",
         warnings=[*guesses.get("warnings", []), *fit],

@@ -27,8 +27,8 @@ def find_swapped(drives: Sequence[np.ndarray]) -> np.ndarray:
     coloured = np.linalg.norm((hues - swapped).reshape(len(hues), -1), axis=1) > COLOURED
     if coloured.sum() < LEAST_DRIVES or coloured.mean() < MOST_OF:
         return np.zeros(len(drives), bool)
-    turned, nearer = _turned(hues, swapped)
-    return turned & coloured & ((nearer > UNLIKE)[coloured].mean() >= MOST_OF)
+    side, nearer = _turned(hues, swapped)
+    return side & coloured & ((nearer > UNLIKE)[coloured].mean() >= MOST_OF)
 
 
 def find_upside_down(drives: Sequence[np.ndarray]) -> np.ndarray:
@@ -36,12 +36,12 @@ def find_upside_down(drives: Sequence[np.ndarray]) -> np.ndarray:
     rows = np.array([_rows(pictures) for pictures in drives])
     rows -= rows.mean(2, keepdims=True)
     rows /= np.sqrt((rows**2).mean((0, 2), keepdims=True)) + 1e-6
-    turned, nearer = _turned(rows, rows[:, :, ::-1])
+    side, nearer = _turned(rows, rows[:, :, ::-1])
     # Walls may be darker than the floor or brighter: what is told by brightness alone is not sure.
     by_texture, nearer_by_texture = _turned(rows[:, 1:4], rows[:, 1:4, ::-1])
-    if (turned == by_texture).mean() < MOST_OF:
+    if (side == by_texture).mean() < MOST_OF:
         return np.zeros(len(drives), bool)
-    return turned & by_texture & (np.minimum(nearer, nearer_by_texture) > UNLIKE)
+    return side & by_texture & (np.minimum(nearer, nearer_by_texture) > UNLIKE)
 
 
 def _turned(features: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,16 +49,16 @@ def _turned(features: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.nd
 
     features, turned: (n, ...) descriptions of the drives, as they are and turned.
     """
-    features, turned = (each.reshape(len(each), -1) for each in (features, turned))
+    features, turned = (values.reshape(len(values), -1) for values in (features, turned))
     apart = features - turned  # what a turn changes, and only that
     apart = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
     common = np.linalg.eigh(apart.T @ apart)[1][:, -1]
     signs = apart @ common
-    others = signs * np.sign(signs.sum()) < 0
-    right = np.where(others[:, None], turned, features)
-    wrong = np.where(others[:, None], features, turned)
+    differ = signs * np.sign(signs.sum()) < 0
+    right = np.where(differ[:, None], turned, features)
+    wrong = np.where(differ[:, None], features, turned)
     usual = right.mean(0)
-    return others, _cosine(right, usual) - _cosine(wrong, usual)
+    return differ, _cosine(right, usual) - _cosine(wrong, usual)
 
 
 def _cosine(vectors: np.ndarray, one: np.ndarray) -> np.ndarray:
@@ -68,7 +68,8 @@ def _cosine(vectors: np.ndarray, one: np.ndarray) -> np.ndarray:
 def _hues(pictures: np.ndarray) -> np.ndarray:
     """Return which share of a picture has each saturated hue, (THIRDS, BINS), from top to bottom."""
     blue, green, red = np.moveaxis(pictures, -1, 0)
-    x, y = red - (green + blue) / 2, np.sqrt(3) / 2 * (green - blue)
+    x = red - (green + blue) / 2
+    y = np.sqrt(3) / 2 * (green - blue)
     hue = (np.degrees(np.arctan2(y, x)) % 360 // (360 / BINS)).astype(int) % BINS
     saturated = np.hypot(x, y) > SATURATED
     parts = zip(np.array_split(hue, THIRDS, 1), np.array_split(saturated, THIRDS, 1), strict=True)
@@ -78,7 +79,8 @@ def _hues(pictures: np.ndarray) -> np.ndarray:
 def _rows(pictures: np.ndarray) -> np.ndarray:
     """Return (6, ROWS): brightness, its spread and edges across and down, red and blue beside green, by height."""
     grey = pictures.mean(-1)
-    across, down = np.abs(np.diff(grey, axis=2)).mean((0, 2)), np.abs(np.diff(grey, axis=1, append=grey[:, -1:]))
+    across = np.abs(np.diff(grey, axis=2)).mean((0, 2))
+    down = np.abs(np.diff(grey, axis=1, append=grey[:, -1:]))
     colours = [(pictures[..., a] - pictures[..., b]).mean((0, 2)) for a, b in ((2, 1), (1, 0))]
-    found = np.array([grey.mean((0, 2)), grey.std(2).mean(0), across, down.mean((0, 2)), *colours])
-    return found.reshape(len(found), ROWS, -1).mean(2)
+    profile = np.array([grey.mean((0, 2)), grey.std(2).mean(0), across, down.mean((0, 2)), *colours])
+    return profile.reshape(len(profile), ROWS, -1).mean(2)

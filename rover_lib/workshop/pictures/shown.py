@@ -18,7 +18,7 @@ import numpy as np
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.workshop.pictures.beside import LEAST_DRIVES, find_swapped, find_upside_down
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, pick_evenly
 
 PLACES, LEAST_PLACES, MOST_DRIVES = 600, 6, 150  # looked at in all, and in a drive; drives
@@ -81,7 +81,10 @@ def _look(episode: Episode, camera: str, recordings: Recordings, drives: int) ->
     count = max(PLACES // (1 if cheap else ENCODED) // drives, LEAST_PLACES)
     small = lru_cache(4)(lambda k: _scaled(samples[k], camera))
     moving = _moving(samples, recordings)
-    pictures, equal, compared, longest = [], 0, 0, 0
+    pictures = []
+    equal = 0
+    compared = 0
+    longest = 0
     try:
         for k in pick_evenly(range(len(samples)), count):
             pictures.append(small(k))
@@ -117,7 +120,8 @@ def _count_equal(samples: Sequence[Sample], k: int, small: Any, moving: np.ndarr
 
 def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
     """Add a fault for a camera that stood still, and for pictures of a single colour."""
-    where, frames = drive.episode.path / drive.episode.id, drive.episode.frames
+    place = drive.episode.path / drive.episode.id
+    frames = drive.episode.frames
     means = drive.pictures.mean((1, 2, 3))
     blocks = drive.pictures.reshape(len(drive.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
     flat = np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
@@ -125,11 +129,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
         mean = float(means[flat].mean())
         word = "black" if mean < DARK else "white" if mean > BRIGHT else "of one colour"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
-        faults.add(where, "blank_pictures", note, max(round(flat.mean() * frames), 1))
+        faults.add(place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
     elif drive.frozen:
         count = max(round(drive.equal / drive.compared * frames), drive.longest)
         note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
-        faults.add(where, "frozen_camera", note, count)
+        faults.add(place, "frozen_camera", note, count)
 
 
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -155,7 +159,7 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
     if len(long) < LEAST_DRIVES:
         return
     pictures = [np.concatenate([piece.pictures for piece in pieces]) for pieces in long]
-    colours = np.array([float(np.ptp(each, axis=-1).mean()) for each in pictures])
+    colours = np.array([float(np.ptp(image, axis=-1).mean()) for image in pictures])
     coloured = colours[colours >= COLOURLESS]
     grey = (colours < COLOURLESS) & bool(len(coloured) >= LEAST_DRIVES and np.median(coloured) > COLOURED)
     for kind, words, odd in (
@@ -163,10 +167,10 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         ("swapped_colours", "have red and blue swapped", find_swapped(pictures)),
         ("upside_down", "are upside down", find_upside_down(pictures)),
     ):
-        others = f"beside those of {len(long) - odd.sum()} other drives"
+        reference = f"beside those of {len(long) - odd.sum()} other drives"
         if 2 * odd.sum() == len(long):
-            others += ", or these are"  # nobody can tell which half is right
-        note = f"its pictures{of_camera} {words}, {others}: turn them or leave them out"
+            reference += ", or these are"  # nobody can tell which half is right
+        note = f"its pictures{of_camera} {words}, {reference}: turn them or leave them out"
         for pieces, is_odd in zip(long, odd, strict=True):
             for drive in pieces if is_odd else ():
                 faults.add(drive.episode.path / drive.episode.id, kind, note, drive.episode.frames)

@@ -22,7 +22,8 @@ from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordi
 
 WIDTH, UPPER = 96, 0.6  # pixels of the examined pictures; the share of their rows above the floor
 STEP = 2  # frames from one examined picture to the next
-POINTS, WINDOW = 80, (11, 11)
+POINTS = 80
+WINDOW = (11, 11)
 LEAST_POINTS = 8
 LONGEST_DELAY_S = 0.4
 SMOOTH = 5  # examined pictures
@@ -58,8 +59,12 @@ class Turning:
             return f"{self.episode}: steers too little to tell which way (spread {self.spread:.2f} of {LEAST_SPREAD})"
         if self.correlation is None:
             return f"{self.episode}: too few pictures that move to tell which way it steers"
-        how = f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
-        return f"{self.episode}: " + (f"positive steering is {self.side} ({how})" if self.side else f"not sure ({how})")
+        figures = (
+            f"correlation {self.correlation:+.2f}, {self.sure:.1f} standard errors, steering spread {self.spread:.2f}"
+        )
+        return f"{self.episode}: " + (
+            f"positive steering is {self.side} ({figures})" if self.side else f"not sure ({figures})"
+        )
 
 
 @dataclass(frozen=True)
@@ -112,19 +117,20 @@ def measure_sides(recordings: Recordings, progress: Progress = silent, most: int
     # OpenCV releases the interpreter's lock, so threads help.
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
         turnings = tuple(progress(pool.map(measure_turning, drives), desc="which way it steers", total=len(drives)))
-    said = {e.samples[0].car.positive for drive in drives for e in drive}
+    sides = {e.samples[0].car.positive for drive in drives for e in drive}
     # A LeRobotDataset, which states its rate, has no car's file.
-    return Sides(turnings, said.pop() if len(said) == 1 and layout.rate_hz is None else None)
+    return Sides(turnings, sides.pop() if len(sides) == 1 and layout.rate_hz is None else None)
 
 
 def measure_turning(drive: Sequence[Episode]) -> Turning:
     """Measure one drive of one camera, by its longest pieces."""
-    pieces, left = list[Sequence[Sample]](), STEP * MOST_PAIRS
+    pieces = list[Sequence[Sample]]()
+    budget = STEP * MOST_PAIRS
     for episode in sorted(drive, key=lambda e: -len(e.samples)):
-        begin = max(0, len(episode.samples) - left) // 2
-        pieces.append(episode.samples[begin : begin + left])
-        left -= len(pieces[-1])
-        if left < STEP * LEAST_PAIRS:
+        begin = max(0, len(episode.samples) - budget) // 2
+        pieces.append(episode.samples[begin : begin + budget])
+        budget -= len(pieces[-1])
+        if budget < STEP * LEAST_PAIRS:
             break
     steering = np.array([s.chunk[0, 0] for samples in pieces for s in samples], float)
     names = tuple(e.id for e in drive)
@@ -135,15 +141,15 @@ def measure_turning(drive: Sequence[Episode]) -> Turning:
         shifts = [_shifts(samples) for samples in pieces]
     except EpisodeError:
         return best
-    moved = np.concatenate([of for _, of in shifts])
-    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(moved) >= LEAST_PAIRS else ():
+    shift = np.concatenate([of for _, of in shifts])
+    for delay_s in np.linspace(0, LONGEST_DELAY_S, 7) if len(shift) >= LEAST_PAIRS else ():
         steered = []
         for samples, (times_s, _) in zip(pieces, shifts, strict=True):
             every_s = np.array([s.time_s for s in samples])
             steered.append(np.interp(times_s - delay_s, every_s, [s.chunk[0, 0] for s in samples]))
-        found = _correlation(_smooth(np.concatenate(steered)), _smooth(moved))
-        if found and found[1] > best.sure:
-            best = replace(best, correlation=found[0], sure=found[1])
+        correlation = _correlation(_smooth(np.concatenate(steered)), _smooth(shift))
+        if correlation and correlation[1] > best.sure:
+            best = replace(best, correlation=correlation[0], sure=correlation[1])
     return best
 
 
@@ -169,9 +175,9 @@ def _shift(before: np.ndarray, after: np.ndarray) -> float | None:
     if points is None:
         return None
     flow: Any = cv2.calcOpticalFlowPyrLK  # OpenCV's types do not know that it finds where to begin
-    there, seen, _ = flow(before, after, points, None, winSize=WINDOW, maxLevel=3)
+    there, status, _ = flow(before, after, points, None, winSize=WINDOW, maxLevel=3)
     back, again, _ = flow(after, before, there, None, winSize=WINDOW, maxLevel=3)
-    good = (seen[:, 0] == 1) & (again[:, 0] == 1) & (np.abs(back - points).max((1, 2)) < 0.5)
+    good = (status[:, 0] == 1) & (again[:, 0] == 1) & (np.abs(back - points).max((1, 2)) < 0.5)
     return float(np.median((there - points)[good, 0, 0])) if good.sum() >= LEAST_POINTS else None
 
 
@@ -183,7 +189,8 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 def _correlation(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
     """Return the correlation of two series, and how many standard errors it is from 0; None if one does not vary."""
     x, y = x - x.mean(), y - y.mean()
-    n, norm = len(x), math.sqrt((x @ x) * (y @ y))
+    n = len(x)
+    norm = math.sqrt((x @ x) * (y @ y))
     if norm < 1e-9:
         return None
     r = float(x @ y) / norm

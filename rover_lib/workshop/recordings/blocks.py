@@ -23,7 +23,7 @@ PARTS = ("calibration", "choosing", "held_out")  # each may take the gap from th
 
 def usual_rate_hz(episodes: Sequence[Episode]) -> float:
     """The median of the episodes' frames per second; 0 if none has two frames."""
-    rates = [found for e in episodes if (found := frame_rate_hz(e.samples)) is not None]
+    rates = [rate_hz for e in episodes if (rate_hz := frame_rate_hz(e.samples)) is not None]
     return float(np.median(rates)) if rates else 0.0
 
 
@@ -32,12 +32,14 @@ def name_blocks(episodes: Sequence[Episode], place: str = "") -> tuple[tuple[Epi
 
     place: its name, which the blocks' names begin with.
     """
-    rate_hz, total = usual_rate_hz(episodes), sum(len(e.samples) for e in episodes)
+    rate_hz = usual_rate_hz(episodes)
+    total = sum(len(e.samples) for e in episodes)
     count = _count(total / rate_hz, len(episodes[0].samples[0].chunk) / rate_hz) if rate_hz else 0
     if not count:
         return tuple(episodes), ()
     names = tuple(f"{place} block {i + 1} of {count}".strip() for i in range(count))
-    named, done = list[Episode](), 0
+    named = list[Episode]()
+    done = 0
     for e in episodes:
         samples = [replace(s, block=names[(done + k) * count // total]) for k, s in enumerate(e.samples)]
         named.append(replace(e, samples=tuple(samples)))
@@ -55,10 +57,10 @@ def name_long_drives(episodes: Sequence[Episode]) -> tuple[tuple[Episode, ...], 
 
 def _count(length_s: float, plan_s: float) -> int:
     """How many blocks a place of that length has; 0 if even the fewest would be shorter than a plan."""
-    most, least = FEWEST
-    if length_s < 2 * plan_s * most:
-        return least if length_s >= plan_s * least else 0
-    return max(most, round(length_s / min(BLOCK_S, max(SHORTER_S, length_s / WANTED))))
+    maximum, minimum = FEWEST
+    if length_s < 2 * plan_s * maximum:
+        return minimum if length_s >= plan_s * minimum else 0
+    return max(maximum, round(length_s / min(BLOCK_S, max(SHORTER_S, length_s / WANTED))))
 
 
 def draw_blocks(places: Sequence[Sequence[str]], share: float, rng: np.random.Generator) -> dict[str, str]:
@@ -77,10 +79,10 @@ def draw_blocks(places: Sequence[Sequence[str]], share: float, rng: np.random.Ge
 
 def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dict[str, tuple[Sample, ...]]:
     """Return the samples of each part, without those of the gaps. drawn: what draw_blocks returned."""
-    every = [(e, s) for e in episodes for s in e.samples]
-    ranks = np.array([PARTS.index(drawn.get(s.block, PARTS[0])) for _, s in every])
-    kept = np.ones(len(every), bool)
-    chunk = len(every[0][1].chunk)
+    pairs = [(e, s) for e in episodes for s in e.samples]
+    ranks = np.array([PARTS.index(drawn.get(s.block, PARTS[0])) for _, s in pairs])
+    usable = np.ones(len(pairs), bool)
+    chunk = len(pairs[0][1].chunk)
     plan_s = chunk / (usual_rate_hz(episodes) or 1.0)
 
     def is_near(e: Episode, s: Sample, other: Episode, o: Sample) -> bool:
@@ -93,10 +95,10 @@ def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dic
     for at in (np.flatnonzero(np.diff(ranks)) + 1).tolist():
         for border, step in ((at - 1, 1), (at, -1)):  # the last sample before, and the first one after
             i = border + step
-            while 0 <= i < len(every) and is_near(*every[border], *every[i]):
-                kept[i] &= ranks[i] >= ranks[border]
+            while 0 <= i < len(pairs) and is_near(*pairs[border], *pairs[i]):
+                usable[i] &= ranks[i] >= ranks[border]
                 i += step
-    return {part: tuple(every[i][1] for i in np.flatnonzero(kept & (ranks == k))) for k, part in enumerate(PARTS)}
+    return {part: tuple(pairs[i][1] for i in np.flatnonzero(usable & (ranks == k))) for k, part in enumerate(PARTS)}
 
 
 def group_by_block(samples: Sequence[Sample]) -> list[list[int]]:

@@ -5,9 +5,8 @@ older one. The duty is the pulse's share of its period.
 """
 
 import math
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -16,8 +15,17 @@ import numpy as np
 
 from rover_lib.onboard.car.pwm import Channel, PwmCalibration
 from rover_lib.onboard.errors import EpisodeError
-from rover_lib.onboard.recording import episode as written
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Fault, relative
+from rover_lib.onboard.recording.episode import (
+    BURST_MIN,
+    CONTROL_FIELDS,
+    arduino_step_s,
+    driver_of,
+    find_backlog,
+    no_pulse,
+    number_of,
+)
+from rover_lib.workshop.recordings.faults import Faults
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode
 from rover_lib.workshop.untrusted import quote
 
 EXACT = 1e-3  # an action agrees with a formula within this; recorded actions have 4 decimals
@@ -25,7 +33,6 @@ FOLLOWS = 0.9  # the share of readings that must agree
 LEAST_READINGS = 8  # fewer do not show a formula, and are taken as recorded
 HALF = 0.4, 0.6  # where the middle of steering is straight ahead if it lies from 0 to 1
 FAR = 0.2  # of an action's unit: a pulse beyond the ends of its range by more is no jitter
-DECISIVE = ("no_formula", "no_car", "no_overlap", "unreadable")  # one is enough to leave a recording out
 Item = TypeVar("Item")
 Rows = list[tuple[int, dict[str, float], str]]  # the number of a control, its numbers, and who drove
 Actions = dict[int, float]  # of one channel, by the number of their control
@@ -41,34 +48,6 @@ OLD = {
 def _formula(channel: Channel) -> str:
     duty = f"(duty % - {channel.neutral_pct:.3g})" if channel.neutral_pct else "duty %"
     return f"{duty} / {channel.span_pct:.3g}"
-
-
-@dataclass
-class Faults:
-    """Counts faults by file and kind, and keeps the note of the first."""
-
-    root: Path
-    counted: dict[tuple[str, str], list] = field(default_factory=dict)
-
-    def add(self, path: Path, kind: str, note: str, count: int = 1) -> None:
-        if count:
-            entry = self.counted.setdefault((relative(path, self.root), kind), [0, note])
-            entry[0] += count
-
-    def listed(self) -> tuple[Fault, ...]:
-        return tuple(Fault(file, kind, count, note) for (file, kind), (count, note) in sorted(self.counted.items()))
-
-    def nothing_usable(self, what: str, remedy: str) -> EpisodeError:
-        """The error of recordings of which all is left out. remedy: if the first reason has none of its own."""
-        left = [fault for fault in self.listed() if fault.handled == "left out"]
-        kinds: Counter[str] = Counter()
-        for fault in left:
-            kinds[fault.kind] += fault.count
-        most = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
-        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in most)
-        found = next((f"{fault.note} ({fault.file})" for fault in left if fault.kind == most[0]), "")
-        what = f"{self.root}: {what} ({worst or 'empty'})"
-        return EpisodeError(what, found=found or None, remedy="" if "; " in found else remedy)
 
 
 def note_one_sided(episodes: Sequence[Episode], faults: Faults) -> None:
@@ -101,10 +80,10 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"control {i} is a {type(row).__name__}, not an object")
             continue
-        lost = [name for name in ACTION_NAMES if written.no_pulse(row, name)]
-        wanted = [name for name in written.CONTROL_FIELDS if name.split("_")[0] not in lost]
-        values = {n: number for n in wanted if (number := written.number_of(row.get(n))) is not None}
-        if bad := [name for name in wanted if name not in values]:
+        lost = [name for name in ACTION_NAMES if no_pulse(row, name)]
+        columns = [name for name in CONTROL_FIELDS if name.split("_")[0] not in lost]
+        values = {n: number for n in columns if (number := number_of(row.get(n))) is not None}
+        if bad := [name for name in columns if name not in values]:
             faults.add(path, "wrong_type", f"control {i}: {bad[0]} is {quote(row.get(bad[0]))}")
             continue  # the recorder did not write such a row, so nothing in it can be trusted
         if nan := [name for name, value in values.items() if math.isnan(value)]:
@@ -113,15 +92,15 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
             continue  # without a time it cannot be the action of a frame
         for name in lost:
             faults.add(path, f"{name}_no_pulse", f"control {i}: not measured; such values are missing, not 0")
-        if (driver := written.driver_of(row)) is None:
+        if (driver := driver_of(row)) is None:
             faults.add(path, "unknown_driver", f"control {i}: {quote(row.get('driver'))} drove; left out")
             continue
         read.append((i, values, driver))
-    found = {name: _read_actions(pwm.channel(name), read, path, faults) for name in ACTION_NAMES}
-    formulas = {name: _formula(older) for name, (*_, older) in found.items() if older}
+    by_name = {name: _read_actions(pwm.channel(name), read, path, faults) for name in ACTION_NAMES}
+    formulas = {name: _formula(older) for name, (*_, older) in by_name.items() if older}
     # Too few readings to show a formula are of older firmware too, if the other channel's are.
     actions = {}
-    for name, (recorded, meant, _) in found.items():
+    for name, (recorded, meant, _) in by_name.items():
         actions[name] = _take(pwm.channel(name), recorded, meant, bool(formulas), path, faults)
     controls = []
     for i, values, driver in read:
@@ -129,7 +108,7 @@ def read_controls(path: Path, rows: list, pwm: PwmCalibration, faults: Faults) -
         pulses = tuple(values.get(f"{n}_raw_us", math.nan) if i in actions[n] else math.nan for n in ACTION_NAMES)
         times_s = values["system_timestamp"], values["arduino_timestamp"] / 1000
         controls.append(Control(*times_s, pair, driver, pulses))
-    went_on = [written.arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
+    went_on = [arduino_step_s(a.arduino_s, b.arduino_s) > 0 for a, b in pairwise(controls)]
     return in_order([(c.system_s, c) for c in controls], went_on, path, "control", faults), formulas
 
 
@@ -140,7 +119,10 @@ def _read_actions(channel: Channel, rows: Rows, path: Path, faults: Faults) -> t
     """
     name = channel.name
     old = replace(OLD[name], period_us=channel.period_us, by_pulse=channel.by_pulse)
-    recorded, meant, of_old, pulses_us = {}, {}, {}, {}
+    recorded = {}
+    meant = {}
+    of_old = {}
+    pulses_us = {}
     for i, values, _ in rows:
         parts = [values.get(f"{name}_{part}", math.nan) for part in ("normalized", "raw_us", "period_us")]
         if any(map(math.isnan, parts)):
@@ -162,13 +144,13 @@ def _read_actions(channel: Channel, rows: Rows, path: Path, faults: Faults) -> t
     unlike = len(recorded) >= LEAST_READINGS and len(wrong) > (1 - FOLLOWS) * len(recorded)
     if not follows_old and not unlike:
         return recorded, meant, None
-    seen = f"control {wrong[0]}: {recorded[wrong[0]]:g} recorded, its pulse says {meant[wrong[0]]:.4f}"
+    example = f"control {wrong[0]}: {recorded[wrong[0]]:g} recorded, its pulse says {meant[wrong[0]]:.4f}"
     if not follows_old:
-        what = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither "
+        problem = f"{name} follows no known formula of its pulses: {len(wrong)} of {len(recorded)} neither "
         remedy = "correct them, say in metadata.car which car it is, or record again"
-        what += f"{_formula(old)} nor {_formula(channel)}, this car's"
-        raise EpisodeError(what, found=seen, remedy=remedy, kind="no_formula")
-    note = f"recorded as {_formula(old)} instead of {_formula(channel)}; {seen}; recomputed from the pulses"
+        problem += f"{_formula(old)} nor {_formula(channel)}, this car's"
+        raise EpisodeError(problem, found=example, remedy=remedy, kind="no_formula")
+    note = f"recorded as {_formula(old)} instead of {_formula(channel)}; {example}; recomputed from the pulses"
     faults.add(path, f"{name}_recomputed", note, len(wrong))
     return meant, meant, old
 
@@ -179,10 +161,10 @@ def _refuse_other_pulses(channel: Channel, pulses_us: dict[int, float]) -> None:
     far = [i for i, us in pulses_us.items() if not low_us - margin_us <= us <= high_us + margin_us]
     count = len(pulses_us)
     if count >= LEAST_READINGS and 2 * len(far) > count:
-        what = f"{channel.name}: {len(far)} of {count} pulses lie far beyond this car's {low_us} to {high_us} us"
+        problem = f"{channel.name}: {len(far)} of {count} pulses lie far beyond this car's {low_us} to {high_us} us"
         remedy = "write pulses and periods in microseconds, or say which car it is in metadata.car"
-        found = f"{pulses_us[far[0]]:g} us in control {far[0]}"
-        raise EpisodeError(what, found=found, remedy=remedy, kind="no_formula")
+        actual = f"{pulses_us[far[0]]:g} us in control {far[0]}"
+        raise EpisodeError(problem, found=actual, remedy=remedy, kind="no_formula")
 
 
 def _take(channel: Channel, recorded: Actions, meant: Actions, recompute: bool, path: Path, faults: Faults) -> Actions:
@@ -204,27 +186,30 @@ def _take(channel: Channel, recorded: Actions, meant: Actions, recompute: bool, 
 
 def place_bursts(controls: list[Control], path: Path, faults: Faults) -> list[Control]:
     """Give the controls of a serial burst the times at which they were measured, or drop them."""
-    late = written.find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
+    late = find_backlog([c.system_s for c in controls], [c.arduino_s for c in controls])
     ends = [i + 1 for i, is_late in enumerate(late) if not is_late]
-    placed, moved, dropped, farthest_s = list[Control](), 0, 0, 0.0
+    placed = list[Control]()
+    shifted = 0
+    dropped = 0
+    farthest_s = 0.0
     for start, end in pairwise([0, *ends]):
         # A burst and the live control that ends it: the times of all others are not those of their measuring.
         *waited, after = controls[start:end]
         placed.append(after)
-        if len(waited) < written.BURST_MIN:
+        if len(waited) < BURST_MIN:
             placed += reversed(waited)
             continue
-        for left, control in reversed([*enumerate(waited, 1)]):
-            step_s = written.arduino_step_s(control.arduino_s, after.arduino_s)
+        for remaining, control in reversed([*enumerate(waited, 1)]):
+            step_s = arduino_step_s(control.arduino_s, after.arduino_s)
             if math.isnan(step_s):  # a restart, readings that were sent twice, or no number
-                dropped += left
+                dropped += remaining
                 break
             after = replace(control, system_s=after.system_s - step_s)
             farthest_s = max(farthest_s, control.system_s - after.system_s)
             placed.append(after)
-            moved += 1
+            shifted += 1
     note = f"placed by the Arduino's clock, up to {farthest_s:.2f} s before they arrived"
-    faults.add(path, "serial_burst", note, moved)
+    faults.add(path, "serial_burst", note, shifted)
     faults.add(path, "serial_burst_dropped", "the Arduino's clock is missing, or steps back after them", dropped)
     return sorted(placed, key=lambda c: c.system_s)
 

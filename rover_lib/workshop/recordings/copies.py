@@ -14,14 +14,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import Episode, Sample, pick_evenly
 
 RUN = 4  # consecutive actions that are compared at once
 STEPS = (1, 2, 3, 4, 5)  # a copy may have only every fifth row
 DIGITS = 2  # of an action; somebody may have rounded them
 SHARED = 0.3  # the share of an episode's runs that makes it a suspect, and of its compared pictures that differ
-COMPARED, SEEN = 8, (16, 9)  # pictures of a suspect, and the size to which they are scaled down
+COMPARED = 8
+SEEN = (16, 9)  # pictures of a suspect, and the size to which they are scaled down
 ALIKE = 4.0  # grey levels, on average over a picture; encoding anew changes less, and a car that moves more
 OF_CONTRAST = 0.1  # at most this share of the mean distance from a picture's mean
 CORRELATED = 0.98  # or so similar, whatever their brightness: a car that moved for five frames has 0.72 to 0.975
@@ -32,7 +33,7 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
     """Return the episodes without those that are the same drive as another, of which the longest is kept."""
     scaled = lru_cache(1000)(scaled_down)
     having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
-    kept = set()
+    unique = set()
     for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
         runs = _runs(episodes[i])
         shared: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -49,11 +50,11 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
             note = f"the same drive as {same.id}, as its actions and pictures show"
             faults.add(episodes[i].path / episodes[i].id, "copy", note)
             continue
-        kept.add(i)
+        unique.add(i)
         for run, k in (item for step in STEPS for item in _runs(episodes[i], step).items()):
             if len(having[run]) < MOST_ALIKE:
                 having[run].append((i, k))
-    return tuple(episode for i, episode in enumerate(episodes) if i in kept)
+    return tuple(episode for i, episode in enumerate(episodes) if i in unique)
 
 
 def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
@@ -83,16 +84,17 @@ def look_alike(
     episode: Episode, other: Episode, pairs: list[tuple[int, int]], scaled: Callable[[Sample], np.ndarray]
 ) -> bool:
     """Whether most pictures at the same actions are the same, and could differ. pairs: a sample of each."""
-    chosen, others = pick_evenly(sorted(pairs), COMPARED), 0
-    for k, there in chosen:
-        others += not _is_same(scaled(episode.samples[k]), scaled(other.samples[there]))
-        if others > SHARED * len(chosen):
+    sampled = pick_evenly(sorted(pairs), COMPARED)
+    different = 0
+    for k, there in sampled:
+        different += not _is_same(scaled(episode.samples[k]), scaled(other.samples[there]))
+        if different > SHARED * len(sampled):
             return False
-    ours = [scaled(episode.samples[k]) for k, _ in chosen]
+    ours = [scaled(episode.samples[k]) for k, _ in sampled]
     if np.ptp([s.chunk[0] for s in episode.samples], axis=0).any() or not all(_is_same(ours[0], a) for a in ours):
         return True
     # The car stands, as it may have on another day: but noise never repeats.
-    return all(np.array_equal(a, scaled(other.samples[there])) for a, (_, there) in zip(ours, chosen, strict=True))
+    return all(np.array_equal(a, scaled(other.samples[there])) for a, (_, there) in zip(ours, sampled, strict=True))
 
 
 def _is_same(a: np.ndarray, b: np.ndarray) -> bool:

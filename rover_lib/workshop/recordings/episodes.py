@@ -26,7 +26,17 @@ from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import NEUTRAL
 from rover_lib.onboard.errors import CarError, EpisodeError
 from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
-from rover_lib.onboard.recording import episode as written
+from rover_lib.onboard.recording.episode import (
+    CONTROL_FIELDS,
+    DATA,
+    DATA_BYTES,
+    FRAME_FIELDS,
+    NOBODY,
+    car_in,
+    find_killed,
+    number_of,
+    read_car_of,
+)
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import (
@@ -36,10 +46,12 @@ from rover_lib.workshop.recordings.blocks import (
     part_by_blocks,
     usual_rate_hz,
 )
-from rover_lib.workshop.recordings.controls import Control, Faults, in_order, place_bursts, read_controls
+from rover_lib.workshop.recordings.controls import Control, in_order, place_bursts, read_controls
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.lerobot_dataset import load_dataset
 from rover_lib.workshop.recordings.pictures import HOLE_INTERVALS, HOLE_S, check_pictures
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, Source, block_of, following
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Episode, Recordings, Sample, block_of, following
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.recordings.strangers import READ, name_stranger
 from rover_lib.workshop.recordings.tub import find_tubs, load_tubs
 from rover_lib.workshop.recordings.twins import leave_out_copies
@@ -47,8 +59,8 @@ from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_
 
 # What the JSON file has under these names, and where it is again with which columns.
 TABLES = {
-    "control_samples": ("control_data.csv", written.CONTROL_FIELDS),
-    "frame_samples": ("frame_data.csv", written.FRAME_FIELDS),
+    "control_samples": ("control_data.csv", CONTROL_FIELDS),
+    "frame_samples": ("frame_data.csv", FRAME_FIELDS),
 }
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 Samples = tuple[Sample, ...]
@@ -98,8 +110,11 @@ def load_recordings(
     if "dataset" not in kinds:
         for option, names in (("--action-names", source.action_names), ("--camera", source.cameras)):
             if names not in ((), ACTION_NAMES):
-                what, found = f"{root}: our recordings and tubs have one camera and named actions", ",".join(names)
-                raise EpisodeError(what, found=f"{option} {found}", remedy="leave it out")
+                problem, names_in_words = (
+                    f"{root}: our recordings and tubs have one camera and named actions",
+                    ",".join(names),
+                )
+                raise EpisodeError(problem, found=f"{option} {names_in_words}", remedy="leave it out")
         if tubs := find_tubs(root, kinds):
             return load_tubs(source, tubs, chunk, progress)
     if source.throttle:
@@ -109,26 +124,28 @@ def load_recordings(
     root = root if root.name else root.resolve()  # "." has no name to give an episode
     try:
         if any((root / name).exists() for name in EPISODE_FILES):
-            root, folders, others = root.parent, [root], []  # so that faults and hashes name the episode here too
+            root, folders, strangers = root.parent, [root], []  # so that faults and hashes name the episode here too
         else:
-            others = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
-            folders = [p for p in others if any((p / name).exists() for name in EPISODE_FILES)]
+            strangers = sorted(p for p in root.iterdir() if not p.name.startswith((".", "__MACOSX")) and p.is_dir())
+            folders = [p for p in strangers if any((p / name).exists() for name in EPISODE_FILES)]
     except OSError as e:
         words, remedy = (name_stranger(root) if root.is_file() else None) or ("no folder of episodes", FOLDER)
         raise EpisodeError(f"{root}: {words} ({e.strerror})", remedy=remedy) from None
     finish = f"`rover record {shlex.quote(str(root))} --finish` makes an episode of it"
-    killed = written.find_killed(root)
+    killed = find_killed(root)
     if not folders:
         inside = quote_all(sorted(p.name for p in root.iterdir())) or None
-        what, remedy = "no episode folders in it", finish if killed else READ
+        problem = "no episode folders in it"
+        remedy = finish if killed else READ
         if not killed and (stranger := name_stranger(root)):
-            what, remedy = f"{stranger[0]}, not our recordings", stranger[1]
-        raise EpisodeError(f"{root}: {what}", found=inside, remedy=remedy)
+            problem = f"{stranger[0]}, not our recordings"
+            remedy = stranger[1]
+        raise EpisodeError(f"{root}: {problem}", found=inside, remedy=remedy)
     faults = Faults(root)
     for part in killed:
         faults.add(part, "killed_recording", finish)
-    for folder in sorted({*others} - {*folders}):
-        faults.add(folder, "no_episode", f"neither {written.DATA} nor CSV files; drives in folders of it are not read")
+    for folder in sorted({*strangers} - {*folders}):
+        faults.add(folder, "no_episode", f"neither {DATA} nor CSV files; drives in folders of it are not read")
     episodes = []
     for folder in progress(folders, desc="reading episodes", total=len(folders)):
         try:
@@ -150,10 +167,10 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         with limited_memory():
             content, tables = _read_tables(folder, faults)
             # read_car_of reads larger files
-            car = written.car_in(content.get("metadata"), folder) if content else written.read_car_of(folder)
+            car = car_in(content.get("metadata"), folder) if content else read_car_of(folder)
     except (OSError, ValueError, csv.Error, MemoryError) as e:
-        what = f"neither {written.DATA} nor its CSV files can be read: {quote(str(e) or 'too much memory')}"
-        raise EpisodeError(what, kind="unreadable") from None
+        problem = f"neither {DATA} nor its CSV files can be read: {quote(str(e) or 'too much memory')}"
+        raise EpisodeError(problem, kind="unreadable") from None
     (source, control_rows), (frames_source, frame_rows) = tables["control_samples"], tables["frame_samples"]
     controls, formulas = read_controls(source, control_rows, car.pwm, faults)
     frames = _read_frames(folder, frames_source, frame_rows, faults)
@@ -162,11 +179,11 @@ def _load_episode(folder: Path, chunk: int, sync_s: float, faults: Faults) -> Ep
         controls = place_bursts(controls, source, faults)
         samples = _make_samples(folder, car, frames, controls, chunk, sync_s, faults)
     if not samples:
-        what = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
-        raise EpisodeError(what, kind="nothing_usable")
+        problem = f"of {len(controls)} usable controls and {len(frames)} usable frame entries"
+        raise EpisodeError(problem, kind="nothing_usable")
     files = tuple(p for name in EPISODE_FILES if (p := folder / name).is_file())
     counts = frames[-1].time_s - frames[0].time_s, len(frame_rows), len(control_rows)
-    label = said if isinstance(said := content.get("action_label"), str) else ""
+    label = raw_label if isinstance(raw_label := content.get("action_label"), str) else ""
     return Episode(folder.name, folder, label, *counts, samples, files, formulas)
 
 
@@ -175,7 +192,9 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[dict[str, Any], dict[str
 
     The rows are the JSON's, or where it has none the CSV file's. Raises OSError, ValueError and csv.Error for that one.
     """
-    path, content, why = folder / written.DATA, dict[str, Any](), "no rows of controls or frames in it"
+    path = folder / DATA
+    content = dict[str, Any]()
+    why = "no rows of controls or frames in it"
     try:
         found = read_json(path)
         content = found if isinstance(found, dict) else {}
@@ -191,7 +210,7 @@ def _read_tables(folder: Path, faults: Faults) -> tuple[dict[str, Any], dict[str
 
 
 def _read_csv(path: Path, fields: Sequence[str]) -> list[dict[str, Any]]:
-    lines = read_plain(path, written.DATA_BYTES).decode("utf-8-sig", errors="replace").splitlines()
+    lines = read_plain(path, DATA_BYTES).decode("utf-8-sig", errors="replace").splitlines()
     # In a row that was cut, a missing field must not look like an empty one, which means "no pulse".
     table = csv.DictReader(lines, restval="missing")
     if missing := [name for name in fields if name not in (table.fieldnames or ())]:
@@ -206,30 +225,32 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         if not isinstance(row, dict):
             faults.add(path, "wrong_type", f"frame {i} is a {type(row).__name__}, not an object")
             continue
-        number, time_s = written.number_of(row.get("frame_id")), written.number_of(row.get("timestamp"))
+        number, time_s = number_of(row.get("frame_id")), number_of(row.get("timestamp"))
         name = row.get("image_path")
         nan = math.isnan(number or 0) or math.isnan(time_s or 0)
         if nan or number is None or time_s is None or not isinstance(name, str) or not name:
-            said = quote_all(row.get(name) for name in written.FRAME_FIELDS)
-            faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {said}")
+            row_values = quote_all(row.get(name) for name in FRAME_FIELDS)
+            faults.add(path, "not_finite" if nan else "wrong_type", f"frame {i}: {row_values}")
             continue
         if number in listed:
             faults.add(path, "duplicate_frame_id", f"frame id {number:g} again in row {i}; the first one counts")
             continue
         listed[number] = int(number), time_s, name
-    found = check_pictures(folder, [name for *_, name in listed.values()], path, faults)
+    pictures = check_pictures(folder, [name for *_, name in listed.values()], path, faults)
     frames = []
-    for (number, time_s, _), (picture, usable) in zip(listed.values(), found, strict=True):
+    for (number, time_s, _), (picture, usable) in zip(listed.values(), pictures, strict=True):
         frames.append(_Frame(number, time_s, picture, usable))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
-    kept = frames[:1]
+    accepted = frames[:1]
     for frame in frames[1:]:
-        if frame.time_s > kept[-1].time_s:
-            kept.append(frame)
+        if frame.time_s > accepted[-1].time_s:
+            accepted.append(frame)
         else:
-            faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {kept[-1].number}")
-    return kept
+            faults.add(
+                path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {accepted[-1].number}"
+            )
+    return accepted
 
 
 def _nearest(times_s: np.ndarray, controls: list[Control], within_s: float) -> list[Control | None]:
@@ -254,13 +275,13 @@ def _make_samples(
     steering = _nearest(times_s, [c for c in controls if c.actions[0] is not None], sync_s)
     throttle = _nearest(times_s, [c for c in controls if c.actions[1] is not None], sync_s)
     measured = list(zip(steering, throttle, strict=True))
-    known = np.array([all(pair) for pair in measured])
+    measured_both = np.array([all(pair) for pair in measured])
     actions = np.array([[c.actions[i] if c else 0 for i, c in enumerate(pair)] for pair in measured], np.float32)
     pulses_us = [[c.pulses_us[i] if c else math.nan for i, c in enumerate(pair)] for pair in measured]
     without = nearest.count(None)
     faults.add(folder, "frame_without_control", f"no control within {sync_s * 1000:g} ms", without)
     note = f"controls near, but without a measured pulse within {sync_s * 1000:g} ms"
-    faults.add(folder, "frame_without_measurement", note, len(frames) - without - int(known.sum()))
+    faults.add(folder, "frame_without_measurement", note, len(frames) - without - int(measured_both.sum()))
 
     steps_s = np.diff(times_s)
     longest_s = min(HOLE_INTERVALS * float(np.median(steps_s)), HOLE_S) if len(steps_s) else HOLE_S
@@ -270,9 +291,9 @@ def _make_samples(
 
     samples: list[Sample] = []
     drivers = [c.driver if c else "" for c in nearest]
-    held = np.array([driver == written.NOBODY for driver in drivers])
-    breaks = np.union1d(holes, np.flatnonzero(held[1:] != held[:-1]) + 1)
-    with_action = np.flatnonzero(known)
+    undriven = np.array([driver == NOBODY for driver in drivers])
+    breaks = np.union1d(holes, np.flatnonzero(undriven[1:] != undriven[:-1]) + 1)
+    with_action = np.flatnonzero(measured_both)
     cuts = np.flatnonzero((np.diff(with_action) > 1) | np.isin(with_action[1:], breaks)) + 1
     for segment in np.split(with_action, cuts):
         chunks, pads = following(actions[segment], chunk)
@@ -284,8 +305,8 @@ def _make_samples(
                 continue
             state = actions[i - 1] if k else np.asarray(NEUTRAL, np.float32)
             numbers = state.copy(), chunks[k], pads[k]
-            shown = folder.name, frames[i].path, float(times_s[i] - times_s[0])
-            samples.append(Sample(*shown, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
+            source = folder.name, frames[i].path, float(times_s[i] - times_s[0])
+            samples.append(Sample(*source, *numbers, i, drivers[i], car, (pulses_us[i][0], pulses_us[i][1])))
     return tuple(samples)
 
 
@@ -317,7 +338,8 @@ def split(recordings: Recordings, held_out_share: float = 0.25, seed: int = 0) -
 
 def _split_by_blocks(recordings: Recordings, held_out_share: float, seed: int) -> Split:
     """Split by the blocks that are left, if episodes were left out since they were named."""
-    episodes, there = recordings.episodes, {s.block for s in recordings.samples}
+    episodes = recordings.episodes
+    there = {s.block for s in recordings.samples}
     places = [[name for name in names if name in there] for names in recordings.blocks]
     drawn = draw_blocks([names for names in places if len(names) > 2], held_out_share, np.random.default_rng(seed))
     if not drawn:
@@ -329,21 +351,24 @@ def _split_by_blocks(recordings: Recordings, held_out_share: float, seed: int) -
 
 
 def _split_by_time(episodes: tuple[Episode, ...], held_out_share: float) -> Split:
-    calibration, choosing, held_out = list[Sample](), list[Sample](), list[Sample]()
+    calibration = list[Sample]()
+    choosing = list[Sample]()
+    held_out = list[Sample]()
     for episode in episodes:
         samples = episode.samples
         gap = len(samples[0].chunk)
-        left = len(samples) - 2 * gap
-        if left < 3:
+        remaining = len(samples) - 2 * gap
+        if remaining < 3:
             continue  # too short to leave a gap of one chunk between the parts
-        held = min(max(round(left * held_out_share), 2), left - 1)
-        first, second = left - held, held // 2
+        held_count = min(max(round(remaining * held_out_share), 2), remaining - 1)
+        first = remaining - held_count
+        second = held_count // 2
         calibration += samples[:first]
         choosing += samples[first + gap : first + gap + second]
         held_out += samples[first + gap + second + gap :]
     if not held_out:
-        what = f"{len(episodes)} episode(s) are too short to be parted"
-        raise EpisodeError(what, remedy="record at least three episodes, or a longer one")
+        problem = f"{len(episodes)} episode(s) are too short to be parted"
+        raise EpisodeError(problem, remedy="record at least three episodes, or a longer one")
     note = f"only {len(episodes)} episode(s): parted along time, with a gap of one chunk between"
     return Split(tuple(calibration), tuple(choosing), tuple(held_out), note)
 
@@ -356,8 +381,8 @@ def choose_calibration(samples: Samples, count: int = 200, seed: int = 0) -> tup
     fewer than asked for, else None. Raises EpisodeError for no samples or a count below 1.
     """
     if not samples or count < 1:
-        what = f"cannot choose {count} of {len(samples)} samples for calibration"
-        raise EpisodeError(what, remedy="record more episodes")
+        problem = f"cannot choose {count} of {len(samples)} samples for calibration"
+        raise EpisodeError(problem, remedy="record more episodes")
     if len(samples) <= count:
         fewer = len(samples) < count
         note = f"asked for {count} calibration samples, found only {len(samples)}: all are used" if fewer else None
@@ -367,12 +392,12 @@ def choose_calibration(samples: Samples, count: int = 200, seed: int = 0) -> tup
     points = np.stack([np.concatenate([s.state[None], s.chunk[steps]]) for s in samples]).astype(np.float64)
     spread = points.reshape(-1, points.shape[-1]).std(axis=0)
     points = (points / np.where(spread > 0, spread, 1)).reshape(len(samples), -1)
-    chosen = [int(rng.integers(len(samples)))]
+    picks = [int(rng.integers(len(samples)))]
     distance = np.full(len(samples), np.inf)
-    while len(chosen) < (count + 1) // 2:
-        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-        distance[chosen] = -1  # equal points must not be taken twice
-        chosen.append(int(distance.argmax()))
-    rest = np.setdiff1d(np.arange(len(samples)), chosen)
-    chosen += rng.choice(rest, count - len(chosen), replace=False).tolist()
-    return tuple(samples[i] for i in sorted(chosen)), None
+    while len(picks) < (count + 1) // 2:
+        distance = np.minimum(distance, ((points - points[picks[-1]]) ** 2).sum(axis=1))
+        distance[picks] = -1  # equal points must not be taken twice
+        picks.append(int(distance.argmax()))
+    rest = np.setdiff1d(np.arange(len(samples)), picks)
+    picks += rng.choice(rest, count - len(picks), replace=False).tolist()
+    return tuple(samples[i] for i in sorted(picks)), None

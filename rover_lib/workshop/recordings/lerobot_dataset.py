@@ -27,9 +27,11 @@ from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop import untrusted
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import name_long_drives
-from rover_lib.workshop.recordings.controls import Faults, note_one_sided
+from rover_lib.workshop.recordings.controls import note_one_sided
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.names import ACTION, STATE, camera_names, name_numbers, name_states
-from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, Source, following
+from rover_lib.workshop.recordings.samples import Episode, Layout, Recordings, Sample, following
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.states import OTHER_STATE, explain_state, last_actions
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all
@@ -95,14 +97,14 @@ class _Camera:
                 note = f"the picture of '{self.key}' in row {min(self.torn)} is torn, or one it needs: copy it again"
                 faults.add(self.paths[min(self.torn)], "broken_picture", note, len(self.torn))
             return {*self.torn}
-        found: list[str] = []
+        problems: list[str] = []
         for batch in self.rows.iter(BATCH):
             encoded = [(picture or {}).get("bytes") or b"" for picture in batch[self.key]]
-            found += [untrusted.check_encoded(data, self.size) for data in encoded]
-        unusable = [row for row, why in enumerate(found) if why]
+            problems += [untrusted.check_encoded(data, self.size) for data in encoded]
+        unusable = [row for row, why in enumerate(problems) if why]
         if unusable:
-            remedy = "" if len(unusable) < len(found) else f"; correct {INFO}, or write the pictures anew as RGB"
-            note = f"the picture of '{self.key}' in row {unusable[0]}: {found[unusable[0]]}{remedy}"
+            remedy = "" if len(unusable) < len(problems) else f"; correct {INFO}, or write the pictures anew as RGB"
+            note = f"the picture of '{self.key}' in row {unusable[0]}: {problems[unusable[0]]}{remedy}"
             faults.add(self.paths[unusable[0]], "broken_picture", note, len(unusable))
         return {*unusable}
 
@@ -113,9 +115,9 @@ class _Camera:
 
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torchvision warns of the decoder
-                shown = decode_video_frames(self.paths[row], [self.times_s[row]], TOLERANCE_S, BACKEND)[0]
+                picture = decode_video_frames(self.paths[row], [self.times_s[row]], TOLERANCE_S, BACKEND)[0]
             # (3, h, w) float32 in [0, 1]. Dividing a uint8 by 255 and multiplying by 255 again is exact.
-            rgb = (shown * 255).round().byte().permute(1, 2, 0).numpy()
+            rgb = (picture * 255).round().byte().permute(1, 2, 0).numpy()
         else:
             from PIL import Image, ImageOps
 
@@ -199,8 +201,9 @@ class _Dataset:
 
     def _file(self, row: Mapping[str, Any], camera: str = "") -> Path:
         """The file of an episode's frames, or its video: version 2 has one of each episode, version 3 names it."""
-        where, number = f"videos/{camera}" if camera else "data", row["episode_index"]
-        parts = {part: row[f"{where}/{part}"] for part in ("chunk_index", "file_index") if f"{where}/{part}" in row}
+        folder = f"videos/{camera}" if camera else "data"
+        number = row["episode_index"]
+        parts = {part: row[f"{folder}/{part}"] for part in ("chunk_index", "file_index") if f"{folder}/{part}" in row}
         own = {"episode_index": number, "episode_chunk": number // self.info.get("chunks_size", 1000)}
         return self.root / self.info["video_path" if camera else "data_path"].format(**own, **parts, video_key=camera)
 
@@ -214,14 +217,15 @@ class _Dataset:
         """Read and check the frames' numbers, and find their pictures."""
         keys = {key: key for key in NUMBERS} | {k: self.features[k]["column"] for k in ALSO if k in self.features}
         images = [key for key in self.keys.values() if self.features[key]["dtype"] == "image"]
-        pattern, needed = "|".join(map(re.escape, keys.values())), {*keys.values(), *images}
+        pattern = "|".join(map(re.escape, keys.values()))
+        needed = {*keys.values(), *images}
         tables = [_read_table(self.root, path, pattern, needed) for path in files]
         for key, column in keys.items():
             values = np.concatenate([_numbers(table.column(column)) for table in tables])
             order = {STATE: self.layout.state_order, ACTION: self.layout.action_order}.get(key)
             if order and values.shape[1] != len(order):
-                what = f"{self.root}: '{key}' has {len(order)} numbers in {INFO} and {values.shape[1]} in the tables"
-                raise EpisodeError(what, remedy="correct its shape and names")
+                problem = f"{self.root}: '{key}' has {len(order)} numbers in {INFO} and {values.shape[1]} in the tables"
+                raise EpisodeError(problem, remedy="correct its shape and names")
             self.columns[key] = values.astype(np.float32)[:, list(order)] if order else values.ravel()
         before = last_actions(self.columns[ACTION], self.columns["frame_index"] == 0)
         self.columns.setdefault(STATE, before)  # as in our own recordings
@@ -240,18 +244,18 @@ class _Dataset:
         starts = np.flatnonzero(np.diff(number, prepend=-1))
         lengths = np.diff([*starts, len(number)])
         within = np.arange(len(number)) - np.repeat(starts, lengths)
-        said = np.array([[row["episode_index"], row["length"]] for row in self.entries]).reshape(-1, 2)
-        whole = np.array_equal(said, np.stack([number[starts], lengths], 1))
+        index = np.array([[row["episode_index"], row["length"]] for row in self.entries]).reshape(-1, 2)
+        whole = np.array_equal(index, np.stack([number[starts], lengths], 1))
         here = f"{len(starts)} episodes of {len(number)} frames"
         if not whole or not np.array_equal(self.columns["frame_index"], within):
-            found = f"{len(said)} episodes of {said[:, 1].sum()} frames, and {here} or in another order"
-            raise _broken(f"{self.root}: meta/episodes and the frames in data do not belong together", found)
+            actual = f"{len(index)} episodes of {index[:, 1].sum()} frames, and {here} or in another order"
+            raise _broken(f"{self.root}: meta/episodes and the frames in data do not belong together", actual)
         counts = self.info.get("total_episodes", len(starts)), self.info.get("total_frames", len(number))
         note = f"{quote(counts[0])} episodes of {quote(counts[1])} frames, and here are {here}: a part?"
         self.faults.add(self.root / INFO, "another_total", note, counts != (len(starts), len(number)))
         ends = [(row.get("dataset_from_index"), row.get("dataset_to_index")) for row in self.entries]
         right = zip(starts.tolist(), (starts + lengths).tolist(), strict=True)
-        scrambled = sum(each not in ((None, None), here) for each, here in zip(ends, right, strict=True))
+        scrambled = sum(end_pair not in ((None, None), here) for end_pair, here in zip(ends, right, strict=True))
         note = "dataset_from_index and _to_index of an early converter: convert it again by a newer LeRobot to train"
         self.faults.add(self.root / "meta/episodes", "scrambled_index", note, scrambled)
 
@@ -269,7 +273,8 @@ class _Dataset:
 
     def _check_times(self) -> None:
         """Let episodes begin with 0 s. Raises EpisodeError for frames that do not come `fps` times a second."""
-        times_s, first = self.columns["timestamp"].astype(np.float64), self.columns["frame_index"] == 0
+        times_s = self.columns["timestamp"].astype(np.float64)
+        first = self.columns["frame_index"] == 0
         usual = float(np.median(np.diff(times_s, prepend=0)[~first])) * self.fps if not first.all() else 1.0
         for unit, word in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
             if abs(usual / unit - 1) <= UNEVEN:
@@ -279,9 +284,11 @@ class _Dataset:
         times_s = self.columns["timestamp"] = np.where(np.abs(begin_s) * self.fps > 1, times_s - begin_s, times_s)
         steps = np.diff(times_s, prepend=0)[~first] * self.fps
         if len(odd := steps[~(np.abs(steps - 1) <= UNEVEN)]):  # so that NaN counts as odd
-            what = f"{self.root}: {INFO} says {self.fps:g} frames a second, but {len(odd)} frames come at another rate"
-            found = f"{odd[0] / self.fps:.4f} s after the one before"
-            raise EpisodeError(what, found=found, remedy="correct the rate, or record again")
+            problem = (
+                f"{self.root}: {INFO} says {self.fps:g} frames a second, but {len(odd)} frames come at another rate"
+            )
+            actual = f"{odd[0] / self.fps:.4f} s after the one before"
+            raise EpisodeError(problem, found=actual, remedy="correct the rate, or record again")
 
     def _check_numbers(self) -> None:
         """Raise EpisodeError for states and actions beyond what the car can do."""
@@ -291,9 +298,11 @@ class _Dataset:
             limits = action_limits(labels, self.car)
             for name, values, low, high in zip(labels, self.columns[key].T, *limits, strict=True):
                 if len(wrong := np.flatnonzero((values < low) | (values > high))):
-                    seen = f"{name} of '{key}' is {values[wrong[0]]:g} in {len(wrong)} frames from {wrong[0]} on"
+                    example = f"{name} of '{key}' is {values[wrong[0]]:g} in {len(wrong)} frames from {wrong[0]} on"
                     remedy = "are names (--action-names) and units right? if it reverses, say reverse_us in car.yml"
-                    raise EpisodeError(f"{self.root}: {seen}, a rover's lies from {low:g} to {high:g}", remedy=remedy)
+                    raise EpisodeError(
+                        f"{self.root}: {example}, a rover's lies from {low:g} to {high:g}", remedy=remedy
+                    )
 
     def _camera(self, key: str, size: tuple[int, int]) -> _Camera:
         """Find each row's picture of a camera."""
@@ -305,20 +314,20 @@ class _Dataset:
 
         paths = [path for row in self.entries for path in [self._file(row)] * row["length"]]
         with SuppressProgressBars():
-            kept = Features({key: Image(decode=False)})
-            rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=kept)
+            undecoded = Features({key: Image(decode=False)})
+            rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=undecoded)
         return _Camera(key, size, paths, rows=rows)
 
     def _video_camera(self, key: str, size: tuple[int, int]) -> _Camera:
         """Find each row's picture in a video. Raises EpisodeError for times at which a video shows none."""
-        shown = [part for row in self.entries for part in [(*self._shown(row, key), row)] * row["length"]]
-        times_s = np.array([first_s for _, first_s, *_ in shown]) + self.columns["timestamp"]
-        torn = np.zeros(len(shown), bool)
-        for path in dict.fromkeys(path for path, *_ in shown):
-            rows = np.array([k for k, part in enumerate(shown) if part[0] == path])
+        parts = [part for row in self.entries for part in [(*self._shown(row, key), row)] * row["length"]]
+        times_s = np.array([first_s for _, first_s, *_ in parts]) + self.columns["timestamp"]
+        torn = np.zeros(len(parts), bool)
+        for path in dict.fromkeys(path for path, *_ in parts):
+            rows = np.array([k for k, part in enumerate(parts) if part[0] == path])
             with _as_episode_error(f"{path}: cannot be decoded"):
                 times_s[rows], off_s, torn[rows] = match_pictures(path, times_s[rows], self.fps, TOLERANCE_S)
-            numbers = np.array([shown[k][3]["episode_index"] for k in rows])
+            numbers = np.array([parts[k][3]["episode_index"] for k in rows])
             for number in np.unique(numbers[off_s > TOLERANCE_S]):
                 most_s = float(off_s[numbers == number].max())
                 note = f"episode {number}: from_timestamp is {1000 * most_s:.2g} ms off the pictures in {path.name}"
@@ -327,7 +336,7 @@ class _Dataset:
                     raise EpisodeError(f"{self.root}: {note}", found=f"{self.fps:g} a second", remedy=remedy)
                 note += "; the nearest are taken, and LeRobot's training would refuse them: correct it in meta/episodes"
                 self.faults.add(self.root / "meta/episodes", "other_times", note)
-        paths = [path for path, *_ in shown]
+        paths = [path for path, *_ in parts]
         return _Camera(key, size, paths, times_s.tolist(), torn=frozenset(np.flatnonzero(torn).tolist()))
 
     def _check_videos(self, key: str, size: tuple[int, int]) -> None:
@@ -335,26 +344,27 @@ class _Dataset:
 
         The merge of LeRobot 0.4.0 wrote times by which an episode is shown another one's pictures.
         """
-        shown = [(*self._shown(row, key), row["episode_index"], row["length"]) for row in self.entries]
-        for file in dict.fromkeys(path for path, *_ in shown):
+        parts = [(*self._shown(row, key), row["episode_index"], row["length"]) for row in self.entries]
+        for file in dict.fromkeys(path for path, *_ in parts):
             _check_file(self.root, file)
             with _as_episode_error(f"{file}: cannot be decoded"):
                 untrusted.check_video(file, size)
-        wrong = {number for _, begin, end, number, n in shown if abs((end - begin) * self.fps - n) >= 1}
-        for before, after in pairwise(sorted(shown, key=lambda part: part[:2])):
+        wrong = {number for _, begin, end, number, n in parts if abs((end - begin) * self.fps - n) >= 1}
+        for before, after in pairwise(sorted(parts, key=lambda part: part[:2])):
             if before[0] == after[0] and before[2] > after[1] + 0.5 / self.fps:
                 wrong.add(after[3])
         if wrong:
-            found = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
+            actual = f"episode {min(wrong)}, and {len(wrong) - 1} more, have another part of a video than their frames"
             remedy = "merge the original datasets again with a newer LeRobot (lerobot-edit-dataset), or copy it again"
-            raise EpisodeError(f"{self.root}: meta/episodes does not fit the videos", found=found, remedy=remedy)
+            raise EpisodeError(f"{self.root}: meta/episodes does not fit the videos", found=actual, remedy=remedy)
 
     def episode(self, entry: Mapping[str, Any], chunk: int) -> Episode:
         """Make samples of an episode's frames; none, and a fault, if a number is missing."""
         number = entry["episode_index"]
         rows = np.flatnonzero(self.columns["episode_index"] == number)
         columns = {key: values[rows] for key, values in self.columns.items()}
-        n, name = len(rows), f"episode_{number:06d}"
+        n = len(rows)
+        name = f"episode_{number:06d}"
         chunks, pads = following(columns[ACTION], chunk)
         taken_over = columns.get(INTERVENTION, np.zeros(n)).astype(bool)
         times_s = columns["timestamp"] - columns["timestamp"][0]
@@ -366,25 +376,27 @@ class _Dataset:
             if finite and row not in self.unusable:
                 driver = HUMAN if taken_over[k] else self.drivers[number]
                 numbers = columns[STATE][k], chunks[k], pads[k]
-                shown = name, camera.paths[row], float(times_s[k])
-                samples.append(LerobotSample(*shown, *numbers, row, driver, self.car, cameras=self.cameras))
+                source = name, camera.paths[row], float(times_s[k])
+                samples.append(LerobotSample(*source, *numbers, row, driver, self.car, cameras=self.cameras))
         videos = [self._file(entry, key) for key in self.keys.values() if self.features[key]["dtype"] == "video"]
-        files, label = (self.root / INFO, self._file(entry), *videos), str((entry.get("tasks") or [""])[0])
+        files = (self.root / INFO, self._file(entry), *videos)
+        label = str((entry.get("tasks") or [""])[0])
         corrects = bool(taken_over.any())
         return Episode(name, self.root, label, float(times_s[-1]), n, n, tuple(samples), files, corrects=corrects)
 
 
 def _read_export(root: Path, episodes: int, marked: bool, faults: Faults) -> tuple[list[str], Car]:
     """Return who drove in each episode where nobody intervened, as a dataset may have `marked`, and whose car."""
-    drivers, car = [POLICY if marked else HUMAN] * episodes, this_car()
+    drivers = [POLICY if marked else HUMAN] * episodes
+    car = this_car()
     if (root / REPORT).is_file():
         try:
             report = untrusted.read_json(root / REPORT, INFO_BYTES)
             car = Car.of(report[CAR], "the exported car")  # right also if somebody has removed episodes since
-            said = report[DRIVEN_BY]
-            if len(said) != episodes or not set(said) <= {POLICY, HUMAN}:
-                raise ValueError(f"it is of {len(said)} episodes, here are {episodes}, or has unknown words")
-            drivers = said
+            driver = report[DRIVEN_BY]
+            if len(driver) != episodes or not set(driver) <= {POLICY, HUMAN}:
+                raise ValueError(f"it is of {len(driver)} episodes, here are {episodes}, or has unknown words")
+            drivers = driver
         except (OSError, ValueError, TypeError, KeyError, CarError) as e:
             faults.add(root / REPORT, "another_export", f"not used: {quote(str(e))}")
     return drivers, car
@@ -398,8 +410,8 @@ def _read_info(root: Path) -> dict[str, Any]:
         info: Any = untrusted.read_json(path, INFO_BYTES)
     if not isinstance(info, dict) or not info.keys() & {"codebase_version", "features", "data_path", "total_frames"}:
         remedy = "give a LeRobotDataset, donkeycar's tub, or a folder of episodes"
-        what = f"{root}: another program's {INFO}, not that of a LeRobotDataset"
-        raise EpisodeError(what, found=quote_all(info) if isinstance(info, dict) else quote(info), remedy=remedy)
+        problem = f"{root}: another program's {INFO}, not that of a LeRobotDataset"
+        raise EpisodeError(problem, found=quote_all(info) if isinstance(info, dict) else quote(info), remedy=remedy)
     version = str(info.get("codebase_version", "without a version"))
     if not version.removeprefix("v").startswith(("2", "3")):
         remedy = "convert it to v2.1 by a LeRobot of that time, or use a newer version of this"
@@ -414,10 +426,10 @@ def _read_info(root: Path) -> dict[str, Any]:
         right = False
     if not right or not is_number(fps, 0, 1000) or not fps:
         also = f", and {STATS} is missing" if version == "v2.1" and not (root / STATS).exists() else ""
-        what = f"{path}: lacks a data_path, frames per second, or features with dtype and shape{also}"
-        raise _broken(what, quote(fps))
-    for key, others in ALSO.items():
-        if column := next((name for name in (key, *others) if name in features), None):
+        problem = f"{path}: lacks a data_path, frames per second, or features with dtype and shape{also}"
+        raise _broken(problem, quote(fps))
+    for key, alternatives in ALSO.items():
+        if column := next((name for name in (key, *alternatives) if name in features), None):
             features[key] = features[column] | {"column": column}
     return info
 
@@ -432,27 +444,31 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names or len(set(names)) < len(names):
-        what = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
-        remedy = "say once each what the policy looks through: --camera NAME, with commas between several"
-        raise EpisodeError(f"{root}: {what}", found=quote_all(keys), remedy=remedy)
+        problem = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
+        remedy = "name once each what the policy looks through: --camera NAME, with commas between several"
+        raise EpisodeError(f"{root}: {problem}", found=quote_all(keys), remedy=remedy)
     sizes = {name: _picture_size(root, keys[name], features[keys[name]]) for name in names}
-    has_state, given = STATE in features, source.action_names  # without one it is the last action
-    if not has_state and (others := [k for k in features if re.search(STATES, k) and "environment" not in k]):
+    has_state = STATE in features
+    names_passed = source.action_names  # without one it is the last action
+    if not has_state and (similar := [k for k in features if re.search(STATES, k) and "environment" not in k]):
         remedy = f"if it is the state, call it '{STATE}' in {INFO} and in the tables, else remove it"
-        raise EpisodeError(f"{root}: has no '{STATE}'", found=quote_all(others), remedy=remedy)
+        raise EpisodeError(f"{root}: has no '{STATE}'", found=quote_all(similar), remedy=remedy)
     for key in (STATE, ACTION) if has_state else (ACTION,):
         row = features.get(key, {})  # LeRobot makes 1 of 0.3 where it says bool
         if len(row.get("shape") or ()) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
-            what = f"{root}: its '{key}' is missing or not a row of numbers"
-            raise EpisodeError(what, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
-    actions, action_order = name_numbers(root, features, ACTION, given)
-    states, state_order = name_states(root, features, given) if has_state else (actions, action_order)
+            problem = f"{root}: its '{key}' is missing or not a row of numbers"
+            raise EpisodeError(
+                problem, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables"
+            )
+    actions, action_order = name_numbers(root, features, ACTION, names_passed)
+    states, state_order = name_states(root, features, names_passed) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)
     return layout, {name: keys[name] for name in names}
 
 
 def _picture_size(root: Path, key: str, feature: Mapping[str, Any]) -> tuple[int, int]:
-    shape, kind = list(feature["shape"]), feature.get("info")
+    shape = list(feature["shape"])
+    kind = feature.get("info")
     depth = isinstance(kind, dict) and (kind.get("is_depth_map") or kind.get("video.is_depth_map"))
     if depth or len(shape) != 3 or 3 not in (shape[0], shape[2]):
         remedy = "choose another: --camera NAME, or record with one in colours"

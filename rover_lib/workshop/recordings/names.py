@@ -47,7 +47,8 @@ def read_as_car(names: Sequence[str]) -> tuple[str, ...] | None:
 
 def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) -> Named:
     """Name a dataset's states: by the user's names of the actions if they have none, or the same as the actions."""
-    own, size = _names(features[STATE]), features[STATE]["shape"][0]
+    own = _names(features[STATE])
+    size = features[STATE]["shape"][0]
     if own and own != _names(features[ACTION]):
         said = (read_as_car(own) or own) if said else own
     elif said and size != len(said):  # such numbers are not actions, and their names matter nowhere
@@ -58,17 +59,18 @@ def name_states(root: Path, features: Mapping[str, Any], said: tuple[str, ...]) 
 def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[str, ...]) -> Named:
     """Return a dataset's names of its states or actions, or those `said` by the user, as `Named` has them.
 
-    Raises EpisodeError if the two deny each other, and asks by it whether other words mean steering and throttle.
+    Raises EpisodeError if the two contradict each other, and asks by it whether other words mean steering and throttle.
     """
     (size,) = features[key]["shape"]
     own = _names(features[key])
     if meant := read_as_car(own):
-        where, say = f"{root}: the names of '{key}' are {quote_all(own)}", f"say --action-names {','.join(meant)}"
+        place = f"{root}: the names of '{key}' are {quote_all(own)}"
+        flag = f"pass --action-names {','.join(meant)}"
         if said and said not in (meant, own):
-            raise EpisodeError(f"{where}, and --action-names says {quote_all(said)}", remedy=f"{say}, or nothing")
+            raise EpisodeError(f"{place}, and --action-names says {quote_all(said)}", remedy=f"{flag}, or nothing")
         if meant != own and not said:
-            remedy = f"if they are, {say}, else --action-names {','.join(own)}"
-            raise EpisodeError(f"{where}: are they steering and throttle?", remedy=remedy)
+            remedy = f"if they are, {flag}, else --action-names {','.join(own)}"
+            raise EpisodeError(f"{place}: are they steering and throttle?", remedy=remedy)
     names = said or own
     if not names:
         # The other numbers' order, if they have one.
@@ -77,13 +79,15 @@ def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[
             # Of a car both orders: the user must not just copy one.
             examples = [CHANNELS, CHANNELS[::-1]] if size == 2 else [[f"joint_{i}" for i in range(1, size + 1)]]
         remedy = f"name them in the order of the numbers: --action-names {', or '.join(map(','.join, examples))}"
-        found = quote(features[key].get("names"))
-        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=found, remedy=remedy)
+        actual = quote(features[key].get("names"))
+        raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=actual, remedy=remedy)
     if len(names) != size or len(set(names)) != size:
-        what = f"{root}: '{key}' has {size} numbers in meta/info.json, their names are {quote_all(names)}"
-        given = said not in ((), own)
-        remedy = "name each once: --action-names with commas between" if given else "correct its shape and names there"
-        raise EpisodeError(what, remedy=remedy)
+        problem = f"{root}: '{key}' has {size} numbers in meta/info.json, their names are {quote_all(names)}"
+        overrides = said not in ((), own)
+        remedy = (
+            "name each once: --action-names with commas between" if overrides else "correct its shape and names there"
+        )
+        raise EpisodeError(problem, remedy=remedy)
     if set(names) == set(CHANNELS):
         return CHANNELS, tuple(names.index(name) for name in CHANNELS)
     return names, tuple(range(size))

@@ -15,7 +15,7 @@ from rover_lib.onboard.car.picture import MOST_BYTES, check_jpeg
 from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.cache import cache_root, key_of
-from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.untrusted import quote, read_json
 
 HOLE_INTERVALS = 2.5  # one dropped frame is bridged; two in a row are a hole in time
@@ -33,10 +33,12 @@ def check_pictures(
     names: of the pictures in `folder`/`inside`, as in the file `listing`. None may be outside of `folder`. What cannot
     be used is a fault. Those that are whole are kept in the cache, and decoded again only after they have changed.
     """
-    home, known, whole = os.path.realpath(folder), dict[str, Any](), dict[str, Any]()
+    home = os.path.realpath(folder)
+    cached = dict[str, Any]()
+    whole = dict[str, Any]()
     cache = cache_root() / f"pictures-{key_of({'in': home})}.json"
     with suppress(OSError, ValueError):  # none yet, or half of one
-        known = dict(read_json(cache, MOST_KNOWN))
+        cached = dict(read_json(cache, MOST_KNOWN))
     parent_of = lru_cache(os.path.realpath)
 
     def check(name: str, path: Path) -> tuple[str, Sequence[int]]:
@@ -49,16 +51,16 @@ def check_pictures(
         there = path.stat() if linked else there
         # The time of any change: a copy may bring along the time of its content.
         key = f"{name} {there.st_size} {there.st_mtime_ns} {there.st_ctime_ns}"
-        return key, known.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
+        return key, cached.get(key) or check_jpeg(read_plain(path, MOST_BYTES))
 
     def check_some(first: int) -> list[Checked]:
-        return [_caught(check, *each) for each in listed[first : first + AT_ONCE]]
+        return [_caught(check, *entry) for entry in listed[first : first + AT_ONCE]]
 
     listed = [(name, folder / inside / name.replace("\\", "/")) for name in names]
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:  # decoding releases the interpreter's lock
-        checked = [each for some in pool.map(check_some, range(0, len(listed), AT_ONCE)) for each in some]
+        checked = [outcome for some in pool.map(check_some, range(0, len(listed), AT_ONCE)) for outcome in some]
     sizes = list(_sizes(listed, checked, listing, faults, whole))
-    if whole.keys() - known.keys():
+    if whole.keys() - cached.keys():
         with suppress(OSError):
             cache.parent.mkdir(parents=True, exist_ok=True)
             cache.write_text(json.dumps(whole))

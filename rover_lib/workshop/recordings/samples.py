@@ -1,7 +1,6 @@
-"""The common form of our recordings and LeRobot's: samples, and what was wrong."""
+"""The common form of our recordings and LeRobot's: samples, and the episodes that have them."""
 
 import re
-import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,61 +15,14 @@ from rover_lib.onboard.car.picture import read_jpeg
 from rover_lib.onboard.errors import CameraError, EpisodeError
 from rover_lib.onboard.recording.episode import CHANNELS, HUMAN, POLICY
 from rover_lib.onboard.stage import sha256_of
+from rover_lib.workshop.recordings.faults import HANDLED, SHOW_NOTHING, Fault, relative
+from rover_lib.workshop.recordings.source import Source
 
 NEARLY_WHOLE = 0.02  # the share by which a rate may be rounded; 4.35 Hz as 4 made plans 8 % slower
 OTHER_RATE = 0.2  # an episode whose rate differs by more than this share has another rate
 LEAST_RATED = 10  # frames; fewer do not show a rate
 
 ACTION_NAMES = CHANNELS
-# Faults of pictures that are whole: a policy that learned from them drives badly, and nothing else tells.
-SHOW_NOTHING = "frozen_camera|repeated_pictures|blank_pictures|without_colours|swapped_colours|upside_down"
-HANDLED = {  # what is done about a fault, by its kind
-    "repaired": "serial_burst|unsorted_.*_times|stood_unrecorded|scrambled_index|other_units|other_times",
-    "read as stopped": "reverse_on_a_car_without",
-    "recomputed from the pulses": ".*_recomputed",
-    "replaced by the last action": "other_state",
-    "taken as recorded": "another_export|another_total|one_sided_steering|no_times|.*_disagrees_with_pulse"
-    f"|{SHOW_NOTHING}",
-    "left out": ".*",
-}
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where recordings are, and what the user adds if the dataset itself does not say it.
-
-    action_names: the names of its actions, in the order of its columns, and of its states too if those are unnamed.
-    cameras: the cameras that the policy looks through, in the policy's order. facts: what a policy's files do not say,
-    as checkpoint.facts reads it. throttle: "as-recorded" or "negated", for tubs of mostly negative throttles.
-    """
-
-    path: Path
-    action_names: tuple[str, ...] = ()
-    cameras: tuple[str, ...] = ()
-    facts: str = ""
-    throttle: str = ""
-
-    @classmethod
-    def of(
-        cls, path: "Path | str | Source", action_names: str = "", camera: str = "", facts: str = "", throttle: str = ""
-    ) -> "Source":
-        """Make a source from a path and a command line's comma-separated names; a Source is returned unchanged."""
-        if isinstance(path, Source):
-            return path
-        names, cameras = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (action_names, camera))
-        return cls(Path(path), names, cameras, facts, throttle)
-
-    def typed(self) -> str:
-        """What a user types for it."""
-        said = {"--action-names": self.action_names, "--camera": self.cameras, "--throttle": (self.throttle,)}
-        options = [part for name, values in said.items() if any(values) for part in (name, ",".join(values))]
-        return shlex.join([str(self.path), *options])
-
-    @classmethod
-    def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":
-        """The recordings that a run loaded, by load.json's params, or those `elsewhere`, with the same names."""
-        said = (given.get(name, "") for name in ("action_names", "camera", "facts", "throttle"))
-        return cls.of(elsewhere or given["episodes"], *said)
 
 
 @dataclass(frozen=True)
@@ -102,21 +54,6 @@ class Layout:
         state = state if self.has_state else f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something wrong: `kind` happened `count` times in `file` (relative to the root); `note` describes the first."""
-
-    file: str
-    kind: str
-    count: int
-    note: str
-
-    @property
-    def handled(self) -> str:
-        """What was done about it, one of HANDLED."""
-        return next(handled for handled, kinds in HANDLED.items() if re.fullmatch(kinds, self.kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,10 +92,14 @@ class Sample:
         try:
             return self.turned(read_jpeg(self.frame_path, least))
         except OSError as e:
-            what, found, remedy = f"cannot be read ({e.strerror})", None, "restore it or load again"
+            problem = f"cannot be read ({e.strerror})"
+            actual = None
+            remedy = "restore it or load again"
         except CameraError as e:
-            what, found, remedy = e.what, e.found, "delete it or record the episode again"
-        raise EpisodeError(f"{self.frame_path}: {what}", found=found, remedy=remedy)
+            problem = e.what
+            actual = e.found
+            remedy = "delete it or record the episode again"
+        raise EpisodeError(f"{self.frame_path}: {problem}", found=actual, remedy=remedy)
 
 
 def block_of(sample: Any) -> str:
@@ -173,8 +114,8 @@ def car_of(samples: Iterable[Any]) -> Car:
         if not any(car.drives_like(other) for other in cars):
             cars.append(car)
     if len(cars) > 1:
-        found = cars[0].unlike(cars[1])
-        raise EpisodeError("the recordings are of several cars", found=found, remedy="use those of one car")
+        difference = cars[0].unlike(cars[1])
+        raise EpisodeError("the recordings are of several cars", found=difference, remedy="use those of one car")
     return cars[0] if cars else Car()
 
 
@@ -257,24 +198,24 @@ class Recordings:
         changed = [e for e in self.episodes if e.formulas]
         if not changed:
             return ""
-        found = ", ".join(sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()}))
+        formulas = ", ".join(sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()}))
         count = f"{len(changed)} of {len(self.episodes)} episodes"
-        return f"the actions of {count} were recomputed from their pulses, as they follow another formula: {found}"
+        return f"the actions of {count} were recomputed from their pulses, as they follow another formula: {formulas}"
 
     def faults_by_kind(self) -> dict[str, dict[str, int]]:
         """How often each kind of fault was found, by what was done about it, one of HANDLED."""
-        counted: dict[str, Counter[str]] = {handled: Counter() for handled in HANDLED}
+        counts: dict[str, Counter[str]] = {handled: Counter() for handled in HANDLED}
         for fault in self.faults:
-            counted[fault.handled][fault.kind] += fault.count
-        return {handled: dict(kinds.most_common()) for handled, kinds in counted.items() if kinds}
+            counts[fault.handled][fault.kind] += fault.count
+        return {handled: dict(kinds.most_common()) for handled, kinds in counts.items() if kinds}
 
     def cautions(self) -> list[str]:
         """A sentence for each kind of fault that makes a policy of these recordings drive badly."""
-        found: dict[str, list[Fault]] = {}
+        by_kind: dict[str, list[Fault]] = {}
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
-                found.setdefault(fault.kind, []).append(fault)
-        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in found.values()]
+                by_kind.setdefault(fault.kind, []).append(fault)
+        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in by_kind.values()]
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
@@ -305,11 +246,6 @@ class Recordings:
             "faults_by_kind": self.faults_by_kind(),
             "faults": [vars(f) for f in self.faults],
         }
-
-
-def relative(path: Path, root: Path) -> str:
-    """Return a file's path as reports show it: relative to `root`, or only its name if it lies elsewhere."""
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
 
 
 def following(actions: np.ndarray, chunk: int) -> tuple[np.ndarray, np.ndarray]:

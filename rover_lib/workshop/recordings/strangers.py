@@ -15,8 +15,8 @@ DEEPEST = 5  # folders in folders that are looked into
 def name_stranger(root: Path) -> tuple[str, str] | None:
     """Return what a file, or a folder without episodes, holds, and what to do; None for what is not known."""
     for above in root.resolve().parents[:3]:
-        if found := {"dataset", "tub"} & {*kinds_of(above)}:
-            return f"a part of {CALLED[found.pop()]}", f"give the whole: {above}"
+        if kinds := {"dataset", "tub"} & {*kinds_of(above)}:
+            return f"a part of {CALLED[kinds.pop()]}", f"give the whole: {above}"
     for depth in range(1, DEEPEST):
         inside = islice(root.glob("*/" * depth), MOST_FILES)
         folders = sorted(p for p in inside if p.is_dir() and not any(n.startswith(".") for n in p.parts[-depth:]))

@@ -24,18 +24,19 @@ from rover_lib.onboard.kinds import EPISODE_FILES, kinds_of
 from rover_lib.onboard.stage import read_plain
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.blocks import name_blocks
-from rover_lib.workshop.recordings.controls import Faults, note_one_sided
+from rover_lib.workshop.recordings.controls import note_one_sided
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.pictures import HOLE_INTERVALS, HOLE_S, check_pictures
 from rover_lib.workshop.recordings.samples import (
     LEAST_RATED,
     Episode,
     Recordings,
     Sample,
-    Source,
     following,
     frame_rate_hz,
     is_another_rate,
 )
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import quote, quote_all
 
@@ -59,7 +60,10 @@ REMEDIES = {  # by what most records were left out for
     "nothing": "nothing was recorded in it: give another",
 }
 COPY = "copy the whole tub, images included"
-PICTURE, ANGLE, THROTTLE, MODE = "cam/image_array", "user/angle", "user/throttle", "user/mode"
+PICTURE = "cam/image_array"
+ANGLE = "user/angle"
+THROTTLE = "user/throttle"
+MODE = "user/mode"
 
 
 @dataclass(frozen=True)
@@ -98,28 +102,33 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
     gives its folder's name to its sessions; one that cannot be used is a fault. Raises EpisodeError for another folder
     or without usable records, and if nothing says which sign of throttle is forward where most of one tub's differ.
     """
-    root, car, every, parts = source.path, this_car(), Faults(source.path), list[tuple[str, list[Episode]]]()
+    root = source.path
+    car = this_car()
+    all_faults = Faults(source.path)
+    parts = list[tuple[str, list[Episode]]]()
     for tub in progress(tubs, desc="reading tubs", total=len(tubs)):
-        faults, place = Faults(root), "" if tub == root else tub.relative_to(root).as_posix()
+        faults = Faults(root)
+        place = "" if tub == root else tub.relative_to(root).as_posix()
         try:
             parts.append((place, _Tub(tub, place, car, faults).read(source.throttle, chunk)))
         except EpisodeError as e:
             if len(tubs) == 1 or e.kind == ASKS:
                 raise
-            every.add(tub, "unusable_tub", str(e))
+            all_faults.add(tub, "unusable_tub", str(e))
         else:
-            every.counted |= faults.counted
+            all_faults.counted |= faults.counted
     if not parts:
-        raise every.nothing_usable(f"none of its {len(tubs)} tubs can be used", COPY)
-    note_one_sided([e for _, own in parts for e in own], every)
-    kept = {id(e) for e in leave_out_copies([e for _, own in parts for e in own], every)}
-    episodes, blocks = list[Episode](), list[tuple[str, ...]]()
+        raise all_faults.nothing_usable(f"none of its {len(tubs)} tubs can be used", COPY)
+    note_one_sided([e for _, own in parts for e in own], all_faults)
+    unique = {id(e) for e in leave_out_copies([e for _, own in parts for e in own], all_faults)}
+    episodes = list[Episode]()
+    blocks = list[tuple[str, ...]]()
     for place, own in parts:
-        if left := [e for e in own if id(e) in kept]:
-            named, names = name_blocks(left, place)
+        if unique_here := [e for e in own if id(e) in unique]:
+            named, names = name_blocks(unique_here, place)
             episodes += named
             blocks += [names] if names else []
-    return Recordings(root, tuple(episodes), every.listed(), source, blocks=tuple(blocks), kind="tub")
+    return Recordings(root, tuple(episodes), all_faults.listed(), source, blocks=tuple(blocks), kind="tub")
 
 
 @dataclass(frozen=True)
@@ -140,13 +149,15 @@ class _Tub:
         steps_s = np.diff([r.time_s for r in records])
         usual_s = float(np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 1 / RATE_HZ
         if usual_s < LEAST_S:
-            found, remedy = f"{usual_s * 1000:.3g} ms between two records", "are they seconds? write milliseconds"
-            raise EpisodeError(f"{self.path}: its _timestamp_ms are not of a drive", found=found, remedy=remedy)
+            actual = f"{usual_s * 1000:.3g} ms between two records"
+            remedy = "are they seconds? write milliseconds"
+            raise EpisodeError(f"{self.path}: its _timestamp_ms are not of a drive", found=actual, remedy=remedy)
         self._note_reverse(records, throttle)
         stands = _standing_parts(records, usual_s, self.path, self.faults)
         pictures = check_pictures(self.path, [r.picture for r in records], self.path, self.faults, "images")
         files = tuple(path for name in ("manifest.json", *catalogs) if (path := self.path / name).is_file())
-        episodes, began_s = list[Episode](), dict[str, float]()
+        episodes = list[Episode]()
+        began_s = dict[str, float]()
         for run in self._runs(records, usual_s, stands):
             first = records[run[0]]
             session = "/".join(filter(None, (self.place, first.session or "session")))
@@ -159,7 +170,8 @@ class _Tub:
                 note = f"{found_hz:.1f} Hz from record {first.index} on"
                 self.faults.add(self.path, "another_rate", note, len(samples))
             elif samples:
-                length_s, begin_s = samples[-1].time_s - samples[0].time_s, first.time_s - began_s[session]
+                length_s = samples[-1].time_s - samples[0].time_s
+                begin_s = first.time_s - began_s[session]
                 counts = length_s, len(run), len(run)
                 whole = Episode(samples[0].episode, self.path, "drive", *counts, samples, files)
                 episodes.append(replace(whole, session=session, begin_s=begin_s))
@@ -172,9 +184,9 @@ class _Tub:
         counts = Counter[str]()
         for (_, kind), (count, _) in self.faults.counted.items():
             counts[kind] += count
-        most = next((kind for kind, _ in counts.most_common() if kind in REMEDIES), "") if counts else "nothing"
+        main_kind = next((kind for kind, _ in counts.most_common() if kind in REMEDIES), "") if counts else "nothing"
         error = self.faults.nothing_usable("no usable record in it", "")
-        return EpisodeError(error.what, found=error.found, remedy=COPY if some else REMEDIES.get(most, COPY))
+        return EpisodeError(error.what, found=error.found, remedy=COPY if some else REMEDIES.get(main_kind, COPY))
 
     def _note_reverse(self, records: Sequence["_Record"], throttle: str) -> None:
         backwards = sum(r.throttle < 0 for r in records)
@@ -203,7 +215,8 @@ class _Tub:
         throttle = np.clip([r.throttle for r, _ in run], low, high)
         actions = np.stack([-self.car.left * np.array([r.angle for r, _ in run]), throttle], 1).astype(np.float32)
         chunks, pads = following(actions, chunk)
-        first, samples = run[0][0], list[Sample]()
+        first = run[0][0]
+        samples = list[Sample]()
         stood = self.began[first.session] == first.index  # before it
         for k, (record, (path, usable)) in enumerate(run):
             if not usable or (k == 0 and not stood):
@@ -227,17 +240,17 @@ class _Tub:
                 faults.add(tub, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
                 continue
             for number, line in enumerate(lines, 1):
-                where = f"{name}, line {number}"
+                place = f"{name}, line {number}"
                 try:
                     record = _parse(line)
                 except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-                    faults.add(tub, "broken_record", f"{where}: {quote(str(e))}")
+                    faults.add(tub, "broken_record", f"{place}: {quote(str(e))}")
                     continue
                 self.began[record.session] = min(record.index, self.began.get(record.session, record.index))
                 if record.index in deleted:
-                    faults.add(tub, "deleted_record", f"{where}: its manifest calls record {record.index} deleted")
+                    faults.add(tub, "deleted_record", f"{place}: its manifest calls record {record.index} deleted")
                 elif record.driver != "user":
-                    faults.add(tub, "a_pilot_drove", f"{where}: {quote(record.driver)}")
+                    faults.add(tub, "a_pilot_drove", f"{place}: {quote(record.driver)}")
                 else:
                     note = f"records without a time: taken as {RATE_HZ:g} a second"
                     faults.add(tub, "no_times", note, not record.timed)
@@ -255,15 +268,16 @@ def _in_order(records: Iterable["_Record"], tub: Path, faults: Faults) -> list["
 
 def _forward(records: list["_Record"], throttle: str, tub: Path) -> list["_Record"]:
     """Return the records with throttles that are positive forward. Raises EpisodeError where that must be asked."""
-    negative, moving = sum(r.throttle < 0 for r in records), sum(r.throttle != 0 for r in records)
+    negative = sum(r.throttle < 0 for r in records)
+    moving = sum(r.throttle != 0 for r in records)
     if not throttle and negative > OTHER_SIGN * moving:
         remedy = "--throttle negated if its car drives forward by them, --throttle as-recorded if it drove backwards"
-        found = f"{negative} of {moving}"
-        raise EpisodeError(f"{tub}: most throttles are negative", found=found, remedy=remedy, kind=ASKS)
+        actual = f"{negative} of {moving}"
+        raise EpisodeError(f"{tub}: most throttles are negative", found=actual, remedy=remedy, kind=ASKS)
     if throttle == "negated" and moving - negative > OTHER_SIGN * moving:
         remedy = "leave --throttle out, and give tubs of other signs by themselves"
-        found = f"{moving - negative} of {moving}"
-        raise EpisodeError(f"{tub}: most throttles are positive already", found=found, remedy=remedy, kind=ASKS)
+        actual = f"{moving - negative} of {moving}"
+        raise EpisodeError(f"{tub}: most throttles are positive already", found=actual, remedy=remedy, kind=ASKS)
     return [replace(r, throttle=-r.throttle) for r in records] if throttle == "negated" else records
 
 
@@ -273,18 +287,19 @@ def _standing_parts(records: list[_Record], usual_s: float, tub: Path, faults: F
     donkeycar by default records only while the throttle is on (AUTO_RECORD_ON_THROTTLE), and numbers on. So it was off
     in the gaps of a tub with hardly a record of throttle 0.
     """
-    found = {}
+    parts = {}
     for before, record in pairwise(records):
         periods = (record.time_s - before.time_s) / usual_s
         if periods > HOLE_INTERVALS and record.index == before.index + 1 and record.session == before.session:
-            found[record.index] = abs(periods - round(periods)) < WHOLE_PERIODS
+            parts[record.index] = abs(periods - round(periods)) < WHOLE_PERIODS
     off = sum(record.throttle == 0 for record in records)
-    whole = sum(found.values()) >= MOST_WHOLE * len(found) and off < MOST_ZERO * len(records)
-    if len(found) < LEAST_STANDING:
+    whole = sum(parts.values()) >= MOST_WHOLE * len(parts) and off < MOST_ZERO * len(records)
+    if len(parts) < LEAST_STANDING:
         return set()
-    kind, note = "stood_unrecorded" if whole else "gaps_unrecorded", "nothing was recorded in gaps of the drive"
-    faults.add(tub, kind, f"{note}: AUTO_RECORD_ON_THROTTLE = False records while the throttle is off too", len(found))
-    return {*found} if whole else set()
+    kind = "stood_unrecorded" if whole else "gaps_unrecorded"
+    note = "nothing was recorded in gaps of the drive"
+    faults.add(tub, kind, f"{note}: AUTO_RECORD_ON_THROTTLE = False records while the throttle is off too", len(parts))
+    return {*parts} if whole else set()
 
 
 def _ends(before: _Record, record: _Record, longest_s: float, tub: Path, faults: Faults) -> bool:
@@ -322,14 +337,17 @@ def _read_manifest(path: Path) -> tuple[list[str], set[int]]:
 def _parse(text: str) -> _Record:
     """Return the record in a line. Raises ValueError, also of other kinds, and EpisodeError for other cameras."""
     row = json.loads(text)
-    if PICTURE not in row and (others := [key for key in row if key.startswith(f"{PICTURE}_")]):
-        remedy = f"to use one, name it so in the catalogs: sed -i 's#{others[0]}#{PICTURE}#' *.catalog"
-        raise EpisodeError(f"a record has no '{PICTURE}', as of two cameras", found=quote_all(others), remedy=remedy)
-    number, ms, values = row["_index"], row.get("_timestamp_ms"), (row[ANGLE], row[THROTTLE])
+    if PICTURE not in row and (similar := [key for key in row if key.startswith(f"{PICTURE}_")]):
+        remedy = f"to use one, name it so in the catalogs: sed -i 's#{similar[0]}#{PICTURE}#' *.catalog"
+        raise EpisodeError(f"a record has no '{PICTURE}', as of two cameras", found=quote_all(similar), remedy=remedy)
+    number = row["_index"]
+    ms = row.get("_timestamp_ms")
+    values = (row[ANGLE], row[THROTTLE])
     if not all(is_number(v, -1, 1) for v in values) or not isinstance(row[PICTURE], str):
         raise ValueError(f"{quote_all(values)} with {quote(row[PICTURE])}")
     if not is_whole(number, 0, MOST_INDEX) or not (ms is None or is_number(ms, 0, MOST_MS)):
         raise ValueError(f"number {quote(number)}, time {quote(ms)}")
     time_s = number / RATE_HZ if ms is None else ms / 1000
-    session, driver = str(row.get("_session_id", "")), row.get(MODE, "user")
+    session = str(row.get("_session_id", ""))
+    driver = row.get(MODE, "user")
     return _Record(number, session, time_s, row[PICTURE], *values, driver, timed=ms is not None)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rover_lib.workshop.recordings import copies
-from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import Episode
 
 MIRRORED, OF = " mirrored", "the same drive as "  # the latter as copies.py begins its notes
@@ -18,18 +18,20 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
 
     Held out, a mirrored drive is judged by a policy that was calibrated, or trained, on its twin.
     """
-    kept = copies.leave_out_copies(episodes, faults)
-    found, left = Faults(faults.root), set[str]()
-    copies.leave_out_copies((*kept, *map(_mirror, kept)), found)
-    by_name = {f"{episode.id}{MIRRORED}": episode for episode in kept} | {episode.id: episode for episode in kept}
-    for fault in found.listed():  # of a mirrored one and another
+    unique = copies.leave_out_copies(episodes, faults)
+    twins = Faults(faults.root)
+    twin_names = set[str]()
+    copies.leave_out_copies((*unique, *map(_mirror, unique)), twins)
+    by_name = {f"{episode.id}{MIRRORED}": episode for episode in unique} | {episode.id: episode for episode in unique}
+    for fault in twins.listed():  # of a mirrored one and another
         names = Path(fault.file).name, fault.note.partition(OF)[2].partition(", as ")[0]
-        pair = sorted((by_name[n] for n in names if n in by_name), key=lambda e: (-len(e.samples), kept.index(e)))
-        first, second = pair[0], pair[-1]
-        if first is not second and not left & {first.id, second.id} and not _is_symmetric(first):
-            left.add(second.id)
+        pair = sorted((by_name[n] for n in names if n in by_name), key=lambda e: (-len(e.samples), unique.index(e)))
+        first = pair[0]
+        second = pair[-1]
+        if first is not second and not twin_names & {first.id, second.id} and not _is_symmetric(first):
+            twin_names.add(second.id)
             faults.add(second.path / second.id, "copy", f"{OF}{first.id}, mirrored, as its actions and pictures show")
-    return tuple(episode for episode in kept if episode.id not in left)
+    return tuple(episode for episode in unique if episode.id not in twin_names)
 
 
 def _is_symmetric(episode: Episode) -> bool:

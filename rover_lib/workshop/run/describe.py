@@ -15,7 +15,7 @@ from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 
 FIRST = "rover run makes the first; in a clone, make demo too"
 
@@ -25,11 +25,12 @@ def describe(source: Source, progress: Progress = silent) -> dict[str, Any]:
 
     Raises the RoverError of that kind's loader if it is damaged, has another version, or is of no known kind.
     """
-    path, kinds = source.path, kinds_of(source.path)
+    path = source.path
+    kinds = kinds_of(source.path)
     kind = kinds[0] if kinds else None
     if path == Path("runs") or (kind is None and path.is_dir()):
-        if found := runs(path):
-            return {"runs": {run["name"]: run["verdict"] for run in found}}
+        if folders := runs(path):
+            return {"runs": {run["name"]: run["verdict"] for run in folders}}
         if path == Path("runs"):
             raise RoverError(f"{path}: no run in it", remedy=FIRST)
     if kind == "artifact":
@@ -73,11 +74,13 @@ def runs(folder: Path | str) -> list[dict[str, str]]:
 def verdict_of(run_dir: Path) -> str:
     """A run's verdict in one line; if it has none of the files that are there, the command that makes one."""
     with suppress(RoverError, KeyError):  # there is none yet, or it cannot be used
-        judged = read_stage(run_dir / "run.json", "run")
-        there = {run_dir / name: sha256 for name, sha256 in judged["inputs"].items() if (run_dir / name).is_file()}
+        stage = read_stage(run_dir / "run.json", "run")
+        there = {run_dir / name: sha256 for name, sha256 in stage["inputs"].items() if (run_dir / name).is_file()}
         if all(sha256_of(path) == sha256 for path, sha256 in there.items()):
-            return str(judged["metrics"]["headline"])
+            return str(stage["metrics"]["headline"])
     if (run_dir / "compare.json").is_file():
         return f"no verdict of its files: rover report {shlex.quote(str(run_dir))}"
-    made = next((p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT")
-    return f"no run yet: rover run {shlex.quote(str(made))} EPISODES --name {shlex.quote(run_dir.name)}"
+    checkpoint = next(
+        (p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT"
+    )
+    return f"no run yet: rover run {shlex.quote(str(checkpoint))} EPISODES --name {shlex.quote(run_dir.name)}"

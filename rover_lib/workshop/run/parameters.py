@@ -58,16 +58,15 @@ def check_parameters(**turned: Any) -> None:
     own, passed = _parameters_here()
     if unknown := sorted(passed.keys() - own.keys()):
         raise ParamsError(f"no parameter {', '.join(unknown)}", remedy=f"known are {', '.join(own)}")
-    left = [name for name, value in own.items() if passed and name not in passed and _is_of_a_run(value)]
-    if left:
-        what = (
-            f"{', '.join(passed)} was passed, and {' and '.join(left)} would be another run's, the notebook's default"
-        )
-        raise ParamsError(what, found=own[left[0]], remedy=f"pass {' and '.join(left)} too")
+    missing = [name for name, value in own.items() if passed and name not in passed and _is_of_a_run(value)]
+    if missing:
+        names = " and ".join(missing)
+        problem = f"{', '.join(passed)} was passed, and {names} would be another run's, the notebook's default"
+        raise ParamsError(problem, found=own[missing[0]], remedy=f"pass {names} too")
     if broken := broken_rule(turned, {name: RULES[name] for name in turned}):
-        name, wanted, found = broken
+        name, rule, actual = broken
         remedy = "set it in the notebook, by -p, or in params.yml"
-        raise ParamsError(f"the parameter {name} must be {wanted}", found=found, remedy=remedy)
+        raise ParamsError(f"the parameter {name} must be {rule}", found=actual, remedy=remedy)
     files = {name: str(turned[name]).startswith(DEMO) for name in FILES if "checkpoint" in turned}
     if not passed and len(set(files.values())) > 1:
         default = next(name for name, of_default in files.items() if of_default)
@@ -98,11 +97,11 @@ def _parameters_here() -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _assigned(source: str) -> dict[str, Any]:
     """Return the names that a cell of literals sets, and their values; None for what is no literal."""
-    found = {}
+    literals = {}
     for line in ast.parse(source).body:
         if isinstance(line, ast.Assign) and isinstance(line.targets[0], ast.Name):
             value = None
             with suppress(ValueError):
                 value = ast.literal_eval(line.value)
-            found[line.targets[0].id] = value
-    return found
+            literals[line.targets[0].id] = value
+    return literals

@@ -50,8 +50,8 @@ def prepare_chooser(
     """A chooser on this many frames that calibration has not seen, and on odd ones, if calibration met any."""
     parts = loaded.parts
     odd = odd_samples(calibration.frames, calibration.seen, parts.calibration)
-    few = pick_evenly(parts.choosing or parts.calibration, frames)
-    return Chooser(checkpoint, calibration, few, loaded.recordings.action_range(), odd)
+    tried = pick_evenly(parts.choosing or parts.calibration, frames)
+    return Chooser(checkpoint, calibration, tried, loaded.recordings.action_range(), odd)
 
 
 def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None) -> dict[str, Scheme]:
@@ -62,7 +62,7 @@ def schemes_of(static: Scheme, mixed: Scheme, modes: Sequence[str] | None = None
     schemes = {"dynamic": replace(static, mode="dynamic"), "static": static, "mixed": mixed}
     if not mixed.float_blocks:
         del schemes["mixed"]  # it is static
-    return {name: each for name, each in schemes.items() if modes is None or name in ("static", *modes)}
+    return {name: scheme for name, scheme in schemes.items() if modes is None or name in ("static", *modes)}
 
 
 def make_artifact(
@@ -75,11 +75,16 @@ def make_artifact(
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
     samples = pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES)
-    said, scheme = p["quantization"], Scheme(smooth=p["quantization"]["smooth"])
-    chosen, note = choose_calibration(parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"])
-    calibration = calibrate(checkpoint, chosen, smooth=scheme.smooth, progress=progress)
+    quantization = p["quantization"]
+    scheme = Scheme(smooth=p["quantization"]["smooth"])
+    calibration_samples, note = choose_calibration(
+        parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"]
+    )
+    calibration = calibrate(checkpoint, calibration_samples, smooth=scheme.smooth, progress=progress)
     if odd_share(calibration.frames):
-        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, said["observers"], progress)
+        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(
+            scheme, quantization["observers"], progress
+        )
     policy = quantize(checkpoint, scheme, calibration)
     drives = Drives.of(parts)
     digest, _ = Exporter(checkpoint, samples).export(policy, path, calibration, drives)
@@ -104,9 +109,10 @@ def export_policies(
     exporter = Exporter(checkpoint, samples)
     for name, policy in policies.items():
         forget_graphs()
-        path, known = Path(folder) / f"policy_{name}.pt", drives if name in DRIVEN else None
+        path = Path(folder) / f"policy_{name}.pt"
+        known_drives = drives if name in DRIVEN else None
         quantized = isinstance(policy, QuantizedPolicy)
-        digest, familiar = exporter.export(policy, path, calibration if quantized else None, known)
+        digest, familiar = exporter.export(policy, path, calibration if quantized else None, known_drives)
         described[name] = {"content_hash": digest} | ({"familiar": familiar} if familiar else {})
         if isinstance(policy, QuantizedPolicy):
             described[name] |= policy.report | {"scheme": asdict(policy.scheme)}
@@ -125,22 +131,23 @@ def export_onnx(run_dir: Path | str, progress: Progress = silent) -> dict[str, s
     checkpoint, parts = again.checkpoint, again.parts
     exporter = Exporter(checkpoint, pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES))
     stage = read_stage(run_dir / "quantize.json", "quantize")
-    made, calibrated = stage["metrics"]["modes"]["static"], run_dir / "calibration.pt"
+    static = stage["metrics"]["modes"]["static"]
+    calibrated = run_dir / "calibration.pt"
     hashes = content_hash(run_dir / "policy_static.pt"), sha256_of(calibrated)
-    if hashes != (made["content_hash"], stage["inputs"]["calibration.pt"]):
-        what = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
-        raise ArtifactError(what, remedy="quantize again")
+    if hashes != (static["content_hash"], stage["inputs"]["calibration.pt"]):
+        problem = f"{run_dir}: policy_static.pt and calibration.pt are not those of quantize.json"
+        raise ArtifactError(problem, remedy="quantize again")
     calibration, drives = Calibration.load(calibrated), Drives.of(parts)
     policies: dict[str, ACT | QuantizedPolicy] = {
         "fp32": ACT(checkpoint.config, checkpoint.weights),
-        "static": quantize(checkpoint, Scheme.of(made["scheme"]), calibration),
+        "static": quantize(checkpoint, Scheme.of(static["scheme"]), calibration),
     }
-    written = {}
+    artifacts = {}
     for name, policy in progress(policies.items(), desc="for ONNX Runtime", total=len(policies)):
         path = run_dir / f"policy_{name}{ONNX_SUFFIX}"
-        written[path.name], _ = exporter.export(policy, path, calibration if name == "static" else None, drives)
+        artifacts[path.name], _ = exporter.export(policy, path, calibration if name == "static" else None, drives)
         forget_graphs()
-    return written
+    return artifacts
 
 
 @torch.inference_mode()
@@ -164,15 +171,18 @@ def export_graph(checkpoint: Checkpoint, path: Path | str) -> Path:
     Raises ArtifactError, and writes nothing, if ONNX Runtime computes something else than the policy does for random
     observations.
     """
-    config, rng = checkpoint.config, np.random.default_rng(0)
+    config = checkpoint.config
+    rng = np.random.default_rng(0)
     policy = ACT(config, checkpoint.weights)
     form = Onnx(policy, config)
     for _ in range(CHECKED_OBSERVATIONS):
         state = torch.from_numpy(rng.uniform(-1, 1, (1, len(config.state_names))).astype(np.float32))
         frames = [torch.from_numpy(rng.integers(0, 256, (*size, 3), np.uint8)) for size in config.image_sizes]
-        wanted, found = policy(state, *frames), form.run((state, *frames))[0]
-        gap, most = (found - wanted).abs().max(), params()["parity"]["fp32"] * wanted.abs().max().clamp(min=1)
-        if not gap <= most:  # written so that NaN fails
+        expected = policy(state, *frames)
+        actual = form.run((state, *frames))[0]
+        gap = (actual - expected).abs().max()
+        tolerance = params()["parity"]["fp32"] * expected.abs().max().clamp(min=1)
+        if not gap <= tolerance:  # written so that NaN fails
             raise ArtifactError(f"{path}: the written graph differs by {gap:.3g}; nothing was written")
     facts = {"rate_hz": config.rate_hz, "states": ",".join(config.state_names), "checkpoint": checkpoint.sha256}
     guessed = [fact for fact in ("actions", "rate") if checkpoint.facts.source(fact) == GUESS]

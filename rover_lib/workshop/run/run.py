@@ -108,17 +108,17 @@ def run(
     folder = run_folder(runs_dir, name, RoverError)
     sources = [NOTEBOOKS / f"{n}.ipynb" for n in NAMES]
     _refuse_senseless(sources, overrides)
-    given = {"checkpoint": str(Path(checkpoint).resolve()), "episodes": str(Path(episodes).resolve()), **overrides}
+    parameters = {"checkpoint": str(Path(checkpoint).resolve()), "episodes": str(Path(episodes).resolve()), **overrides}
     texts = [s.read_text() for s in sources]
-    asked = json.dumps([str(folder), given, params(), texts], sort_keys=True, default=str)
-    with build_folder(folder, files_of_a_run, asked) as new:
+    request = json.dumps([str(folder), parameters, params(), texts], sort_keys=True, default=str)
+    with build_folder(folder, files_of_a_run, request) as new:
         finished = {path.name for path in new.glob("*.ipynb")}
         for path in folder.glob("benchmark-*.json"):  # notebook 05 shows those of other hosts
             shutil.copy2(path, new)
         try:
             for source in progress(sources, desc="notebooks", total=len(sources)):
                 if source.name not in finished:
-                    known_to_it = {k: v for k, v in given.items() if k in parameters_of(source)}
+                    known_to_it = {k: v for k, v in parameters.items() if k in parameters_of(source)}
                     _execute(source, new, known_to_it, progress is not silent)
         except BaseException:
             if {path.name for path in new.glob("*.ipynb")} <= finished:  # the next one shall not fail there again
@@ -142,14 +142,15 @@ def execute(name: str, run_dir: Path | str, **overrides: Any) -> Path:
     name: it, or its beginning, such as 04. Raises RoverError for an unknown notebook or parameter, or with the cell and
     its error; an earlier executed one then stays.
     """
-    found = [each for each in NAMES + AFTERWARDS if each.startswith(name.removesuffix(".ipynb"))]
-    if len(found) != 1:
+    matches = [notebook for notebook in NAMES + AFTERWARDS if notebook.startswith(name.removesuffix(".ipynb"))]
+    if len(matches) != 1:
         raise RoverError(f"no notebook {name}", remedy=f"known are {', '.join(NAMES + AFTERWARDS)}")
-    folder, source = Path(run_dir).resolve(), NOTEBOOKS / f"{found[0]}.ipynb"
+    folder = Path(run_dir).resolve()
+    source = NOTEBOOKS / f"{matches[0]}.ipynb"
     if not folder.is_dir():
         raise RoverError(f"{folder}: not found", remedy="rover inspect shows the runs that there are")
     _refuse_senseless([source], overrides)
-    if found == [NAMES[0]] and (folder / "load.json").is_file():  # what the run was made of, unless said otherwise
+    if matches == [NAMES[0]] and (folder / "load.json").is_file():  # what the run was made of, unless said otherwise
         overrides = read_stage(folder / "load.json", "load")["params"] | overrides
     _execute(source, folder, overrides, False)
     return folder / source.name
@@ -159,9 +160,9 @@ def _refuse_senseless(notebooks: list[Path], given: Mapping[str, Any]) -> None:
     """Raise RoverError for parameters that none of the notebooks has, impossible values, and missing notebooks."""
     if missing := [path for path in notebooks if not path.is_file()]:
         raise RoverError(f"{missing[0]}: not found", remedy="install the project again")
-    known = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
-    if unknown := sorted(given.keys() - known):
-        raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(known)}")
+    accepted = set().union(*(parameters_of(path) for path in notebooks)) - {"run_dir"}
+    if unknown := sorted(given.keys() - accepted):
+        raise RoverError(f"no parameter {', '.join(unknown)}", remedy=f"known are {sorted(accepted)}")
     check_parameters(**given)
 
 
@@ -172,11 +173,16 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # it says what it executes; the bar does that
     bar = {"leave": False} if bars and sys.stderr.isatty() else False  # of its cells
-    how: dict[str, Any] = {"cwd": str(folder), "progress_bar": bar, "kernel_name": "python3", "start_timeout": START_S}
-    how |= {"kernel_manager_class": ThisPython}
+    options: dict[str, Any] = {
+        "cwd": str(folder),
+        "progress_bar": bar,
+        "kernel_name": "python3",
+        "start_timeout": START_S,
+    }
+    options |= {"kernel_manager_class": ThisPython}
     with patch.dict(os.environ, KERNEL_ENVIRONMENT), atomic_path(folder / source.name) as temporary:
         try:
-            papermill.execute_notebook(with_parameters(source, given), str(temporary), **how)
+            papermill.execute_notebook(with_parameters(source, given), str(temporary), **options)
             sync_disk(folder)  # a power cut must not leave the notebook without what it wrote
         except papermill.PapermillExecutionError as e:
             if e.ename == "KeyboardInterrupt":  # Ctrl-C reaches the kernel too
@@ -188,7 +194,8 @@ def _execute(source: Path, folder: Path, given: Mapping[str, Any], bars: bool) -
 
 def with_parameters(source: Path, given: Mapping[str, Any]) -> Any:
     """Read a notebook, and set the values in its `parameters` cell: those given, else those of params.yml."""
-    values, p = {"run_dir": ".", **given}, params()
+    values = {"run_dir": ".", **given}
+    p = params()
     notebook, cell = _parameters_cell(source)
     lines = []
     for name, literal, comment in LINE.findall(cell.source):

@@ -33,27 +33,30 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     Made anew of what is there, with what `make count` and `rover world students` added. Raises RoverError where a stage
     is missing, is of other artifacts or lacks what is to be judged, and for an artifact that was not compared.
     """
-    folder, p = Path(run_dir), params()
+    folder = Path(run_dir)
+    p = params()
     files = _files(folder)
     contents = {stage: read_stage(path, stage) for stage, path in files.items()}
     try:
-        made = contents["quantize"]["metrics"]["modes"]
-        _refuse_other_artifacts(folder, made, contents["compare"]["inputs"])
-        if (timed := benchmark_of(folder, made)) is None:
+        modes = contents["quantize"]["metrics"]["modes"]
+        _refuse_other_artifacts(folder, modes, contents["compare"]["inputs"])
+        if (timed := benchmark_of(folder, modes)) is None:
             raise RoverError(f"{folder}: no benchmark of its artifacts", remedy=AGAIN)
         files["benchmark"] = timed
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
-        given = contents["load"]["params"]
-        names = Names(*(relative(path) for path in (folder.resolve(), given["checkpoint"], given["episodes"])))
-        there = {mode: path for mode in made if (path := folder / f"policy_{mode}.pt").is_file()}
+        parameters = contents["load"]["params"]
+        names = Names(
+            *(relative(path) for path in (folder.resolve(), parameters["checkpoint"], parameters["episodes"]))
+        )
+        there = {mode: path for mode in modes if (path := folder / f"policy_{mode}.pt").is_file()}
         refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
-        judged = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
-        judged = {"headline": headline(judged), "host": contents["benchmark"]["env"]["host"], **judged}
+        result = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
+        result = {"headline": headline(result), "host": contents["benchmark"]["env"]["host"], **result}
     except KeyError as missing:
         raise RoverError(f"{folder}: its stages lack {missing}, as of another version", remedy=AGAIN) from missing
     inputs = {path.name: sha256_of(path) for path in files.values()}
-    given = {"verdict": p["verdict"], "gates": p["gates"]}
-    return write_stage(folder / "run.json", "run", params=given, metrics=judged, inputs=inputs)
+    parameters = {"verdict": p["verdict"], "gates": p["gates"]}
+    return write_stage(folder / "run.json", "run", params=parameters, metrics=result, inputs=inputs)
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -71,10 +74,10 @@ def _refuse_other_artifacts(folder: Path, modes: Mapping[str, Any], compared: Ma
     """
     if not is_of(compared, modes):
         raise RoverError(f"{folder / 'compare.json'}: is of other artifacts than this run's", remedy=AGAIN)
-    for mode, made in modes.items():
+    for mode, entry in modes.items():
         path = folder / f"policy_{mode}.pt"
-        if path.is_file() and (found := content_hash(path)) != made["content_hash"]:
-            contents = f"content {found[:12]} instead of {made['content_hash'][:12]}"
+        if path.is_file() and (actual_hash := content_hash(path)) != entry["content_hash"]:
+            contents = f"content {actual_hash[:12]} instead of {entry['content_hash'][:12]}"
             raise RoverError(f"{path}: not the artifact that this run made", found=contents, remedy=AGAIN)
 
 
@@ -96,14 +99,14 @@ def text(judged: Mapping[str, Any]) -> str:
 def columns(judged: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The modes beside each other, a header first: for a terminal and for a card. A dash where nothing was measured."""
     actions = list(dict.fromkeys(action for row in judged["modes"] for action in row["errors_pct"]))
-    counted = ("10^9 instructions",) if any(row["instructions_g"] for row in judged["modes"]) else ()
+    instructions = ("10^9 instructions",) if any(row["instructions_g"] for row in judged["modes"]) else ()
     errors = (f"{action} error, %" for action in actions)
-    lines = [("", "MB", "times smaller", *errors, "hits", judged["compared"], "times faster", *counted)]
+    lines = [("", "MB", "times smaller", *errors, "hits", judged["compared"], "times faster", *instructions)]
     for row in judged["modes"]:
         cells = [CALLED[row["mode"]], number(row["size_mb"]), number(row["times_smaller"])]
         cells += [number(row["errors_pct"].get(action), ".2f") for action in actions]
         cells += [f"{row['hits']} of {row['trials']}" if row["trials"] else "-", number(row["time_ms"])]
-        cells += [number(row["times_faster"]), *(number(row["instructions_g"], ".3g") for _ in counted)]
+        cells += [number(row["times_faster"]), *(number(row["instructions_g"], ".3g") for _ in instructions)]
         lines.append(tuple(cells))
     return lines
 
@@ -115,16 +118,16 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
     Raises RoverError if the run has no verdict, and if there is a README.md that this has not written.
     """
     folder = Path(run_dir)
-    judged, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
+    result, load = (read_stage(folder / f"{name}.json", name)["metrics"] for name in ("run", "load"))
     path = folder / "README.md"
     if path.exists() and CARD not in path.read_text(errors="replace"):
         raise RoverError(f"{path}: is not a card that this has written", remedy="move it away")
-    header, *rows = columns(judged)
+    header, *rows = columns(result)
     recordings = load["recordings"]
-    known = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
-    hub = {key: value for key, value in known.items() if value}
+    metadata = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
+    hub = {key: value for key, value in metadata.items() if value}
     hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
-    values = {"name": folder.resolve().name, "judged": judged, "header": header, "rows": rows, "recordings": recordings}
+    values = {"name": folder.resolve().name, "judged": result, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
     with atomic_path(path) as temporary:
         temporary.write_text(Template(Path(__file__).with_name("card.md").read_text()).render(values))

@@ -15,7 +15,7 @@ from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, check_limits, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.units import in_todays_units
 
 SMALL_GMAC = 1.0  # a policy below this gains less from a second thread than the thread costs on a busy machine
@@ -59,21 +59,22 @@ def open_run(run_dir: Path | str, progress: Progress = silent) -> Opened:
     Raises RoverError if it did not run, or if the files have changed since.
     """
     stage = read_stage(Path(run_dir) / "load.json", "load")
-    given, loaded = stage["params"], stage["metrics"]["checkpoint"]
+    parameters = stage["params"]
+    loaded = stage["metrics"]["checkpoint"]
     if sum(loaded["macs_by_block"].values()) < SMALL_GMAC * 1e9:
         torch.set_num_threads(1)
-    again = load(given["checkpoint"], Source.loaded(given), progress, loaded["sha256"])
+    again = load(parameters["checkpoint"], Source.loaded(parameters), progress, loaded["sha256"])
     now = again.checkpoint
     then = stage["metrics"].get("recordings", {}).get("layout"), stage["metrics"]["split"]
     words = again.recordings.layout.words()
     # older runs lack an identity and a layout
     if (now.sha256, now.identity) != (loaded["sha256"], loaded.get("identity", now.identity)):
-        what = f"{now.path}: its weights, config or statistics have changed since notebook 01 loaded it"
+        problem = f"{now.path}: its weights, config or statistics have changed since notebook 01 loaded it"
     elif (then[0] or words, then[1]) != (words, again.parts.episodes):
-        what = f"{again.recordings.root}: other episodes, or another order of numbers, than notebook 01 loaded"
+        problem = f"{again.recordings.root}: other episodes, or another order of numbers, than notebook 01 loaded"
     else:
         return again
-    raise RoverError(what, remedy="run notebook 01 again")
+    raise RoverError(problem, remedy="run notebook 01 again")
 
 
 def training_device(asked: str | None, error: type[RoverError]) -> torch.device:
@@ -83,6 +84,7 @@ def training_device(asked: str | None, error: type[RoverError]) -> torch.device:
     if name not in ("cpu", "cuda") or (number and (name == "cpu" or not number.isdecimal())):
         raise error("a device is cpu, cuda, or a GPU's number as in cuda:1", found=asked, remedy="leave it out")
     if name == "cuda" and int(number or 0) >= count:
-        what, remedy = f"{asked}: torch {torch.__version__} finds {count} GPUs", "does nvidia-smi show it?"
-        raise error(what, remedy=f"{remedy} if not, install its driver, or train on the CPU: --device cpu")
+        problem = f"{asked}: torch {torch.__version__} finds {count} GPUs"
+        remedy = "does nvidia-smi show it?"
+        raise error(problem, remedy=f"{remedy} if not, install its driver, or train on the CPU: --device cpu")
     return torch.device(name if name == "cpu" else f"cuda:{number or torch.cuda.current_device()}")

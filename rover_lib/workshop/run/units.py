@@ -34,12 +34,13 @@ def in_todays_units(policy: Checkpoint, recordings: Recordings, samples: Sequenc
     tried = [recorded] if recorded else []
     if car.drives_like(Car()) and recordings.layout.rate_hz is None and OLD not in tried:
         tried.append(OLD)
-    few = pick_evenly(samples, FRAMES)
-    best, least = policy, BETTER * planned_error(policy, few, 1) if tried else 0.0
+    samples_tried = pick_evenly(samples, FRAMES)
+    best = policy
+    best_error = BETTER * planned_error(policy, samples_tried, 1) if tried else 0.0
     for formulas in tried:
         converted = _in_units_of(policy, car, formulas)
-        if (error := planned_error(converted, few, 1)) <= least:
-            best, least = converted, error
+        if (error := planned_error(converted, samples_tried, 1)) <= best_error:
+            best, best_error = converted, error
     return best
 
 
@@ -59,8 +60,12 @@ def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Channel]) 
         state_norm=_affine(np.array(state.scale) * gains, np.array(state.scale) * offsets + np.array(state.shift)),
         action_unnorm=_affine(scale / gains, (shift - offsets) / gains),
     )
-    said = ", ".join(f"{name} = (duty % - {f.neutral_pct:g}) / {f.span_pct:g}" for name, f in formulas.items())
-    words = normalisation(config) | {"units": f"trained on actions of older firmware ({said}), and converted"}
+    formulas_in_words = ", ".join(
+        f"{name} = (duty % - {f.neutral_pct:g}) / {f.span_pct:g}" for name, f in formulas.items()
+    )
+    words = normalisation(config) | {
+        "units": f"trained on actions of older firmware ({formulas_in_words}), and converted"
+    }
     return replace(policy, config=config, report=policy.report | {"normalisation": words})
 
 

@@ -5,10 +5,8 @@ import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
-import needs
 import numpy as np
 import pytest
-from policies import memory_samples
 
 from lab.a76 import core as a76
 from lab.a76 import count as counting
@@ -23,6 +21,8 @@ from rover_lib.workshop.act import ACT
 from rover_lib.workshop.int8 import quantize as q
 from rover_lib.workshop.int8.export import Exporter
 from rover_lib.workshop.progress import silent
+from tests.helpers import needs
+from tests.helpers.policies import memory_samples
 
 pytestmark = [pytest.mark.emulated, needs.qemu]
 

@@ -4,12 +4,12 @@ import shutil
 
 import numpy as np
 import pytest
-from executed import shown
 
 from lab import PARAMS
 from lab.a76 import count as counting
 from lab.a76 import report
 from rover_lib.workshop.run import run as runs
+from tests.helpers.executed import shown
 
 
 def test_what_is_not_divided_over_the_threads_is_executed_by_one():

@@ -5,12 +5,12 @@ Who may arm, which lines are commands, and what noise does are the state machine
 
 import random
 
-import needs
 import pytest
-from uno import CUT, EDGE_US, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
+from tests.helpers import needs
+from tests.helpers.uno import CUT, EDGE_US, RESET, STEP_US, Uno, arm, line, on_pins, pulses, widths
 
 pytestmark = [pytest.mark.emulated, needs.simavr]
 NEUTRAL_US = 1456, 120

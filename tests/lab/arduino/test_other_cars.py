@@ -6,13 +6,13 @@ import zlib
 from itertools import pairwise
 from types import SimpleNamespace
 
-import needs
 import pytest
-from uno import ANSWER_MS, EDGE_US, EEPROM_BYTES, REPOSITORY, STEP_US, Uno, arm, on_pins, pulses, widths
 
 from lab.arduino.emulator import eeprom_of
 from rover_lib.onboard.car.car import Car, read_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
+from tests.helpers import needs
+from tests.helpers.uno import ANSWER_MS, EDGE_US, EEPROM_BYTES, REPOSITORY, STEP_US, Uno, arm, on_pins, pulses, widths
 
 pytestmark = [pytest.mark.emulated, needs.simavr]
 CRAWLER, INVERTED = (read_car(REPOSITORY / "lab" / "cars" / f"{name}.yml") for name in ("crawler", "inverted"))

@@ -2,7 +2,6 @@
 
 import re
 
-import needs
 import pytest
 from click.testing import CliRunner
 
@@ -10,6 +9,7 @@ from lab.__main__ import main
 from lab.driving.invariants import broken
 from lab.driving.stories import KEPT, drive_story, random_story
 from rover_lib.onboard.stage import read_stage
+from tests.helpers import needs
 
 pytestmark = needs.gcc
 

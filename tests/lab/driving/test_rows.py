@@ -4,7 +4,6 @@ import logging
 import re
 from dataclasses import fields
 
-import needs
 import pytest
 from click.testing import CliRunner
 
@@ -16,6 +15,7 @@ from lab.driving.stories import KEPT
 from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.stage import read_stage
+from tests.helpers import needs
 
 SAFETY = (REPOSITORY / "docs" / "safety.md").read_text()
 CARS = REPOSITORY / "lab" / "cars"

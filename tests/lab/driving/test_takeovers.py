@@ -4,11 +4,10 @@ from dataclasses import replace
 from itertools import groupby
 from unittest.mock import MagicMock
 
-import needs
-
 from lab.driving.virtual import LIVE, LOST, World
 from lab.driving.virtual_host import Process
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
+from tests.helpers import needs
 
 
 def sticks(steering_us, throttle_us, receiver=LIVE):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from archives import manifest_with, rewritten, vectors_with
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.archive import ONNX
@@ -17,6 +16,7 @@ from rover_lib.onboard.artifact.manifest import Artifact, content_hash
 from rover_lib.onboard.care.benchmark import peak_memory_alone_mb
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
+from tests.helpers.archives import manifest_with, rewritten, vectors_with
 
 HARM = "harm"  # the file that a hostile program writes into the working folder
 

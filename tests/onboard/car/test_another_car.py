@@ -5,7 +5,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from recorded import content_of, edit_json, record_there_and_back
 
 from rover_lib.onboard.artifact.manifest import car_of
 from rover_lib.onboard.car.car import Car, read_car
@@ -17,6 +16,7 @@ from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.recording.episode import car_in, read_car_of
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.recordings.samples import car_of as recorded_car_of
+from tests.helpers.recorded import content_of, edit_json, record_there_and_back
 
 CRAWLER = read_car(Path(__file__).parents[3] / "lab" / "cars" / "crawler.yml")
 

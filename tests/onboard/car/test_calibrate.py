@@ -6,7 +6,6 @@ from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 
-import needs
 import pytest
 from click.testing import CliRunner
 
@@ -19,6 +18,7 @@ from rover_lib.onboard.car.calibrate import measure
 from rover_lib.onboard.car.car import Car, read_car, yaml_of
 from rover_lib.onboard.car.pwm import Pulses
 from rover_lib.onboard.errors import CarError
+from tests.helpers import needs
 
 pytestmark = needs.gcc
 CRAWLER = {"rest": (1504, 1496), "left": 1996, "right": 1012, "forward": 1990, "back": 1004}

@@ -4,14 +4,13 @@ import os
 from unittest.mock import Mock, call
 
 import cv2
-import hostile
 import numpy as np
 import pytest
-import recorded
 
 from rover_lib.onboard.car import camera as c
 from rover_lib.onboard.car.camera import Camera, CameraError
 from rover_lib.onboard.car.picture import decode_jpeg
+from tests.helpers import hostile, recorded
 
 SIZE = 160, 90
 

@@ -6,15 +6,15 @@ import re
 from contextlib import suppress
 
 import cv2
-import hostile
 import numpy as np
 import pytest
-from hostile import HOSTILE, WHOLE, jpeg, scene
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rover_lib.onboard.car.picture import block_sums, brightness, check_jpeg, decode_jpeg, read_jpeg
 from rover_lib.onboard.errors import CameraError
+from tests.helpers import hostile
+from tests.helpers.hostile import HOSTILE, WHOLE, jpeg, scene
 
 
 def test_what_is_not_all_of_a_cameras_picture_is_refused_cheaply(tmp_path):

@@ -16,7 +16,7 @@ def test_the_only_one_is_found_and_the_provisioned_name_goes_first(tmp_path):
     assert find_port(tmp_path) == str(tmp_path / "ttyACM0")
     (tmp_path / "ttyUSB0").touch()
     (by_id / "usb-1a86").symlink_to("../../ttyUSB0")
-    with pytest.raises(RoverError, match=r"found \S+ttyACM0, \S+ttyUSB0 \(usb-1a86\); say it: --port \S+ttyACM0"):
+    with pytest.raises(RoverError, match=r"found \S+ttyACM0, \S+ttyUSB0 \(usb-1a86\); pass it: --port \S+ttyACM0"):
         find_port(tmp_path)
     (tmp_path / "rover-arduino").symlink_to("ttyUSB0")
     assert find_port(tmp_path) == str(tmp_path / "rover-arduino")

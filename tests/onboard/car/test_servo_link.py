@@ -7,16 +7,16 @@ import termios
 import threading
 import time
 
-import needs
 import numpy as np
 import pytest
 import serial
 from hypothesis import given
 from hypothesis import strategies as st
-from pty_board import Board, board_of, obedient
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, State, Telemetry, frame, parse
+from tests.helpers import needs
+from tests.helpers.pty_board import Board, board_of, obedient
 
 DEFAULT = Car().id
 until = functools.partial(needs.until, seconds=2.0)

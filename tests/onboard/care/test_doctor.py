@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import rover
-from pty_board import board_of
 
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car
@@ -16,6 +14,8 @@ from rover_lib.onboard.car.host import Host
 from rover_lib.onboard.care import doctor
 from rover_lib.onboard.care.doctor import examine
 from rover_lib.onboard.errors import CameraError
+from tests.helpers.command import rover
+from tests.helpers.pty_board import board_of
 
 
 def only(checks):

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from archives import manifest_with, rewritten, vectors_with
-from command import rover
 
 from rover_lib.onboard.artifact.acceptance import Expected
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
 from rover_lib.onboard.care.release import Releases
 from rover_lib.onboard.errors import ArtifactError, RoverError
 from rover_lib.onboard.stage import sha256_of
+from tests.helpers.archives import manifest_with, rewritten, vectors_with
+from tests.helpers.command import rover
 
 CHANGES = ("fsync", "mkdir", "symlink", "rename", "replace", "unlink", "rmdir")  # calls that change the disk
 Hook = Callable[[str, Callable[[], object], Path], object]  # takes a call's name, the call itself, and its path

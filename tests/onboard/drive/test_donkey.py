@@ -6,10 +6,8 @@ import threading
 import time
 from pathlib import Path
 
-import needs
 import numpy as np
 import pytest
-from fake_drive import Clock, Log
 
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car
@@ -21,6 +19,8 @@ from rover_lib.onboard.drive.pilot import PolicyPilot
 from rover_lib.onboard.drive.plan import Commanded, Follower, Plan, Settings
 from rover_lib.onboard.errors import DriveFault, RoverError
 from rover_lib.onboard.params import params
+from tests.helpers import needs
+from tests.helpers.fake_drive import Clock, Log
 
 HZ, TURN_S = 20.0, 1 / 16  # a plan's steps a second; a turn of the loop, of another length, and exact in floats
 PAGE = Path(__file__).parents[3] / "docs/donkeycar.md"

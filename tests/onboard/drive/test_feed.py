@@ -9,7 +9,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_drive import STATUS, Always, Clock, Link
 
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.servo_link import State
@@ -17,6 +16,7 @@ from rover_lib.onboard.drive import feed as f
 from rover_lib.onboard.drive.flight_log import FlightLog, read_log
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.plan import Plan
+from tests.helpers.fake_drive import STATUS, Always, Clock, Link
 
 JPEG = b"\xff\xd8 a picture\n with a line's end \xff\xd9"
 FRAME = Frame(np.zeros((36, 64, 3), np.uint8), 999.95, 5, 0, 100.0, 40.0, JPEG)

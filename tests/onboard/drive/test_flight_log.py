@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from needs import until
 
 from rover_lib.onboard.drive import flight_log as module
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick, read_log
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.watch import HealthWatch
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError
+from tests.helpers.needs import until
 
 LIMITS = {"max_bytes": 1_000_000, "keep": 2}
 HEADER = {"hz": 30, "fade_s": 0.5, "stop_s": 1.0}

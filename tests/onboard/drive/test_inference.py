@@ -10,13 +10,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from needs import until
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.drive.inference import Planner, PolicyProcess
 from rover_lib.onboard.drive.plan import Commanded
 from rover_lib.onboard.errors import PolicyError
+from tests.helpers.needs import until
 
 pytestmark = pytest.mark.slow  # each starts processes that import torch
 

@@ -13,7 +13,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_drive import Always, Clock, Link, Log
 
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -24,6 +23,7 @@ from rover_lib.onboard.drive.pilot import PolicyPilot, Sight
 from rover_lib.onboard.drive.plan import Commanded, Plan, Settings
 from rover_lib.onboard.drive.watch import NOT_REPORTED, HealthWatch, stop_on_signals
 from rover_lib.onboard.errors import CameraError, DriveFault, ParamsError, RoverError
+from tests.helpers.fake_drive import Always, Clock, Link, Log
 
 PERIOD = 1 / 30
 

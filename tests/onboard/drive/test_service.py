@@ -21,8 +21,6 @@ from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
-from fake_drive import STATUS
-from needs import until
 
 from rover_lib.cli import main
 from rover_lib.onboard.car import host
@@ -34,6 +32,8 @@ from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.drive.session import Arming, DriveOptions, Session, arm_when_ready, wanted_since
 from rover_lib.onboard.errors import CameraError
+from tests.helpers.fake_drive import STATUS
+from tests.helpers.needs import until
 
 REQUEST_S = s.REQUEST_S
 

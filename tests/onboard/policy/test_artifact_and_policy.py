@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import memory_samples
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.acceptance import inspect_artifact
 from rover_lib.onboard.errors import ArtifactError, PolicyError
 from rover_lib.onboard.policy.torch_engine import _originals, give_back_packed_weights
+from tests.helpers.policies import memory_samples
 
 FRAME = memory_samples(1)[0].picture
 STATE = np.zeros(2, np.float32)

@@ -4,12 +4,12 @@ import sys
 
 import numpy as np
 import pytest
-from archives import manifest_with, rewritten, vectors_with
 
 from rover_lib.onboard import load_policy
 from rover_lib.onboard.artifact.manifest import read_manifest
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.errors import ArtifactError
+from tests.helpers.archives import manifest_with, rewritten, vectors_with
 
 FRAME, STATE = np.full((360, 640, 3), 99, np.uint8), np.array([0.1, 0.2], np.float32)
 

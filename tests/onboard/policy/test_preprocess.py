@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from policies import normalise, smooth_frame
 
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.preprocess import IMAGENET_MEAN, IMAGENET_STD, prepare_frame
+from tests.helpers.policies import normalise, smooth_frame
 
 
 def lerobots(frame_bgr, height, width):

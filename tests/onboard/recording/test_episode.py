@@ -12,8 +12,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from command import rover
-from recorded import content_of, names_in, real_episode
 
 from rover_lib.onboard.errors import EpisodeError
 from rover_lib.onboard.recording import episode as module
@@ -27,6 +25,8 @@ from rover_lib.onboard.recording.episode import (
 )
 from rover_lib.onboard.recording.recorder import _new_episode
 from rover_lib.workshop.recordings.episodes import load_recordings
+from tests.helpers.command import rover
+from tests.helpers.recorded import content_of, names_in, real_episode
 
 NAME = "episode_20260101_120000"
 FRAME = np.full((36, 64, 3), (30, 90, 200), np.uint8)

@@ -10,9 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import rover
-from needs import until
-from recorded import content_of, names_in
 
 from rover_lib.onboard.car.camera import CameraError, Frame
 from rover_lib.onboard.car.car import Car
@@ -22,6 +19,9 @@ from rover_lib.onboard.recording import recorder as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.recording.recorder import Recorder, record
 from rover_lib.workshop.recordings.episodes import load_recordings
+from tests.helpers.command import rover
+from tests.helpers.needs import until
+from tests.helpers.recorded import content_of, names_in
 
 PICTURE = np.full((36, 64, 3), (30, 90, 200), np.uint8)
 

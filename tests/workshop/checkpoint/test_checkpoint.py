@@ -12,19 +12,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from archives import rewritten
-from policies import TINY, check_is, lerobot_policy, memory_samples, saved_normalised, trainer_content
-from recorded import edit_json as edit
 from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError, RoverError
 from rover_lib.workshop.act import ACT, Affine, example_inputs, inputs_of, predictions
-from rover_lib.workshop.checkpoint import files
+from rover_lib.workshop.checkpoint import trainer
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint, write_both
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.lerobot import lerobot_folder, write_lerobot
 from rover_lib.workshop.judge.compare import LerobotEager
 from rover_lib.workshop.recordings.samples import Layout
+from tests.helpers.archives import rewritten
+from tests.helpers.policies import TINY, check_is, lerobot_policy, memory_samples, saved_normalised, trainer_content
+from tests.helpers.recorded import edit_json as edit
 
 RAW = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 RENAMES = {"registry_name": "rename_observations_processor", "config": {"rename_map": {"a": "b"}}}
@@ -400,8 +400,8 @@ def test_the_size_of_what_was_trained_here_is_not_guessed(tiny, tmp_path):
     for ours in (False, True):
         read = replace(tiny, report=tiny.report | {"written_here": ours})
         assert bool(read.recorded_as(Layout(), [wide]).report["guesses"]) != ours
-    known = files.trainer_config(tiny.config, learning_rate=1e-3)
-    assert files.OURS.items() <= known.items() and not tiny.report["written_here"]
+    known = trainer.trainer_config(tiny.config, learning_rate=1e-3)
+    assert trainer.OURS.items() <= known.items() and not tiny.report["written_here"]
 
 
 def test_a_rate_between_whole_ones_is_read_as_it_was_written(tiny, tmp_path):

@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from policies import TINY, lerobot_policy, saved_normalised, trainer_content
-from recorded import edit_json as edit
-from recorded import record_drives
 from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.recordings.samples import Layout, Source
+from rover_lib.workshop.recordings.samples import Layout
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import load
+from tests.helpers.policies import TINY, lerobot_policy, saved_normalised, trainer_content
+from tests.helpers.recorded import edit_json as edit
+from tests.helpers.recorded import record_drives
 
 TURNED = {"mean": torch.tensor([0.25, 0.3]), "std": torch.tensor([0.05, 0.4])}
 
@@ -50,7 +51,7 @@ def says_more(policy, path, config=(), **more):
         ({"config": {"throttle_scale": 0.5}}, "units"),
         ({"config": {"frame_skip": 2}}, "its rate"),
         ({"config": {"input_size": 224}}, "its pictures are 128x72"),
-        ({"config": {"rate_hz": 20, "fps": 30}}, "deny each other on its rate, found '20.0' and '30.0'"),
+        ({"config": {"rate_hz": 20, "fps": 30}}, "contradict each other on its rate, found '20.0' and '30.0'"),
         ({"config": {"label_names": ["gas", "steer"]}}, "are they steering and throttle?"),
         ({"mean": [0.0, 0.4]}, "units"),
         ({"config": {"invert_steering": True}}, "nobody here knows what that does to its numbers"),
@@ -112,7 +113,7 @@ def test_order_and_rate_are_asked_and_never_assumed(lerobots, tmp_path):
     # of a dataset whose actions vary as the policy's in the other order
     rng, straight = np.random.default_rng(0), Layout(("cam_front",), rate_hz=20.0)
     samples = [replace(s, chunk=rng.normal(size=(1, 2)) * (0.4, 0.05)) for s in loaded.recordings.samples]
-    with pytest.raises(CheckpointError, match=r"deny the order .* --facts actions=throttle,steering"):
+    with pytest.raises(CheckpointError, match=r"contradict the order .* --facts actions=throttle,steering"):
         load_checkpoint(lerobots).recorded_as(straight, samples)
     right = load_checkpoint(lerobots).recorded_as(replace(straight, action_order=(1, 0)), samples)
     assert right.config.action_unnorm == found.config.action_unnorm
@@ -150,7 +151,7 @@ def test_a_forks_keys_are_asked_about(lerobots):
     say = remedied(lerobots, act=lambda path, said: load_checkpoint(path, said=said).recorded_as(Layout(rate_hz=20.0)))
     assert "nobody here knows" in say
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=[48, 64]))
-    assert "its pictures are 128x72: say --facts size=WxH" in remedied(lerobots)
+    assert "its pictures are 128x72: pass --facts size=WxH" in remedied(lerobots)
     assert load_checkpoint(lerobots, said="size=64x48").config.image_sizes == ((48, 64),)
     edit(lerobots / "config.json", lambda c: c.update(resize_imgs=None))
     weights, key = load_file(lerobots / "model.safetensors"), "model.backbone.conv1.weight"
@@ -173,7 +174,7 @@ def test_processors_and_adapters_that_change_actions_are_refused(lerobots):
     edit(lerobots / "policy_preprocessor.json", lambda c: c["steps"].append(unused))
     file, adapter = next(lerobots.glob("policy_post*.safetensors")), lerobots / "adapter_config.json"
     save_file(load_file(file) | {"action.std": torch.tensor([9.0, 9.0])}, file)
-    assert "deny each other on its normalisation of actions" in remedied(lerobots)
+    assert "contradict each other on its normalisation of actions" in remedied(lerobots)
     with pytest.raises(CheckpointError, match="of other units than a rover's"):
         load_checkpoint(lerobots, said="ignore=policy_preprocessor.json").recorded_as(Layout(("it",), rate_hz=20.0))
     adapter.touch()

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from policies import MemorySample, memory_samples
 
 from rover_lib.onboard.artifact import manifest as artifact
 from rover_lib.onboard.artifact.manifest import Artifact
@@ -18,6 +17,7 @@ from rover_lib.workshop.int8.export import Exporter, TorchScript
 from rover_lib.workshop.int8.familiar import MARGIN, Drives, fit
 from rover_lib.workshop.int8.quantize import quantize, with_embedding
 from rover_lib.workshop.int8.scheme import Scheme
+from tests.helpers.policies import MemorySample, memory_samples
 
 NOISE = np.random.default_rng(5).integers(0, 256, (72, 128, 3), np.uint8)
 MADE = ("policy_fp32.pt", "policy_static.pt", "policy_fp32.onnx.zip", "policy_static.onnx.zip")

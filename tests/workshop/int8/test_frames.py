@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from policies import dazzled_by_white, memory_samples
 
 from rover_lib.workshop.act import inputs_of
 from rover_lib.workshop.int8 import frames
@@ -18,6 +17,7 @@ from rover_lib.workshop.int8.quantize import quantize
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import worst
 from rover_lib.workshop.progress import silent
+from tests.helpers.policies import dazzled_by_white, memory_samples
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
 EXTREMES = {

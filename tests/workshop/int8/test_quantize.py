@@ -8,8 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from policies import TINY, lerobot_policy, memory_samples, saved
-from recorded import record_drives
 
 from rover_lib.onboard.artifact.manifest import LARGEST_TOLERANCE, read_manifest
 from rover_lib.onboard.car.car import Car
@@ -32,6 +30,8 @@ from rover_lib.workshop.int8.scales import (
 )
 from rover_lib.workshop.int8.scheme import ENGINE, OBSERVERS, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.recordings.episodes import load_recordings
+from tests.helpers.policies import TINY, lerobot_policy, memory_samples, saved
+from tests.helpers.recorded import record_drives
 
 RANGE = {"steering": (-0.5, 0.5), "throttle": (0.0, 0.5)}
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from policies import MemorySample, memory_samples
 
 from rover_lib.workshop.act import ACT, Affine, inputs_of, predictions
 from rover_lib.workshop.judge.plausible import fits
+from tests.helpers.policies import MemorySample, memory_samples
 
 NAMES = ("steering", "throttle")
 

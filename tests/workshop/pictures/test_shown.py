@@ -7,12 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded import real_recordings
 
 from balloon_world.world import World
 from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.source import Source
+from tests.helpers.recorded import real_recordings
 
 FRAMES, DRIVES = 60, 6
 

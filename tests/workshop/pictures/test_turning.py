@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import pass_a_wall, real_recordings
 
 from rover_lib.workshop.pictures.turning import LEAST_SPREAD, measure_sides
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample
+from rover_lib.workshop.recordings.source import Source
+from tests.helpers.recorded import pass_a_wall, real_recordings
 
 
 @dataclass(frozen=True, eq=False)

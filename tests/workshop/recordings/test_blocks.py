@@ -10,7 +10,8 @@ import pytest
 from rover_lib.workshop.int8.familiar import Drives
 from rover_lib.workshop.recordings.blocks import name_blocks, name_long_drives
 from rover_lib.workshop.recordings.episodes import split
-from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, Source, block_of, round_rate_hz
+from rover_lib.workshop.recordings.samples import Episode, Recordings, Sample, block_of, round_rate_hz
+from rover_lib.workshop.recordings.source import Source
 
 RATE_HZ, CHUNK = 20, 32
 

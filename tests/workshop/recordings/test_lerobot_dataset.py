@@ -13,10 +13,7 @@ import pyarrow
 import pytest
 import torch
 from click.testing import CliRunner
-from policies import TINY, lerobot_policy, memory_samples, saved_normalised
 from pyarrow import parquet
-from recorded import edit_json as edit
-from recorded import lerobot_dataset as make_dataset
 
 from rover_lib.cli import main
 from rover_lib.onboard.errors import CheckpointError, EpisodeError
@@ -24,8 +21,12 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.recordings.episodes import load_recordings
-from rover_lib.workshop.recordings.samples import Layout, Source
+from rover_lib.workshop.recordings.samples import Layout
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import load
+from tests.helpers.policies import TINY, lerobot_policy, memory_samples, saved_normalised
+from tests.helpers.recorded import edit_json as edit
+from tests.helpers.recorded import lerobot_dataset as make_dataset
 
 CHUNK, FPS, SIZE = 8, 20, (72, 128)
 CAR, SWAPPED = ("steering", "throttle"), ("throttle", "steering")

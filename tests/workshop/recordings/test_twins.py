@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from policies import smooth_frame
 
-from rover_lib.workshop.recordings.controls import Faults
+from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import Episode, Sample
 from rover_lib.workshop.recordings.twins import leave_out_copies
+from tests.helpers.policies import smooth_frame
 
 FRAMES = 30
 

@@ -4,13 +4,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from recorded import record_drives
 
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.errors import RoverError
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run import run_report as report
 from rover_lib.workshop.run.describe import describe, runs
+from tests.helpers.recorded import record_drives
 
 DEMO = Path(__file__).parents[3] / "results" / "demo"
 

@@ -4,7 +4,6 @@ from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
-from policies import memory_samples
 
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.errors import RoverError
@@ -14,6 +13,7 @@ from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run import pipeline
 from rover_lib.workshop.run.pipeline import export_onnx
 from rover_lib.workshop.run.session import Opened
+from tests.helpers.policies import memory_samples
 
 
 def test_ranges_are_chosen_on_frames_that_calibration_has_not_seen(tiny, calibration):

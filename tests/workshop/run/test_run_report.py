@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from recorded import edit_json
 
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.stage import read_stage, sha256_of
 from rover_lib.workshop.run import run_report as report
 from rover_lib.workshop.run.describe import runs
+from tests.helpers.recorded import edit_json
 
 DEMO = Path(__file__).parents[3] / "results" / "demo"
 

@@ -4,16 +4,16 @@ import json
 from dataclasses import replace
 
 import pytest
-from executed import run_cells
-from recorded import record_drives
 
 from rover_lib.onboard.errors import CheckpointError, EpisodeError, RoverError
 from rover_lib.workshop.act import Affine
 from rover_lib.workshop.checkpoint.checkpoint import check_limits
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
-from rover_lib.workshop.recordings.samples import Source
+from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run import session
 from rover_lib.workshop.run.session import load, open_run
+from tests.helpers.executed import run_cells
+from tests.helpers.recorded import record_drives
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_what_no_artifact_may_hold_is_refused(tiny):
 def test_a_rate_of_the_recordings_is_refused_before_anything_is_calibrated(tiny, tmp_path, monkeypatch):
     slow = replace(tiny, config=replace(tiny.config, rate_hz=0.5))
     monkeypatch.setattr(session, "load_checkpoint", lambda *_: slow)
-    with pytest.raises(CheckpointError, match="from 1 to 120, found 0.5"):
+    with pytest.raises(CheckpointError, match=r"from 1 to 120, found 0\.5"):
         load(slow.path, record_drives(tmp_path / "episodes", frames=300))
 
 

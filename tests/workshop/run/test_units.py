@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from recorded import record_drives
-from test_episodes import OLD as WAS
-from test_episodes import edit, rewritten
 
 from rover_lib.onboard.car.car import read_car
 from rover_lib.onboard.car.pwm import PwmCalibration
@@ -15,6 +12,9 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.episodes import load_recordings
 from rover_lib.workshop.run.units import in_todays_units
+from tests.helpers.episodes import OLD as WAS
+from tests.helpers.episodes import edit, rewritten
+from tests.helpers.recorded import record_drives
 
 PWM = PwmCalibration()
 

@@ -1,4 +1,4 @@
-"""Is a stuck car stopped, and no other? `python -m lab.driving.stuck OUTPUT RUN_OR_ARTIFACT [RECORDINGS]`.
+"""Is a stuck car stopped, and no other? `python -m research.stuck OUTPUT RUN_OR_ARTIFACT [RECORDINGS]`.
 
 The loop of `rover drive`, in virtual time, drives a policy through unseen balloon worlds: freely, and against a wall.
 Recordings are watched as they were driven, and in kinds of light: driving, and standing at one of their pictures.

@@ -1,6 +1,6 @@
 """Which error tells the policies that drive worse? Drive degraded versions through the same worlds as FP32.
 
-    python -m lab.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim
+    python -m research.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim
 
 Each policy drives in FP32 and in every version of VERSIONS, pushed and with late plans. A version that hits fewer
 worlds than FP32 by more than chance loses; each measure is held against that. Drives are kept in the cache, so that the

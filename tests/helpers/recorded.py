@@ -9,13 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from policies import smooth_frame
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import PwmCalibration
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from tests.helpers.policies import smooth_frame
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[2]
 BESIDE = (REPO, *REPO.parents[:2])  # where shared/ may be
 
 

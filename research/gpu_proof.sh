@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # What a GPU's trainings are good for, as JSON in the folder OUT:
 #
-#     lab/gpu_proof.sh OUT [policy] [student] [drives]      # all three if none is named
+#     research/gpu_proof.sh OUT [policy] [student] [drives]      # all three if none is named
 #
 # policy: one of the real car's size, and its INT8 (OUT/policy/run.json). student: distilled from it. drives: how well
 # policies of 5 to 320 drives plan in 40 others, and drive (OUT/drives.json); an hour without a GPU. STEPS of the

@@ -1,4 +1,4 @@
-"""Does a policy stop where it has seen nothing like it, and only there? `python -m lab strange OUTPUT`.
+"""Does a policy stop where it has seen nothing like it, and only there? `python -m research.strange OUTPUT`.
 
 Drives through unseen balloon worlds in closed loop and virtual time. From CHANGE_S on something may be strange; the
 drive goes on to its end, so that its outcome is known, and whether the car would have been stopped before.
@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import cv2
 import numpy as np
 
@@ -17,11 +18,13 @@ from balloon_world.drives import NoLog, TimedCar, drive_missing, wilson_interval
 from balloon_world.record import SHOVES
 from balloon_world.world import HORIZON_ROW as WALL
 from balloon_world.world import RATE_HZ, World, expert
+from rover_lib.onboard.cli import FILE, show
 from rover_lib.onboard.drive.plan import OFF, Settings, Smoother
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
-from rover_lib.workshop.progress import Progress, silent
+from rover_lib.onboard.stage import write_stage
+from rover_lib.workshop.progress import Progress, silent, terminal_bar
 from rover_lib.workshop.recordings.episodes import Episode, load_recordings
 
 SEED = 30_000  # of the first world: not of those on which the scores were chosen
@@ -206,3 +209,23 @@ def _compare(policy: Policy, other: Policy, make: Callable[[str, int], World], h
             same[how] += alike
             same["good" if how in GOOD else "strange"] += alike
     return {how: _share(alike) for how, alike in same.items()}
+
+
+@click.command()
+@click.argument("output", type=FILE)
+@click.option("--demo", type=FILE, default="runs/demo", show_default=True, help="A run, whose static artifact drives.")
+@click.option("--worlds", type=click.IntRange(min=1), default=200, show_default=True, help="Good drives of each kind.")
+@click.option("--each", type=click.IntRange(min=1), default=60, show_default=True, help="Drives of each strangeness.")
+@click.option("--real", type=FILE, help="Recordings of another room, to be unfamiliar.")
+def main(output: Path, demo: Path, worlds: int, each: int, real: Path | None) -> None:
+    """Make the balloon world strange, and see whether the policy stops in time, and only then. Writes OUTPUT as JSON.
+
+    Drives that were made are kept beside OUTPUT, and not made again.
+    """
+    metrics = judge_strangeness(demo, worlds, each, real, output.with_suffix(".jsonl"), terminal_bar())
+    write_stage(output, "strange", params={"worlds": worlds, "each": each}, metrics=metrics)
+    show(metrics, False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,8 @@
-"""Measure trainings on a GPU, a row at a time, which is in the JSON as soon as it ends."""
+"""Measure trainings on a GPU by rows, each in the JSON as it ends: `python -m research.gpu OUTPUT [EPISODES]`."""
 
 import json
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -11,14 +12,17 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import click
 import torch
 
 from balloon_world.record import record_episodes
 from rover_learn import train as training
 from rover_learn.train import SIZES, train
 from rover_learn.training import Machine, Resumable
+from rover_lib.onboard.cli import FILE
 from rover_lib.onboard.stage import atomic_path
 from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.cache import cache_root
 
 MOST = {"all_s": 130.0, "before_s": 6.0, "data_share": 0.25}  # in all, before the first step, of it waiting for data
 DRIVES = 128  # 16,500 frames
@@ -112,3 +116,24 @@ def _train(episodes: Path, folder: Path, name: str, **options: Any) -> dict[str,
     with patch.dict(os.environ, ROVER_CACHE=str(folder / name)):
         made = train(episodes, folder / f"{name}.pth", **options)
     return torch.load(made, weights_only=False)["model_state_dict"]
+
+
+@click.command()
+@click.argument("output", type=FILE)
+@click.argument("episodes", type=FILE, required=False)
+@click.option("--device", default="cuda", show_default=True)
+@click.option("--size", type=click.Choice(["small", "full"]), default="full", show_default=True)
+def main(output: Path, episodes: Path | None, device: str, size: str) -> None:
+    """Train on a GPU, on EPISODES or on 128 drives recorded for it, and write what it takes to OUTPUT, as JSON.
+
+    It takes some ten minutes. The exit code is 1 if it takes too long, or an interruption changes the weights.
+    research/gpu_proof.sh trains for longer, and judges what comes of that.
+    """
+    problems = measure(output, device, size, episodes or cache_root() / "gpu-episodes")
+    for problem in problems:
+        click.echo(problem, err=True)
+    sys.exit(1 if problems else 0)
+
+
+if __name__ == "__main__":
+    main()

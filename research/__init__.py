@@ -1,0 +1,1 @@
+"""Programs that make published figures again; see README.md here."""
