@@ -22,7 +22,8 @@ from torch import Tensor, nn
 from rover_lib.onboard.params import params
 from rover_lib.workshop.recordings.blocks import usual_rate_hz
 from rover_lib.workshop.recordings.episodes import load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, Source, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
+from rover_lib.workshop.recordings.source import Source
 
 WIDTH, HEIGHT = 80, 60
 AHEAD_S = (0.0, 0.25, 0.5, 1.0)

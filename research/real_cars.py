@@ -25,7 +25,8 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.judge.guesses import frame_errors, least_blind_errors
 from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, Source, block_of, frame_rate_hz
+from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz
+from rover_lib.workshop.recordings.source import Source
 
 AHEAD_S = donkey_cnn.AHEAD_S
 EVERY_S, WINDOW = 0.1, 15  # between a Pi's plans; pictures that follow one another
