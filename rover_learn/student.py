@@ -94,11 +94,9 @@ def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tup
 
     inputs: calibration frames as the student sees them (`act.inputs_of`); they are only run if units are left out.
     """
-    weights = {
-        name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)
-    }
+    init = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
     if config.feedforward == teacher.config.feedforward:
-        return weights
+        return init
     wide = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights)
     downs = {}
     for name, module in wide.named_modules():
@@ -106,8 +104,8 @@ def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tup
             part, index, _ = name.split(".")
             downs[f"{part}.layers.{index}"] = module.down
     for name, gram in grams_of(downs, lambda x: x[:1], lambda: [wide(*x)[0] for x in inputs]).items():
-        weights |= _narrow(weights, name, gram, config.feedforward)
-    return weights
+        init |= _narrow(init, name, gram, config.feedforward)
+    return init
 
 
 def _is_kept(name: str, config: ActConfig) -> bool:

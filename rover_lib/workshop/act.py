@@ -4,6 +4,26 @@ It computes the same function as `lerobot.policies.act` in eval mode. What depen
 batch norm is folded into convolutions, the latent's projection is a bias, positions are constants, as are the first
 decoder layer's self-attention and the query that follows from it.
 
+    frame (height, width, 3)      state (S,)                            name here, and in the checkpoint
+             |                         |
+      Pixels or Columns            Normalise                            image_input, state_norm
+             |                         |
+          Backbone                     |        latent of zeros         backbone.*
+             | h x w features          |               |
+         1x1 convolution             Linear          its bias           image_project: encoder_img_feat_input_proj
+             |                         |               |                state_project: encoder_robot_state_input_proj
+             +------- T tokens (1, T, D) --------------+                latent: encoder_latent_input_proj
+                            |                                           pos: encoder_1d_feature_pos_embed, sinusoids
+                  EncoderLayer, N times                                 encoder: encoder.layers
+                            |
+          Memory: keys and values of all decoder layers                 memory
+                            |
+        DecoderLayer, M times <- C queries                              decoder: decoder.layers
+                            |                                           q_pos: decoder_pos_embed
+               LayerNorm, Linear, Normalise                             norm, head: decoder.norm, action_head
+                            |
+                     chunk (1, C, A)
+
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
 

@@ -218,9 +218,7 @@ class Checkpoint:
         if sizes == c.image_sizes:
             return self
         config = replace(c, image_sizes=sizes)
-        own, other = (
-            planned_error(replace(self, config=candidate), tried) if tried else 1.0 for candidate in (c, config)
-        )
+        own, other = (planned_error(replace(self, config=option), tried) if tried else 1.0 for option in (c, config))
         # Nobody squeezes a copy, so then the recordings' size is likelier.
         best = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
         errors = f"they are {own:.3g} and {other:.3g} off"

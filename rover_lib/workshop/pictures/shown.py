@@ -127,7 +127,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
     flat = np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
     if flat.mean() >= BLANK:
         mean = float(means[flat].mean())
-        word = "black" if mean < DARK else "white" if mean > BRIGHT else "of one colour"
+        word = "of one colour"
+        if mean < DARK:
+            word = "black"
+        elif mean > BRIGHT:
+            word = "white"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
         faults.add(place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
     elif drive.frozen:
