@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act import ACT, FeedForward, multiply_accumulates
+from rover_lib.workshop.act_config import BACKBONES, ActConfig, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote_all

@@ -34,7 +34,7 @@ def number(value: float | None, form: str = ".1f") -> str:
 
 
 def ratio(over: float | None, under: float | None) -> float | None:
-    """over / under; None where one of them was not measured, or is 0."""
+    """Return over / under, None where one of them was not measured, or is 0."""
     return over / under if over and under else None
 
 

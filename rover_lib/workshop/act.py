@@ -40,7 +40,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import Sample
 
 Projection = nn.Linear | nn.Conv2d
 Pair = tuple[Tensor, Tensor]  # weight and bias
@@ -85,14 +85,17 @@ def _load(module: Layer, weight: Tensor, bias: Tensor) -> Layer:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    """Return a linear layer with this weight, (outputs, inputs), and bias."""
     return _load(nn.Linear(weight.shape[1], weight.shape[0], device="meta"), weight, bias)
 
 
 def layer_norm(w: Weights) -> nn.LayerNorm:
+    """Return the layer norm of a checkpoint."""
     return _load(nn.LayerNorm(w["weight"].shape[0], device="meta"), w["weight"], w["bias"])
 
 
 def conv(weight: Tensor, bias: Tensor, stride: Any, padding: int, dilation: int = 1) -> nn.Conv2d:
+    """Return a convolution with this weight, (outputs, inputs, height, width), and bias."""
     outputs, inputs, height, width = weight.shape
     size = height, width
     return _load(nn.Conv2d(inputs, outputs, size, stride, padding, dilation, device="meta"), weight, bias)
@@ -341,6 +344,8 @@ def _plus_scaled(x: Tensor, y: Tensor, scale: Any) -> Tensor:
 
 
 class EncoderLayer(nn.Module):
+    """LeRobot's ACTEncoderLayer."""
+
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool):
         super().__init__()
         self.pre_norm = config.pre_norm

@@ -59,7 +59,7 @@ class Car:
     positive: str = "right"  # as the pictures of the recordings show
     human: str = "receiver"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         steering, throttle = self.pwm.steering, self.pwm.throttle
         neutral_us, forward_us = throttle.neutral_us, throttle.pulse_us(throttle.high)
         periods, pulses = (PERIOD_MIN_US, PERIOD_MAX_US), (PULSE_MIN_US, PULSE_MAX_US)

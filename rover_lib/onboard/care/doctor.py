@@ -25,7 +25,8 @@ from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.ports import DEV, find_port, list_ports
-from rover_lib.onboard.car.servo_link import PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import PROTOCOL_VERSION, Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import blank, frozen

@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
-from rover_lib.onboard.car.servo_link import REASONS, ServoLink
+from rover_lib.onboard.car.protocol import REASONS
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.pilot import PolicyPilot

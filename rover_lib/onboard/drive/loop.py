@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
+from rover_lib.onboard.car.protocol import SEQUENCES, State, Telemetry
+from rover_lib.onboard.car.servo_link import LATE_S, LinkError, ServoLink
 from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick, figures
 from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of

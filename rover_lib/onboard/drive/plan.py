@@ -58,7 +58,7 @@ class Settings:
     stuck_s: float = 1.5
     undervoltage_s: float = 3.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         remedy = "look at the section 'drive' of params.yml"
         if broken := broken_rule(vars(self), RULES):
             name, wanted, found = broken
@@ -104,7 +104,7 @@ class Plan:
     limits: np.ndarray = field(default_factory=lambda: LIMITS)
     strange: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         actions = np.asarray(self.actions, float)
         if actions.ndim != 2 or actions.shape[1] != 2 or len(actions) == 0:
             raise PolicyError("a plan must be (chunk, 2) actions", found=actions.shape)

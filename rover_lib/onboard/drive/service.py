@@ -35,7 +35,7 @@ from rover_lib.onboard.car.host import boottime, is_listened_at
 from rover_lib.onboard.errors import RoverError
 
 if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
-    from rover_lib.onboard.car.servo_link import Telemetry
+    from rover_lib.onboard.car.protocol import Telemetry
     from rover_lib.onboard.drive.loop import Arm, Report
 
 UNIT = "rover-drive.service"

@@ -16,7 +16,8 @@ from typing import Any
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime
-from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner

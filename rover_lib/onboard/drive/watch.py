@@ -16,7 +16,8 @@ from pathlib import Path
 from types import FrameType
 
 from rover_lib.onboard.car.host import UNDER_VOLTAGE, throttled_means
-from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.errors import DriveFault

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.act_config import LEROBOTS, lerobot_act
+from rover_lib.workshop.act_config import LEROBOTS, ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
 from rover_lib.workshop.checkpoint.weights import Weights, check_weights_are_whole, name_weights

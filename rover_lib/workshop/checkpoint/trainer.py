@@ -16,8 +16,7 @@ from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import plain, read_plain
-from rover_lib.workshop.act import ActConfig
-from rover_lib.workshop.act_config import imagenet
+from rover_lib.workshop.act_config import ActConfig, imagenet
 from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import Facts
 from rover_lib.workshop.checkpoint.weights import (

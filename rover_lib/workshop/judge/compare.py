@@ -23,8 +23,7 @@ from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act import Affine
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act_config import Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
@@ -147,7 +146,7 @@ class LerobotEager:
 
 
 def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
-    """x * scale + shift over the last axis."""
+    """Return x * scale + shift over the last axis."""
     if affine is None:
         return torch.from_numpy(x)
     return torch.from_numpy(x * np.asarray(affine.scale, np.float32) + np.asarray(affine.shift, np.float32))

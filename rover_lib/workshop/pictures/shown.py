@@ -1,5 +1,6 @@
-"""Find pictures that show nothing, or not what the car saw: a camera that stood still, black or grey pictures, colours
-or sides that are not those of the other drives.
+"""Find pictures that show nothing, or not what the car saw.
+
+A camera that stood still, black or grey pictures, colours or sides that are not those of the other drives.
 
     recordings = with_faults(recordings)     # its faults name them; `rover inspect` and notebook 01 do so
 

@@ -33,8 +33,8 @@ from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, qua
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.episodes import choose_calibration
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
 from rover_lib.workshop.run.session import Opened, open_run
 
 DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared

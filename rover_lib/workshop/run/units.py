@@ -11,7 +11,7 @@ import numpy as np
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import Channel
-from rover_lib.workshop.act import Affine
+from rover_lib.workshop.act_config import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation, planned_error
 from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
