@@ -22,8 +22,8 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
     """A line for each row, a header among them. Rows are of one length."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
-    for first, *others in rows:
-        cells = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(others, widths[1:], strict=True))]
+    for first, *rest in rows:
+        cells = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(rest, widths[1:], strict=True))]
         lines.append("  ".join(cells).rstrip())
     return lines
 
