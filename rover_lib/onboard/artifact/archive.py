@@ -18,10 +18,7 @@ ARCHIVE_BYTES, DIRECTORY_BYTES, RECORDS = 1_000_000_000, 1_000_000, 5000
 CODE_BYTES, DEBUG_BYTES, PICKLE_BYTES = 250_000, 2_000_000, 1_000_000
 MANIFEST_BYTES, PARITY_BYTES = 100_000, 50_000_000
 ABOUT = frozenset({"extra/manifest.json", "extra/parity.npz"})
-REQUIRED = {
-    "torch": ABOUT | {"data.pkl", "constants.pkl", "version"},
-    "onnxruntime": ABOUT | {"model.onnx"},
-}
+REQUIRED = {"torch": ABOUT | {"data.pkl", "constants.pkl", "version"}, "onnxruntime": ABOUT | {"model.onnx"}}
 MANIFEST, PARITY, ONNX = "archive/extra/manifest.json", "archive/extra/parity.npz", "archive/model.onnx"
 RECORD_BYTES = {  # largest size by name after "archive/"
     r"version|byteorder|\.data/serialization_id": 100,

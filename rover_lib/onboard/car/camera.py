@@ -22,15 +22,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.csi import newest_jpegs, read_csi
-from rover_lib.onboard.car.picture import (
-    COLUMNS,
-    LEAST,
-    ROWS,
-    block_sums,
-    brightness,
-    decode_jpeg,
-    is_squeezed,
-)
+from rover_lib.onboard.car.picture import COLUMNS, LEAST, ROWS, block_sums, brightness, decode_jpeg, is_squeezed
 from rover_lib.onboard.errors import CameraError, sentence_of
 
 FIRST_FRAME_S = 5.0

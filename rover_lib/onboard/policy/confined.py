@@ -43,10 +43,7 @@ def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None
 
 
 def load_confined(
-    paths: Mapping[str, Path | str],
-    *,
-    threads: int,
-    notify: Callable[[str], object] | None = None,
+    paths: Mapping[str, Path | str], *, threads: int, notify: Callable[[str], object] | None = None
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 

@@ -18,10 +18,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 
 # Each module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact here.
 # threads: None lets the engine choose.
-MODULES = {
-    TORCH: "rover_lib.onboard.policy.torch_engine",
-    ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
-}
+MODULES = {TORCH: "rover_lib.onboard.policy.torch_engine", ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine"}
 
 
 class Engine(Protocol):

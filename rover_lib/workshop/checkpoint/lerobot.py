@@ -70,10 +70,7 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         raise CheckpointError(problem, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     settings = _act_config(folder, raw, facts)
-    tensors, inside = (
-        name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored),
-        dict[str, Tensor](),
-    )
+    tensors, inside = (name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored), dict[str, Tensor]())
     # Statistics of before LeRobot had processors.
     for key in () if (folder / OUTER[0]).exists() else (*settings.input_features, *settings.output_features):
         for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:

@@ -209,11 +209,7 @@ def fidelity(
     )
 
 
-def metrics(
-    report: Fidelity,
-    policies: Mapping[str, Any],
-    trials: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
+def metrics(report: Fidelity, policies: Mapping[str, Any], trials: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The metrics of compare.json: fp32, modes and what they were measured on.
 
     policies: "fp32" and the modes. trials: reports by mode; modes that were not driven have None, not 0.

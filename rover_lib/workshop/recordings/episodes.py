@@ -58,10 +58,7 @@ from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
-TABLES = {
-    "control_samples": ("control_data.csv", CONTROL_FIELDS),
-    "frame_samples": ("frame_data.csv", FRAME_FIELDS),
-}
+TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 Samples = tuple[Sample, ...]
 
