@@ -99,9 +99,7 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     """
     import yaml
 
-    from rover_lib.workshop.run import run_folder
-    from rover_lib.workshop.run.run import execute
-    from rover_lib.workshop.run.run import run as run_notebooks
+    from rover_lib.workshop.run import run, run_folder
 
     name, runs_dir = options.pop("name"), options.pop("runs_dir")
     parameters = {key: value for key, value in options.items() if value not in (None, "")}
@@ -111,11 +109,11 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
         raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
     if only and not (checkpoint or episodes):
         folder = run_folder(runs_dir, name, RoverError)
-        return click.echo(f"executed: {execute(only, folder, **parameters)}")
+        return click.echo(f"executed: {run.execute(only, folder, **parameters)}")
     if only or not (checkpoint and episodes):
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
     parameters = {"worlds": 0} | parameters
-    _judge(run_notebooks(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **parameters))
+    _judge(run.run(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **parameters))
 
 
 @click.command(short_help="Judge an existing run again.")
