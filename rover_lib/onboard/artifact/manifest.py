@@ -290,7 +290,9 @@ def shapes_of_familiar(manifest: Mapping[str, Any]) -> dict[str, tuple[int, ...]
 
 def largest_tolerance(mode: str, action: str) -> float:
     """Return the largest parity tolerance that a manifest may have for an action; infinity if it moves no servo."""
-    return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"] if action in CAR_ACTIONS else math.inf
+    if action not in CAR_ACTIONS:
+        return math.inf
+    return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"]
 
 
 def _texts(value: Any) -> Iterator[str]:

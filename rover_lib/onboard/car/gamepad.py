@@ -9,6 +9,7 @@ has told where both sticks are. PyPI's evdev is compiled where it is installed, 
 import contextlib
 import fcntl
 import logging
+import math
 import os
 import struct
 import time
@@ -43,7 +44,9 @@ def read_stick(fd: int, axis: int) -> tuple[int, int, int]:
 def deflection(value: int, low: int, high: int) -> float:
     """Return how far a stick is from its middle, in [-1, 1]; 0 near it. low, high: the ends of its range."""
     x = max(-1.0, min(1.0, (2 * value - low - high) / (high - low)))
-    return 0.0 if abs(x) < DEAD else (abs(x) - DEAD) / (1 - DEAD) * (1 if x > 0 else -1)
+    if abs(x) < DEAD:
+        return 0.0
+    return math.copysign((abs(x) - DEAD) / (1 - DEAD), x)
 
 
 class Gamepad:
