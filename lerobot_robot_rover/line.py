@@ -57,7 +57,7 @@ class CarPart:
 
     @property
     def action_features(self) -> dict[str, type]:
-        """steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
+        """Steering in [-1, 1], its side as car.yml says, and throttle in [0, 1], or from -1 on a car with reverse."""
         return dict(FEATURES)
 
     def configure(self) -> None:

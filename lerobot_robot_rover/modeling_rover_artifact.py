@@ -31,7 +31,9 @@ _log = logging.getLogger("rover")
 
 
 class RoverArtifactPolicy(PreTrainedPolicy):
-    """Runs an artifact. Raises ParamsError or PolicyError for one that is missing, damaged or made for other actions,
+    """Runs an artifact.
+
+    Raises ParamsError or PolicyError for one that is missing, damaged or made for other actions,
     and for a dataset whose rate is not the artifact's; CarError for one that would steer this car mirrored.
     """
 
@@ -107,7 +109,7 @@ class RoverArtifactPolicy(PreTrainedPolicy):
         return torch.from_numpy(np.stack(chunks).astype(np.float32))
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any):
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, *, config: Any = None, **kwargs: Any) -> Any:
         """Return the policy in a folder that pack() wrote. Raises ParamsError for anything else, such as a Hub name."""
         if config is not None and pretrained_name_or_path is None:  # lerobot-rollout with --policy.artifact
             return cls(config, **kwargs).eval()

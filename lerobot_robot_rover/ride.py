@@ -8,7 +8,8 @@ import threading
 import time
 
 from rover_lib.onboard.car.camera import Camera
-from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Hooks, Report, Until, drive
 from rover_lib.onboard.drive.pilot import Order, Sight

@@ -172,7 +172,7 @@ class Rover(CarPart, Robot):
             return
         arm_when_ready(lambda: None, self._link, threading.Event(), self._log.event, [self._camera.latest])
 
-    def _next_frame(self):
+    def _next_frame(self) -> Any:
         newest, after = self._camera.latest(), self._seen
         if newest and time.monotonic() - newest.captured_s > LATE_FRAME_S:  # nobody asked for a while
             after = max(after, newest.number)

@@ -9,8 +9,9 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_rover.line import CarPart, line_to, named
+from rover_lib.onboard.car.protocol import MISSING, Telemetry
 from rover_lib.onboard.car.pwm import Channel
-from rover_lib.onboard.car.servo_link import MISSING, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 from rover_lib.onboard.drive.service import CHECK_S
 
 WITHHELD_S = 0.5  # far longer than until a status shows a moved stick

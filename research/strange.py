@@ -25,7 +25,8 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.progress import Progress, silent, terminal_bar
-from rover_lib.workshop.recordings.episodes import Episode, load_recordings
+from rover_lib.workshop.recordings.episodes import load_recordings
+from rover_lib.workshop.recordings.samples import Episode
 
 SEED = 30_000  # of the first world: not of those on which the scores were chosen
 OTHER = 20_000  # from a world's seed to that of the world whose look or pictures it gets

@@ -44,8 +44,9 @@ def export_dataset(recordings: Path, out: Path, throttle: str | None, as_json: b
 
 
 def _print_export(report: dict[str, Any], out: Path, as_json: bool) -> None:
-    from rover_exchange.export_dataset import CAR, DRIVEN_BY, REPORT, lerobot_train, lerobot_video
+    from rover_exchange.export_dataset import lerobot_train, lerobot_video
     from rover_lib.workshop.installed import command_line
+    from rover_lib.workshop.recordings.lerobot_dataset import CAR, DRIVEN_BY, REPORT
 
     for name in ("episodes_are", "faults_while_reading", CAR, DRIVEN_BY):
         del report[name]  # too long to print; the file has them

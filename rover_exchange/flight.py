@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rover_lib.onboard.car.protocol import State
 from rover_lib.onboard.car.pwm import Channel
-from rover_lib.onboard.car.servo_link import State
 from rover_lib.onboard.drive.flight_log import Flight
 from rover_lib.workshop.plots.style import BLACK, COLOURS, GREY, MIST, RED, SLATE, new_figure
 

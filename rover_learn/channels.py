@@ -16,8 +16,8 @@ from torch import Tensor
 
 from rover_learn.lessons import BatchedPolicy
 from rover_learn.student import grams_of, refit_layer
-from rover_lib.workshop.act import ActConfig, Weights, norm_gain
-from rover_lib.workshop.act_config import backbone_blocks
+from rover_lib.workshop.act import Weights, norm_gain
+from rover_lib.workshop.act_config import ActConfig, backbone_blocks
 
 TILE = 16  # XNNPACK's INT8 kernels compute 16 channels at a time: 17 cost as much as 32
 PATCHES = 8  # taken of a picture's feature map in each block, at random

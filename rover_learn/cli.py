@@ -65,6 +65,7 @@ def of_a_recipe(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def show_stage(folder: Path, stage: str, summary: Callable[[Any], str]) -> None:
+    """Print the summary of a run's stage, and where the run is."""
     from rover_lib.onboard.stage import read_stage
 
     click.echo(f"{summary(read_stage(folder / f'{stage}.json', stage))}\ndone: {folder}")

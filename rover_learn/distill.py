@@ -27,8 +27,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.recorded_range import Range, format_pct, not_judged, pct_of_range
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
 from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import Opened, load
 
@@ -128,8 +127,10 @@ class Distillation(Work):
         return Learned(policy.weights(), losses | saved.losses, own)
 
     def _train_backbone(self, lessons: Lessons, saved: Resumable) -> dict[str, Tensor]:
-        """Phase one: the backbone, at the student's picture size, to the teacher's feature map. Then its tokens, unless
-        it is to lose channels. Returns its weights; at the teacher's own size they are the teacher's.
+        """Phase one: the backbone, at the student's picture size, to the teacher's feature map.
+
+        Then its tokens, unless it is to lose channels. Returns its weights; at the teacher's own size they are the
+        teacher's.
         """
         teacher = self.origin.at_size(*self.config.image_sizes[0])
         policy = self.machine.taking(BatchedPolicy(teacher.config, teacher.weights))

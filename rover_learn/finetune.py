@@ -19,7 +19,7 @@ Letters: n samples, B batch, C chunk, A actions.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -179,19 +179,22 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
     for recordings in read:
         own = [e for i, (r, e) in enumerate(corrected) if r is recordings and i not in judges]
         for kind, by_policy in ((ADDITIONS, False), (CORRECTIONS, True)):
-            taught.append((kind, tuple(s for e in own if e.by_policy == by_policy for s in human_samples(e))))
+            of_kind = [human_samples(e) for e in own if e.by_policy == by_policy]
+            taught.append((kind, tuple(chain.from_iterable(of_kind))))
+    watched = chain.from_iterable(e.samples for e in (*old, *(e for _, e in new)))
     return _Material(
         read,
         tuple((kind, pick_evenly(samples, recipe.samples)) for kind, samples in taught if samples),
         tuple(entry for entry in held_out if entry[2]),
-        sum(s.driver != HUMAN for e in (*old, *(e for _, e in new)) for s in e.samples),
+        sum(s.driver != HUMAN for s in watched),
     )
 
 
 def _driven_by_humans(samples: Sequence[Sample], episodes: Sequence[Episode]) -> tuple[Sample, ...]:
     """Return those of the samples that a human drove, with chunks as `human_samples` pads them."""
     keys = {(s.episode, s.row) for s in samples}
-    return tuple(s for e in episodes for s in human_samples(e) if (s.episode, s.row) in keys)
+    human = chain.from_iterable(map(human_samples, episodes))
+    return tuple(s for s in human if (s.episode, s.row) in keys)
 
 
 def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
@@ -239,13 +242,11 @@ class Finetuning(Work):
                 lessons.ask(saved, parent, self.rng(kind))
             all_lessons.append((kind, lessons))
         whole = {
-            "lessons": [[kind, lessons_of.frames.path.parent.name] for kind, lessons_of in all_lessons],
+            "lessons": [[kind, own.frames.path.parent.name] for kind, own in all_lessons],
             "recipe": asdict(recipe),
         }
-        weights = np.concatenate(
-            [_weights(recipe, kind, lessons_of, 1 / self.ranges) for kind, lessons_of in all_lessons]
-        )
-        pool = Pool([(lessons_of, kind != DEMONSTRATIONS) for kind, lessons_of in all_lessons], weights)
+        weights = np.concatenate([_weights(recipe, kind, own, 1 / self.ranges) for kind, own in all_lessons])
+        pool = Pool([(own, kind != DEMONSTRATIONS) for kind, own in all_lessons], weights)
         with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
             policy = self.machine.taking(BatchedPolicy(parent.config, parent.weights))
             policy.thaw()
@@ -285,7 +286,7 @@ class Finetuning(Work):
         """Judge the policy, and write its files and finetune.json."""
         material = self.material
         rows = self.judge(learned.weights)
-        old = [(key, row[key]) for row in rows if row["kind"] == OLD for key in row]
+        old = chain.from_iterable(row.items() for row in rows if row["kind"] == OLD)
         errors = [error for key, error in old if key.startswith("after_") and error is not None]
         loss = float(np.mean(errors)) / 100 if errors else float("nan")
         hashes = self.write_policy(new, name, learned, loss, material.recordings[-1].root.name)

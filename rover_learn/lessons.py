@@ -25,8 +25,7 @@ from rover_learn.augment import GAIN
 from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act_config import ActConfig, Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Sample, car_of

@@ -25,7 +25,7 @@ from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy import preprocess
 from rover_lib.workshop import act
-from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.cache import cache_root, key_of
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, write_both
 from rover_lib.workshop.judge.recorded_range import Range

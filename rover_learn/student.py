@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from rover_lib.onboard.errors import TrainingError
-from rover_lib.workshop.act import ACT, BACKBONES, ActConfig, FeedForward, multiply_accumulates
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act import ACT, FeedForward, multiply_accumulates
+from rover_lib.workshop.act_config import BACKBONES, ActConfig, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 from rover_lib.workshop.untrusted import quote_all
@@ -94,11 +94,9 @@ def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tup
 
     inputs: calibration frames as the student sees them (`act.inputs_of`); they are only run if units are left out.
     """
-    weights = {
-        name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)
-    }
+    init = {name: weight.detach().float().clone() for name, weight in teacher.weights.items() if _is_kept(name, config)}
     if config.feedforward == teacher.config.feedforward:
-        return weights
+        return init
     wide = ACT(replace(config, feedforward=teacher.config.feedforward), teacher.weights)
     downs = {}
     for name, module in wide.named_modules():
@@ -106,8 +104,8 @@ def initial_weights(teacher: Checkpoint, config: ActConfig, inputs: Iterable[tup
             part, index, _ = name.split(".")
             downs[f"{part}.layers.{index}"] = module.down
     for name, gram in grams_of(downs, lambda x: x[:1], lambda: [wide(*x)[0] for x in inputs]).items():
-        weights |= _narrow(weights, name, gram, config.feedforward)
-    return weights
+        init |= _narrow(init, name, gram, config.feedforward)
+    return init
 
 
 def _is_kept(name: str, config: ActConfig) -> bool:

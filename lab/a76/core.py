@@ -180,12 +180,7 @@ def emulate_artifact(core: Core, given: Sequence[object], folder: Path, packages
 
 
 def emulate(
-    core: Core,
-    command: Sequence[object],
-    folder: Path,
-    *,
-    environment: dict[str, str] | None = None,
-    watch: str = "",
+    core: Core, command: Sequence[object], folder: Path, *, environment: dict[str, str] | None = None, watch: str = ""
 ) -> Emulation:
     """Run an aarch64 program to its end on one core, and read the counts that it marked (see guest/count.c).
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from lab.driving.virtual import STEERING, THROTTLE, Board
 from rover_lib.onboard.car.car import DEFAULT_NUMBERS, Car
-from rover_lib.onboard.car.servo_link import Hello, Telemetry, frame, parse
+from rover_lib.onboard.car.protocol import Hello, Telemetry, frame, parse
 
 BOOT = 7
 WIGGLE_US = (1750, 1150)  # the stick's pulses, three periods each

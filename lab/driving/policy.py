@@ -32,11 +32,11 @@ def make_artifact(
     class Constant(torch.nn.Module):
         plan: torch.Tensor
 
-        def __init__(self):
+        def __init__(self) -> None:
             super().__init__()
             self.register_buffer("plan", torch.tensor(planned)[None])
 
-        def forward(self, state, frame):
+        def forward(self, state: torch.Tensor, frame: torch.Tensor) -> torch.Tensor:
             return self.plan + 0 * state[:, None] + follows * frame.float().mean() / 255
 
     names, frame = ["steering", "throttle"], f"frame_{camera}"

@@ -18,7 +18,7 @@ import yaml
 from lab.driving.virtual import DROPPING, GONE, HELD, LIVE, LOST, PRESET, SILENT, STUCK, Killed, Seen, World
 from lab.driving.virtual_host import PLAN, Process
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.servo_link import frame
+from rover_lib.onboard.car.protocol import frame
 
 WIGGLE_MS, START_MS, ASK_MS, STOP_MS, END_MS = 100, 1500, 2100, 4800, 5400
 GAMEPAD_MS = 2000  # how much later with a gamepad the gesture is, the request and the stop

@@ -18,7 +18,7 @@ import numpy as np
 
 from lab.arduino.emulator import CC, FIRMWARE, compile_c
 from rover_lib.onboard.car.car import Car
-from rover_lib.onboard.car.servo_link import Telemetry, parse
+from rover_lib.onboard.car.protocol import Telemetry, parse
 from rover_lib.workshop.cache import cache_folder, key_of
 
 BOARD = Path(__file__).with_name("board.c")

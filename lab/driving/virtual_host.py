@@ -21,7 +21,8 @@ import numpy as np
 from lab.driving.virtual import DROPPING, FRAME_MS, GONE, LOST, SILENT, STUCK, Killed, Planned, World
 from rover_lib.onboard.car import gamepad
 from rover_lib.onboard.car.camera import Camera, check_shape
-from rover_lib.onboard.car.servo_link import Hello, LinkError, ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Hello, Telemetry
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 from rover_lib.onboard.drive.feed import Feed
 from rover_lib.onboard.drive.inference import Planner
 from rover_lib.onboard.drive.loop import Report
@@ -395,7 +396,9 @@ class Process:
     service, terminal, limited, heartbeat: see Story; ask() is an operator's request. session: what it drives by.
     """
 
-    def __init__(self, world: World, service: bool, terminal: bool = False, limited=False, heartbeat=False):
+    def __init__(
+        self, world: World, service: bool, terminal: bool = False, limited: bool = False, heartbeat: bool = False
+    ):
         self.world, self.stopped, self._terminal = world, _Stop(world), terminal
         self.report, self.log = Report(), cast(Any, _Log(world))
         self._operators = Service(self.report, self.stopped, clock=world.boottime)

@@ -1,3 +1,5 @@
+"""Run the command line by `python -m rover_lib.cli`."""
+
 from rover_lib.cli import main
 
 main()

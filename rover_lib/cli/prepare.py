@@ -63,8 +63,8 @@ def with_source(command: Callable[..., None]) -> Callable[..., None]:
     def called(*args: Any, episodes: Path, **options: Any) -> None:
         from rover_lib.workshop.recordings.source import Source
 
-        said = {name: options.pop(name) or "" for name in ("action_names", "camera", "facts", "throttle")}
-        return command(*args, episodes=Source.of(episodes, **said), **options)
+        texts = {name: options.pop(name) or "" for name in ("action_names", "camera", "facts", "throttle")}
+        return command(*args, episodes=Source.of(episodes, **texts), **options)
 
     return called
 
@@ -99,23 +99,21 @@ def run(checkpoint: Path | None, episodes: Path | None, turned: Turned, only: st
     """
     import yaml
 
-    from rover_lib.workshop.run import run_folder
-    from rover_lib.workshop.run.run import execute
-    from rover_lib.workshop.run.run import run as run_notebooks
+    from rover_lib.workshop.run import run, run_folder
 
     name, runs_dir = options.pop("name"), options.pop("runs_dir")
-    given = {key: value for key, value in options.items() if value not in (None, "")}
+    parameters = {key: value for key, value in options.items() if value not in (None, "")}
     try:
-        given |= {key: yaml.safe_load(value) for key, value in turned}
+        parameters |= {key: yaml.safe_load(value) for key, value in turned}
     except yaml.YAMLError as error:
         raise click.BadParameter(f"a value is not YAML: {' '.join(str(error).split())}") from None
     if only and not (checkpoint or episodes):
         folder = run_folder(runs_dir, name, RoverError)
-        return click.echo(f"executed: {execute(only, folder, **given)}")
+        return click.echo(f"executed: {run.execute(only, folder, **parameters)}")
     if only or not (checkpoint and episodes):
         raise click.UsageError("give a CHECKPOINT and EPISODES, or --only NOTEBOOK --name RUN")
-    given = {"worlds": 0} | given
-    _judge(run_notebooks(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **given))
+    parameters = {"worlds": 0} | parameters
+    _judge(run.run(checkpoint, episodes, name, runs_dir=runs_dir, progress=terminal_bar(), **parameters))
 
 
 @click.command(short_help="Judge an existing run again.")
@@ -165,8 +163,8 @@ def export(source: Path, onnx: bool, output: Path | None, facts: str, card: bool
         from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
         from rover_lib.workshop.run.pipeline import export_graph
 
-        written = export_graph(load_checkpoint(source, said=facts), output or Path(f"{source.resolve().stem}.onnx"))
-        return click.echo(f"{written}: {written.stat().st_size / 1e6:.1f} MB, FP32")
+        graph = export_graph(load_checkpoint(source, said=facts), output or Path(f"{source.resolve().stem}.onnx"))
+        return click.echo(f"{graph}: {graph.stat().st_size / 1e6:.1f} MB, FP32")
     check_kind(source, "run")
     if output or facts:
         raise click.UsageError("--output and --facts belong to a checkpoint, not to a run")

@@ -37,13 +37,13 @@ def playbook(name: str | None, options: tuple[str, ...]) -> None:
         return click.echo(f"folder     {folder}\ninventory  {inventory}")
     if name not in books:
         raise RoverError(f"no playbook {name}", remedy=f"known are {', '.join(books)}")
-    beside = Path(sys.executable).with_name("ansible-playbook")
-    if not (program := str(beside) if beside.is_file() else shutil.which(beside.name)):
+    playbook_path = Path(sys.executable).with_name("ansible-playbook")
+    if not (program := str(playbook_path) if playbook_path.is_file() else shutil.which(playbook_path.name)):
         raise RoverError("this command needs ansible-playbook", remedy=NO_ANSIBLE)
-    chosen = any(word.startswith(("-i", "--inv")) for word in options)
-    words = [program, *([] if chosen else ["-i", str(inventory)]), str(books[name]), *options]
+    has_inventory = any(word.startswith(("-i", "--inv")) for word in options)
+    words = [program, *([] if has_inventory else ["-i", str(inventory)]), str(books[name]), *options]
     # The role makes the rover's wheel by this program, and takes paths from this folder.
-    here = {"ROVER_COMMAND": str(beside.with_name("rover")), "PWD": str(Path.cwd())}
+    here = {"ROVER_COMMAND": str(playbook_path.with_name("rover")), "PWD": str(Path.cwd())}
     os.execve(program, words, {**os.environ, **here})
 
 

@@ -22,8 +22,8 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
     """A line for each row, a header among them. Rows are of one length."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
-    for first, *others in rows:
-        cells = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(others, widths[1:], strict=True))]
+    for first, *rest in rows:
+        cells = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(rest, widths[1:], strict=True))]
         lines.append("  ".join(cells).rstrip())
     return lines
 
@@ -34,7 +34,7 @@ def number(value: float | None, form: str = ".1f") -> str:
 
 
 def ratio(over: float | None, under: float | None) -> float | None:
-    """over / under; None where one of them was not measured, or is 0."""
+    """Return over / under, None where one of them was not measured, or is 0."""
     return over / under if over and under else None
 
 

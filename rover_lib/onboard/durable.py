@@ -129,9 +129,9 @@ def _clear(new: Path, asked: str) -> None:
     """Empty a folder, except for the finished files of a process that asked the same."""
     note = new / ASKED
     same = asked != "" and note.is_file() and note.read_text() == asked
-    for left in new.iterdir():
-        if not same or (left.name.startswith(".") and left != note):
-            _remove(left)
+    for path in new.iterdir():
+        if not same or (path.name.startswith(".") and path != note):
+            _remove(path)
     if asked:
         note.write_text(asked)
 

@@ -37,8 +37,8 @@ class RoverError(Exception):
 def of_system(error: OSError) -> RoverError:
     """Return a system's error in a sentence with its file, if it names one, and a remedy."""
     reason = os.strerror(error.errno).lower() if error.errno else f"{type(error).__name__}: {error}"
-    where = f"{printable(str(error.filename))}: " if error.filename else ""
-    return RoverError(f"{where}{reason}", remedy=SYSTEM_REMEDIES.get(error.errno or 0, ""))
+    place = f"{printable(str(error.filename))}: " if error.filename else ""
+    return RoverError(f"{place}{reason}", remedy=SYSTEM_REMEDIES.get(error.errno or 0, ""))
 
 
 def printable(value: object) -> object:

@@ -64,13 +64,13 @@ def kinds_of(path: Path | str) -> tuple[str, ...]:
 
 def check_kind(path: Path | str, wanted: str) -> None:
     """Raise RoverError for no path, and for one of a known kind that is not the wanted one, a key of WANTED."""
-    found = kinds_of(path)
+    kinds = kinds_of(path)
     takes, remedy = WANTED[wanted]
     if not Path(path).exists():
         raise RoverError(f"{path}: not found", remedy=_download(str(path), wanted) or remedy)
-    if not found or set(found) & set(takes):
+    if not kinds or set(kinds) & set(takes):
         return
-    raise RoverError(f"{path}: this is {CALLED[found[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
+    raise RoverError(f"{path}: this is {CALLED[kinds[0]]}, not {CALLED[takes[0]]}", remedy=remedy)
 
 
 def _download(name: str, wanted: str) -> str:
@@ -98,8 +98,8 @@ def check_output(path: Path, kind: str | None, *, appended: bool = False) -> Non
     """Raise RoverError for a file that a command must not write, see `Output`."""
     if path.is_dir():
         raise RoverError(f"{path}: this is a folder, and one file is to be written", remedy="name the file in it")
-    if (found := kinds_of(path)) and kind not in found:
-        raise RoverError(f"{path}: this is {CALLED[found[0]]}, and would be lost", remedy="give another name")
+    if (kinds := kinds_of(path)) and kind not in kinds:
+        raise RoverError(f"{path}: this is {CALLED[kinds[0]]}, and would be lost", remedy="give another name")
     folder = next(p for p in path.absolute().parents if p.exists())
     if not (path.exists() and appended) and not (folder.is_dir() and os.access(folder, os.W_OK)):
         raise RoverError(f"{folder}: cannot be written to", remedy="name a file elsewhere")

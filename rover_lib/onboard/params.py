@@ -39,12 +39,12 @@ class _EachKeyOnce(yaml.SafeLoader):
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
-        seen = set()
+        keys = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
-                if key.value in seen:
+                if key.value in keys:
                     raise yaml.composer.ComposerError(None, None, f"{key.value!r} is there twice", key.start_mark)
-                seen.add(key.value)
+                keys.add(key.value)
         return node
 
 

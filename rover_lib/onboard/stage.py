@@ -78,10 +78,10 @@ def _create_locked(path: Path) -> BufferedWriter:
 
 
 def _remove_leftovers(path: Path) -> None:
-    for left in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}{glob.escape(path.suffix)}"):
-        with contextlib.suppress(OSError), left.open("rb") as file:
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.{'[0-9a-f]' * 8}{glob.escape(path.suffix)}"):
+        with contextlib.suppress(OSError), leftover.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            left.unlink()
+            leftover.unlink()
 
 
 def open_plain(path: Path | str, refusal: RoverError | OSError) -> BufferedReader:
@@ -196,9 +196,9 @@ def read_stage(path: Path | str, stage: str | None) -> dict[str, Any]:
         raise RoverError(f"{path}: not found", remedy=f"is this the run's folder? {made_by}") from None
     except (ValueError, OSError, RecursionError) as e:  # RecursionError: too many nested brackets
         raise RoverError(f"{path}: not readable as JSON ({e})", remedy=made_by) from None
-    found = content if isinstance(content, dict) else {}
-    whole = all(isinstance(found.get(part), dict) for part in PARTS)
-    if not whole or (found.get("schema"), found.get("stage")) != (SCHEMA, stage or found.get("stage")):
-        what = f"{path}: not schema {SCHEMA} of stage '{stage or 'any'}' with {', '.join(PARTS)}"
-        raise RoverError(what, found=f"'{found.get('stage')}' with {', '.join(sorted(found))}", remedy=made_by)
-    return found
+    parts = content if isinstance(content, dict) else {}
+    whole = all(isinstance(parts.get(part), dict) for part in PARTS)
+    if not whole or (parts.get("schema"), parts.get("stage")) != (SCHEMA, stage or parts.get("stage")):
+        problem = f"{path}: not schema {SCHEMA} of stage '{stage or 'any'}' with {', '.join(PARTS)}"
+        raise RoverError(problem, found=f"'{parts.get('stage')}' with {', '.join(sorted(parts))}", remedy=made_by)
+    return parts

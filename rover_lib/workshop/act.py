@@ -4,6 +4,26 @@ It computes the same function as `lerobot.policies.act` in eval mode. What depen
 batch norm is folded into convolutions, the latent's projection is a bias, positions are constants, as are the first
 decoder layer's self-attention and the query that follows from it.
 
+    frame (height, width, 3)      state (S,)                            name here, and in the checkpoint
+             |                         |
+      Pixels or Columns            Normalise                            image_input, state_norm
+             |                         |
+          Backbone                     |        latent of zeros         backbone.*
+             | h x w features          |               |
+         1x1 convolution             Linear          its bias           image_project: encoder_img_feat_input_proj
+             |                         |               |                state_project: encoder_robot_state_input_proj
+             +------- T tokens (1, T, D) --------------+                latent: encoder_latent_input_proj
+                            |                                           pos: encoder_1d_feature_pos_embed, sinusoids
+                  EncoderLayer, N times                                 encoder: encoder.layers
+                            |
+          Memory: keys and values of all decoder layers                 memory
+                            |
+        DecoderLayer, M times <- C queries                              decoder: decoder.layers
+                            |                                           q_pos: decoder_pos_embed
+               LayerNorm, Linear, Normalise                             norm, head: decoder.norm, action_head
+                            |
+                     chunk (1, C, A)
+
 Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions, C chunk, h and w of the feature map.
 """
 
@@ -20,7 +40,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import Sample
 
 Projection = nn.Linear | nn.Conv2d
 Pair = tuple[Tensor, Tensor]  # weight and bias
@@ -65,14 +85,17 @@ def _load(module: Layer, weight: Tensor, bias: Tensor) -> Layer:
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    """Return a linear layer with this weight, (outputs, inputs), and bias."""
     return _load(nn.Linear(weight.shape[1], weight.shape[0], device="meta"), weight, bias)
 
 
 def layer_norm(w: Weights) -> nn.LayerNorm:
+    """Return the layer norm of a checkpoint."""
     return _load(nn.LayerNorm(w["weight"].shape[0], device="meta"), w["weight"], w["bias"])
 
 
 def conv(weight: Tensor, bias: Tensor, stride: Any, padding: int, dilation: int = 1) -> nn.Conv2d:
+    """Return a convolution with this weight, (outputs, inputs, height, width), and bias."""
     outputs, inputs, height, width = weight.shape
     size = height, width
     return _load(nn.Conv2d(inputs, outputs, size, stride, padding, dilation, device="meta"), weight, bias)
@@ -321,6 +344,8 @@ def _plus_scaled(x: Tensor, y: Tensor, scale: Any) -> Tensor:
 
 
 class EncoderLayer(nn.Module):
+    """LeRobot's ACTEncoderLayer."""
+
     def __init__(self, w: Weights, config: ActConfig, as_conv: bool):
         super().__init__()
         self.pre_norm = config.pre_norm

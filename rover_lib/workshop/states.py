@@ -39,7 +39,7 @@ def _explain(state: np.ndarray, action: np.ndarray) -> str:
     if state.std() <= VARIES * max(1.0, abs(state.mean())):
         same = np.abs(action - state.mean()).max() <= NEAR * max(abs(state.mean()), VARIES)
         return "" if same else f"always {state.mean():.3g}"
-    errors = {lag: float(np.abs(a - b).mean()) for lag in LAGS for a, b in [_lagged(state, action, lag)]}
+    errors = {lag: float(np.abs(np.subtract(*_lagged(state, action, lag))).mean()) for lag in LAGS}
     best = min(LAGS, key=errors.__getitem__)
     if errors[1] <= NEARER * errors[best] + VARIES and errors[1] <= NEAR * max(action.std(), VARIES):
         return ""
@@ -62,6 +62,6 @@ def _lagged(state: np.ndarray, action: np.ndarray, lag: int) -> tuple[np.ndarray
 def _called(lag: int) -> str:
     if lag == 1:
         return "the last action"
-    return (
-        "the action of the same row" if lag == 0 else f"the action {abs(lag)} rows {'before' if lag > 0 else 'later'}"
-    )
+    if lag == 0:
+        return "the action of the same row"
+    return f"the action {abs(lag)} rows {'before' if lag > 0 else 'later'}"

@@ -71,7 +71,7 @@ def inspect_artifact(path: Path | str, expected: Expected = THIS_CAR, allow: Ite
         artifact.prove()
         manifest = artifact.manifest
         code = b"".join(artifact.record(n) for n in artifact.names if n.endswith(".py") or n == ONNX)
-        if (wanted := OF_MODE[artifact.kind].get(manifest["mode"])) and wanted not in code:
+        if (needed := OF_MODE[artifact.kind].get(manifest["mode"])) and needed not in code:
             raise refused(path, f"its manifest says {manifest['mode']}, its code is not")
         for kind, why in expected.refusals(manifest).items():
             if kind not in allow:

@@ -18,10 +18,7 @@ ARCHIVE_BYTES, DIRECTORY_BYTES, RECORDS = 1_000_000_000, 1_000_000, 5000
 CODE_BYTES, DEBUG_BYTES, PICKLE_BYTES = 250_000, 2_000_000, 1_000_000
 MANIFEST_BYTES, PARITY_BYTES = 100_000, 50_000_000
 ABOUT = frozenset({"extra/manifest.json", "extra/parity.npz"})
-REQUIRED = {
-    "torch": ABOUT | {"data.pkl", "constants.pkl", "version"},
-    "onnxruntime": ABOUT | {"model.onnx"},
-}
+REQUIRED = {"torch": ABOUT | {"data.pkl", "constants.pkl", "version"}, "onnxruntime": ABOUT | {"model.onnx"}}
 MANIFEST, PARITY, ONNX = "archive/extra/manifest.json", "archive/extra/parity.npz", "archive/model.onnx"
 RECORD_BYTES = {  # largest size by name after "archive/"
     r"version|byteorder|\.data/serialization_id": 100,
@@ -100,13 +97,13 @@ def _check_records(records: list[zipfile.ZipInfo], path: Path | str) -> None:
         name = record.filename.removeprefix("archive/")
         if name == ".data/version":  # torch moves it there if the program has an operator that changed, as gelu did
             name = "version"
-        known = [limit for pattern, limit in RECORD_BYTES.items() if re.fullmatch(pattern, name, re.ASCII)]
-        if not known or not record.filename.startswith("archive/"):
+        limits = [limit for pattern, limit in RECORD_BYTES.items() if re.fullmatch(pattern, name, re.ASCII)]
+        if not limits or not record.filename.startswith("archive/"):
             raise refused(path, "unknown record", repr(record.filename)[:80])
         if name.lower() in names:  # torch ignores case in names
             raise refused(path, f"'{name}' is in it twice")
-        if record.file_size > known[0]:
-            raise refused(path, f"'{name}' unpacks to {record.file_size} bytes, at most {known[0]} are taken")
+        if record.file_size > limits[0]:
+            raise refused(path, f"'{name}' unpacks to {record.file_size} bytes, at most {limits[0]} are taken")
         packed = record.compress_type == zipfile.ZIP_DEFLATED and name.startswith("code/")
         if not packed and (record.compress_type != zipfile.ZIP_STORED or record.compress_size != record.file_size):
             raise refused(path, f"'{name}' is compressed, only code may be")

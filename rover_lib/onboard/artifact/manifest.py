@@ -184,31 +184,31 @@ class Artifact:
     @cached_property
     def parity(self) -> Vectors:
         """The parity vectors, as save_artifact() takes them, of the shapes that the manifest says."""
-        wanted: dict[str, tuple[str, tuple[int, ...]]] = {
+        expected: dict[str, tuple[str, tuple[int, ...]]] = {
             "state": ("float32", (len(self.manifest["state_names"]),)),
             "chunk": ("float32", (self.manifest["chunk"], len(self.manifest["action_names"]))),
         } | {f"frame_{c['name']}": ("uint8", (c["height"], c["width"], 3)) for c in self.manifest["cameras"]}
         fixed = shapes_of_familiar(self.manifest)
         if fixed:
-            wanted["embedding"] = ("float32", fixed["familiar_mean"])
-        wanted |= {name: ("float32", shape) for name, shape in fixed.items()}
-        most = MOST_VECTORS * sum(math.prod(shape) * np.dtype(dtype).itemsize for dtype, shape in wanted.values())
+            expected["embedding"] = ("float32", fixed["familiar_mean"])
+        expected |= {name: ("float32", shape) for name, shape in fixed.items()}
+        limit = MOST_VECTORS * sum(math.prod(shape) * np.dtype(dtype).itemsize for dtype, shape in expected.values())
         try:
             with np.lib.npyio.NpzFile(io.BytesIO(read_record(self._z, PARITY)), allow_pickle=False) as packed:
-                if sum(record.file_size for record in packed.zip.infolist()) > most + 1000 * len(wanted):
+                if sum(record.file_size for record in packed.zip.infolist()) > limit + 1000 * len(expected):
                     raise refused(self.path, "its parity vectors are too large")
-                vectors = {name: np.asarray(packed[name]) for name in wanted}
+                vectors = {name: np.asarray(packed[name]) for name in expected}
         except (KeyError, ValueError, OSError, MemoryError, zipfile.BadZipFile, zlib.error, RuntimeError) as e:
             raise refused(self.path, f"its parity vectors are not readable ({e})") from None
-        for name, (dtype, shape) in wanted.items():
-            found = vectors[name]
+        for name, (dtype, shape) in expected.items():
+            vector = vectors[name]
             shape = shape if name in fixed else (len(vectors["state"]), *shape)
-            if found.dtype != dtype or found.shape != shape or not len(found):
+            if vector.dtype != dtype or vector.shape != shape or not len(vector):
                 raise refused(self.path, f"its parity vector {name} has another shape than its manifest says")
-            if not np.isfinite(found).all():
+            if not np.isfinite(vector).all():
                 raise refused(self.path, "its parity vectors are not finite", name)
-            if name in DIVISORS and not (found > 0).all():
-                raise refused(self.path, f"its {name} must be above 0", f"{found.min():g}")
+            if name in DIVISORS and not (vector > 0).all():
+                raise refused(self.path, f"its {name} must be above 0", f"{vector.min():g}")
         return vectors
 
     @property
@@ -227,8 +227,8 @@ class Artifact:
             return read_record(self._z, name)
         # RuntimeError, its subclasses too: a damaged header may ask for a password, or for an unknown compression
         except (zipfile.BadZipFile, OSError, RuntimeError, zlib.error) as e:
-            what = f"the checksum of '{name}' does not match" if "Bad CRC-32" in str(e) else str(e)
-            raise ArtifactError(f"{self.path}: damaged, {what}", remedy="copy the file again") from None
+            problem = f"the checksum of '{name}' does not match" if "Bad CRC-32" in str(e) else str(e)
+            raise ArtifactError(f"{self.path}: damaged, {problem}", remedy="copy the file again") from None
 
     def prove(self) -> None:
         """Prove that no byte changed since the artifact was written. Nothing in it is run."""
@@ -256,16 +256,16 @@ def check_manifest(manifest: Any, where: str) -> None:
     if broken := broken_rule(manifest, RULES):
         raise refused(where, f"manifest {broken[0]} must be {broken[1]}", broken[2])
     if "familiar" in manifest and not _is_familiar(manifest["familiar"]):
-        what = f"manifest familiar must have its sizes, 1 to {MOST_SIZE}"
-        raise refused(where, what, repr(manifest["familiar"])[:80])
+        problem = f"manifest familiar must have its sizes, 1 to {MOST_SIZE}"
+        raise refused(where, problem, repr(manifest["familiar"])[:80])
     car_of(manifest)
     tolerance = manifest["parity"].get("tolerance")
     if not isinstance(tolerance, dict) or set(tolerance) != set(manifest["action_names"]):
         raise refused(where, "manifest parity tolerance does not cover its actions", repr(tolerance)[:80])
     for name, value in tolerance.items():
-        most = largest_tolerance(manifest["mode"], name)
-        if not is_number(value, 0, most):
-            raise refused(where, f"manifest parity tolerance of {name} must be from 0 to {most:g}", repr(value)[:80])
+        limit = largest_tolerance(manifest["mode"], name)
+        if not is_number(value, 0, limit):
+            raise refused(where, f"manifest parity tolerance of {name} must be from 0 to {limit:g}", repr(value)[:80])
 
 
 def seen_size(manifest: Mapping[str, Any]) -> tuple[int, int]:
@@ -290,7 +290,9 @@ def shapes_of_familiar(manifest: Mapping[str, Any]) -> dict[str, tuple[int, ...]
 
 def largest_tolerance(mode: str, action: str) -> float:
     """Return the largest parity tolerance that a manifest may have for an action; infinity if it moves no servo."""
-    return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"] if action in CAR_ACTIONS else math.inf
+    if action not in CAR_ACTIONS:
+        return math.inf
+    return LARGEST_TOLERANCE["fp32" if mode == "fp32" else "int8"]
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -298,5 +300,5 @@ def _texts(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):
-        for each in [*value, *value.values()] if isinstance(value, dict) else value:
-            yield from _texts(each)
+        for entry in [*value, *value.values()] if isinstance(value, dict) else value:
+            yield from _texts(entry)

@@ -59,15 +59,15 @@ def measure(
     steering_us, throttle_us, *periods_us = _hold(link, "at rest", sleep)
     notify(f"at rest: {steering_us} and {throttle_us} us, with periods of {periods_us[0]} and {periods_us[1]} us")
     ends = {}
-    for where, stick in (
+    for position, stick in (
         ("left", "Steer fully to the left"),
         ("right", "Steer fully to the right"),
         ("forward", "Let go of it, and give throttle fully forward (stick or trigger)"),
         ("back", "Give throttle fully back (leave it at rest if this car has no reverse)"),
     ):
         ask(f"{stick}, and hold it there.")
-        ends[where] = _hold(link, f"with the stick {where}", sleep)[where in ("forward", "back")]
-        notify(f"{where}: {ends[where]} us")
+        ends[position] = _hold(link, f"with the stick {position}", sleep)[position in ("forward", "back")]
+        notify(f"{position}: {ends[position]} us")
     ask("Let go of steering and throttle.")
     fast = periods_us[1] < PERIOD_MIN_US
     if fast:
@@ -91,17 +91,17 @@ def measure(
 
 def _find(link: "ServoLink", sleep: Callable[[float], None]) -> None:
     """Tell the Arduino of one kind of car after the other until it receives both signals. Raises CarError."""
-    seen: set[str] = set()
+    names: set[str] = set()
     for kind in KINDS:
         link.tell(kind)
         for _ in range(round(LOOK_S / STEP_S)):
             sleep(STEP_S)
             status = link.latest()
             pulses = status.receiver[:2] if status else (None, None)
-            seen |= {name for name, us in zip(NAMES, pulses, strict=True) if us is not None}
+            names |= {name for name, us in zip(NAMES, pulses, strict=True) if us is not None}
             if None not in pulses:
                 return
-    silent = " and ".join(name for name in NAMES if name not in seen)
+    silent = " and ".join(name for name in NAMES if name not in names)
     remedy = "is the transmitter on, and are the receiver's channels on D2 and D8 (firmware/README.md)?"
     raise CarError(f"no pulse of {silent or 'both channels at a time'} came from the receiver", remedy=remedy)
 
@@ -118,12 +118,12 @@ def _hold(link: "ServoLink", where: str, sleep: Callable[[float], None]) -> list
         assert status, "it was received a moment ago"
         for name, pulse_us in zip(NAMES, status.receiver[:2], strict=True):
             if pulse_us is None:
-                what = f"no pulse of {name} {where} that a servo would take, 800 to 2200 us"
-                raise CarError(what, remedy="set the transmitter's end points to 100 %, and keep it on")
+                problem = f"no pulse of {name} {where} that a servo would take, 800 to 2200 us"
+                raise CarError(problem, remedy="set the transmitter's end points to 100 %, and keep it on")
         rows.append([us or 0 for us in status.receiver])
     columns = list(zip(*rows, strict=True))
     for name, column in zip(NAMES, columns, strict=False):
         if max(column) - min(column) > STEADY_US:
-            found = f"{min(column)} to {max(column)} us"
-            raise CarError(f"{name} moved while it was measured {where}", found=found, remedy="hold the stick still")
+            span = f"{min(column)} to {max(column)} us"
+            raise CarError(f"{name} moved while it was measured {where}", found=span, remedy="hold the stick still")
     return [round(statistics.median(column)) for column in columns]

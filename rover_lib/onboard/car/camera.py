@@ -22,15 +22,7 @@ import cv2
 import numpy as np
 
 from rover_lib.onboard.car.csi import newest_jpegs, read_csi
-from rover_lib.onboard.car.picture import (
-    COLUMNS,
-    LEAST,
-    ROWS,
-    block_sums,
-    brightness,
-    decode_jpeg,
-    is_squeezed,
-)
+from rover_lib.onboard.car.picture import COLUMNS, LEAST, ROWS, block_sums, brightness, decode_jpeg, is_squeezed
 from rover_lib.onboard.errors import CameraError, sentence_of
 
 FIRST_FRAME_S = 5.0
@@ -224,8 +216,8 @@ class Camera:
             return now_s
         age_s, stands, self._stamp_s = now_s - stamp_s, stamp_s <= self._stamp_s, stamp_s
         if stands or not -AHEAD_S <= age_s <= OLD_S:
-            found = "the same again" if stands else f"one of {age_s:.2f} s ago"
-            raise CameraError("a frame's time stamp is not of now", found=found, remedy="plug the camera in again")
+            actual = "the same again" if stands else f"one of {age_s:.2f} s ago"
+            raise CameraError("a frame's time stamp is not of now", found=actual, remedy="plug the camera in again")
         return min(now_s, stamp_s)
 
     def add(self, image: np.ndarray, captured_s: float, jpeg: bytes | None) -> None:
@@ -235,13 +227,13 @@ class Camera:
             raise CameraError(f"{self.source}: a frame must be (h, w, 3) uint8", found=image.shape)
         (h, w), (h0, w0) = image.shape[:2], (before.image if before else image).shape[:2]
         if (h, w) != (h0, w0):
-            what = f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}"
-            raise CameraError(what, remedy="is another program using the camera?")
+            problem = f"{self.source}: the picture changed from {w0}x{h0} to {w}x{h}"
+            raise CameraError(problem, remedy="is another program using the camera?")
         if w < LEAST[0] or h < LEAST[1]:
             raise CameraError(f"{self.source}: too small a picture to drive by", found=f"{w}x{h}")
-        shown, number = block_sums(image), self.frames + 1
-        same = (self._shown[: self._remembered] == shown).mean(axis=1).max(initial=0.0)
-        self._shown[self._remembered % REMEMBERED] = shown
+        sums, number = block_sums(image), self.frames + 1
+        same = (self._shown[: self._remembered] == sums).mean(axis=1).max(initial=0.0)
+        self._shown[self._remembered % REMEMBERED] = sums
         self._remembered += 1
         repeats = before.repeats + 1 if before and same >= SAME else 0
         frame = Frame(image, captured_s, number, repeats, *brightness(image), jpeg)
@@ -264,8 +256,8 @@ def _reader(source: str, size: tuple[int, int], rate_hz: float, closing: threadi
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        what = f"{path}: no such camera ({error.strerror})"
-        raise CameraError(what, remedy="'rover doctor' lists those that are") from None
+        problem = f"{path}: no such camera ({error.strerror})"
+        raise CameraError(problem, remedy="'rover doctor' lists those that are") from None
     if stat.S_ISCHR(mode):
         return _v4l2(str(path), size, rate_hz)
     if stat.S_ISFIFO(mode):

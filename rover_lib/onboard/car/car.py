@@ -59,7 +59,7 @@ class Car:
     positive: str = "right"  # as the pictures of the recordings show
     human: str = "receiver"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         steering, throttle = self.pwm.steering, self.pwm.throttle
         neutral_us, forward_us = throttle.neutral_us, throttle.pulse_us(throttle.high)
         periods, pulses = (PERIOD_MIN_US, PERIOD_MAX_US), (PULSE_MIN_US, PULSE_MAX_US)
@@ -81,10 +81,10 @@ class Car:
             ("the camera's field_of_view_deg", self.field_of_view_deg, 20, 160),
             ("wheelbase_m", self.wheelbase_m, 0.03, 3),
         ]
-        for what, value, low, high in limits:
+        for problem, value, low, high in limits:
             if not low <= value <= high:
                 remedy = "measure it with `rover calibrate`, or see docs/build.md"
-                raise CarError(f"{what} must be from {low:g} to {high:g}", found=f"{value:g}", remedy=remedy)
+                raise CarError(f"{problem} must be from {low:g} to {high:g}", found=f"{value:g}", remedy=remedy)
 
     @property
     def reverses(self) -> bool:
@@ -132,8 +132,8 @@ class Car:
         """Say in which way another car drives otherwise with the same actions; "" if it does not."""
         if self.positive != other.positive:
             return f"steering +1 turns {self.name!r} {self.positive} and {other.name!r} {other.positive}"
-        mine, others = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
-        return "" if mine == others else f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
+        mine, theirs = ((c.pulses_us, c.field_of_view_deg, c.wheelbase_m) for c in (self, other))
+        return "" if mine == theirs else f"{self.name!r} and {other.name!r} differ in pulses, camera or wheelbase"
 
     @property
     def pulses_us(self) -> tuple[int, ...]:
@@ -162,13 +162,13 @@ class Car:
         """The car that the content of a car.yml describes. CarError names what is missing, unknown or impossible."""
         top = _section(content, where, TOP)
         steering, throttle, camera = (
-            _section(top.get(name, {}), f"{where}: {name}", known) for name, known in SECTIONS.items()
+            _section(top.get(name, {}), f"{where}: {name}", keys) for name, keys in SECTIONS.items()
         )
         # In files that do not say it, +1 is what they call left; of the recorded car they did not know it (below).
         positive = steering.get("positive", "left")
         ends_us = steering["right_us"], steering["neutral_us"], steering["left_us"]
         forward_us = abs(throttle["forward_us"] - throttle["neutral_us"])
-        given = {
+        settings = {
             "name": top.get("name", "no name"),
             "cap_us": throttle.get("cap_us", min(round(CAP * forward_us), CAP_MAX_US)),
             **{key: top[key] for key in ("wheelbase_m", "human") if key in top},
@@ -180,12 +180,12 @@ class Car:
                 steering=_channel("steering", steering["period_us"], ends_us if positive == "left" else ends_us[::-1]),
                 throttle=_channel("throttle", throttle["period_us"], pulses_us),
             )
-            car = cls(pwm=pwm, positive=positive, **given)
+            car = cls(pwm=pwm, positive=positive, **settings)
         except CarError as error:
             raise CarError(f"{where}: {error.what}", found=error.found, remedy=error.remedy) from None
         if car.pulses_us == _DEFAULT_CAR.pulses_us:
             # The checked constants themselves, because whole microseconds are slightly less precise.
-            car = cls(positive=steering.get("positive", _DEFAULT_CAR.positive), **given)
+            car = cls(positive=steering.get("positive", _DEFAULT_CAR.positive), **settings)
         return car
 
 
@@ -226,9 +226,9 @@ def _channel(name: str, period_us: int, pulses_us: tuple[int | None, int, int]) 
     low_us, neutral_us, high_us = pulses_us
     upwards = high_us > neutral_us
     if high_us == neutral_us or (low_us is not None and (low_us == neutral_us or (low_us < neutral_us) != upwards)):
-        found = f"{low_us}, {neutral_us} and {high_us}"
-        what = f"{name}'s neutral_us must lie between its two ends"
-        raise CarError(what, found=found, remedy="measure them with `rover calibrate`")
+        pulses = f"{low_us}, {neutral_us} and {high_us}"
+        problem = f"{name}'s neutral_us must lie between its two ends"
+        raise CarError(problem, found=pulses, remedy="measure them with `rover calibrate`")
     neutral_pct, high_pct = neutral_us / period_us * 100, (high_us - neutral_us) / period_us * 100
     if low_us is None:
         return Channel(name, period_us, neutral_pct, high_pct, 0.0, 1.0, by_pulse=True)

@@ -27,13 +27,13 @@ Jpegs = Generator[tuple[bytes, None], None, None]
 
 def command(source: str, size: tuple[int, int], rate_hz: float) -> list[str]:
     """Return rpicam-vid's command line. size: (width, height). Raises CameraError for another source."""
-    found = SOURCE.fullmatch(source)
-    given = dict(setting.split("=") for setting in (found[2] if found else "").split(",")[1:])
-    if not found or set(given) - set(SETTINGS):
+    match = SOURCE.fullmatch(source)
+    settings = dict(setting.split("=") for setting in (match[2] if match else "").split(",")[1:])
+    if not match or set(settings) - set(SETTINGS):
         remedy = f"csi, csi:1, or csi,NAME=VALUE with {', '.join(SETTINGS)}"
         raise CameraError(f"{source}: not understood", remedy=remedy)
-    options: dict[str, object] = {"camera": found[1] or 0, "width": size[0], "height": size[1], "framerate": rate_hz}
-    options |= {"timeout": 0, "codec": "mjpeg", "quality": QUALITY, "output": "-", "verbose": 0, **DEFAULTS, **given}
+    options: dict[str, object] = {"camera": match[1] or 0, "width": size[0], "height": size[1], "framerate": rate_hz}
+    options |= {"timeout": 0, "codec": "mjpeg", "quality": QUALITY, "output": "-", "verbose": 0, **DEFAULTS, **settings}
     return [PROGRAM, "--nopreview", "--flush", *(f"--{name}={value}" for name, value in options.items())]
 
 
@@ -56,9 +56,9 @@ def read_csi(source: str, size: tuple[int, int], rate_hz: float, closing: thread
             finally:
                 process.kill()
         errors.seek(0)
-        said = errors.read()[-200:].decode(errors="replace").strip().split("\n")[-1] or f"its status is {code}"
+        message = errors.read()[-200:].decode(errors="replace").strip().split("\n")[-1] or f"its status is {code}"
         remedy = "`rpicam-hello --list-cameras` shows what is there"
-        raise CameraError(f"{source}: {PROGRAM} has ended: {said}", remedy=remedy)
+        raise CameraError(f"{source}: {PROGRAM} has ended: {message}", remedy=remedy)
 
 
 def newest_jpegs(fd: int, closing: threading.Event) -> Jpegs:

@@ -9,6 +9,7 @@ has told where both sticks are. PyPI's evdev is compiled where it is installed, 
 import contextlib
 import fcntl
 import logging
+import math
 import os
 import struct
 import time
@@ -43,7 +44,9 @@ def read_stick(fd: int, axis: int) -> tuple[int, int, int]:
 def deflection(value: int, low: int, high: int) -> float:
     """Return how far a stick is from its middle, in [-1, 1]; 0 near it. low, high: the ends of its range."""
     x = max(-1.0, min(1.0, (2 * value - low - high) / (high - low)))
-    return 0.0 if abs(x) < DEAD else (abs(x) - DEAD) / (1 - DEAD) * (1 if x > 0 else -1)
+    if abs(x) < DEAD:
+        return 0.0
+    return math.copysign((abs(x) - DEAD) / (1 - DEAD), x)
 
 
 class Gamepad:
@@ -178,15 +181,15 @@ def list_gamepads(dev: Path = Path("/dev/input"), sys: Path = Path("/sys/class/i
     nodes = sorted(sys.glob("event*"), key=lambda node: int(node.name[5:]))
     whole = {node: (node / "device" / "device").resolve() for node in nodes}
     motion = {whole[node]: dev / node.name for node in nodes if bits(node, "properties") & SENSORS}
-    wanted = 1 << STEERING | 1 << THROTTLE
-    found = []
+    both_axes = 1 << STEERING | 1 << THROTTLE
+    gamepads = []
     for node in nodes:
         axes, keys = bits(node, "capabilities/abs"), bits(node, "capabilities/key")
-        if axes & wanted == wanted and keys >> BTN_L1 & 1:
+        if axes & both_axes == both_axes and keys >> BTN_L1 & 1:
             name = ascii(text(node, "name"))[1:-1][:60]
             identity = f"{name} {text(node, 'uniq') or text(node, 'phys')}"
-            found.append(Found(name, dev / node.name, motion.get(whole[node]), identity))
-    return found
+            gamepads.append(Found(name, dev / node.name, motion.get(whole[node]), identity))
+    return gamepads
 
 
 def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: Gamepad | None = None) -> Gamepad:
@@ -194,12 +197,12 @@ def open_gamepad(list_them: Callable[[], list[Found]] | None = None, *, again: G
 
     again: one that is gone; only the same one is opened, and nothing is waited for. Raises CarError.
     """
-    found = (list_them or list_gamepads)()
-    usable = [pad for pad in found if pad.motion and (not again or pad.identity == again.identity)]
+    gamepads = (list_them or list_gamepads)()
+    usable = [pad for pad in gamepads if pad.motion and (not again or pad.identity == again.identity)]
     if len(usable) != 1:
-        wanted = f"{again.name} again" if again else "one DualShock 4, DualSense or Switch Pro Controller"
-        listed = ", ".join(map(str, found)) or "none in /dev/input"
-        raise CarError("not one usable gamepad is connected", found=listed, remedy=f"connect {wanted}")
+        needed = f"{again.name} again" if again else "one DualShock 4, DualSense or Switch Pro Controller"
+        listed = ", ".join(map(str, gamepads)) or "none in /dev/input"
+        raise CarError("not one usable gamepad is connected", found=listed, remedy=f"connect {needed}")
     gamepad = usable[0].open()
     end_s = time.monotonic() + OPEN_S
     while not again and gamepad.silent_s > ALIVE_S:

@@ -58,8 +58,8 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
         height, width = simplejpeg.decode_jpeg_header(data, strict=False)[:2]
         scans = data.count(b"\xff\xda")
         if width * height > MOST_PIXELS or scans > MOST_SCANS:
-            found = f"{width}x{height} pixels in {scans} scans"
-            raise CameraError("a JPEG would take too much to decode", found=found, remedy="is it a camera's?")
+            size_found = f"{width}x{height} pixels in {scans} scans"
+            raise CameraError("a JPEG would take too much to decode", found=size_found, remedy="is it a camera's?")
         if b"Exif\0\0" in data and _is_turned(data):
             remedy = "turn its pixels, as mogrify -auto-orient does"
             raise CameraError("a JPEG that its EXIF data turn over", remedy=remedy)
@@ -74,8 +74,8 @@ def _decode(data: bytes, colours: str, **scale: int) -> np.ndarray:
 def _is_turned(data: bytes) -> bool:
     """Whether most programs show a picture turned, while decoders do not turn it."""
     encoded, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8
-    shown, plain = (np.asarray(cv2.imdecode(encoded, flags | more)) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION))
-    return not np.array_equal(shown, plain)
+    upright, plain = (np.asarray(cv2.imdecode(encoded, flags | more)) for more in (0, cv2.IMREAD_IGNORE_ORIENTATION))
+    return not np.array_equal(upright, plain)
 
 
 def _check_only_filler(data: bytes, warning: ValueError) -> bytes:
@@ -122,8 +122,8 @@ def _check_only_filler(data: bytes, warning: ValueError) -> bytes:
 
 
 def _is_filler(warning: ValueError) -> bool:
-    found = re.search(r"(\d+) extraneous bytes before marker", str(warning))  # libjpeg reports it only as text
-    return found is not None and int(found[1]) <= FILLED_MOST
+    match = re.search(r"(\d+) extraneous bytes before marker", str(warning))  # libjpeg reports it only as text
+    return match is not None and int(match[1]) <= FILLED_MOST
 
 
 def _segments(data: bytes) -> tuple[list[bytes], int]:

@@ -17,10 +17,10 @@ def list_ports(dev: Path = DEV) -> dict[Path, str]:
 
 def other_ports(port: str, dev: Path = DEV) -> str:
     """Say which other USB serial ports there are, "" if none: udev gives two that are alike the Arduino's one name."""
-    asked = Path(port).resolve()
-    others = [f"{path} ({name})" if name else str(path) for path, name in list_ports(dev).items()]
-    others = [text for text in others if text.split()[0] != str(asked)]
-    return f"{asked} was asked, and there is also {', '.join(others)}: unplug it, or try --port" if others else ""
+    own = Path(port).resolve()
+    ports = [f"{path} ({name})" if name else str(path) for path, name in list_ports(dev).items()]
+    ports = [text for text in ports if text.split()[0] != str(own)]
+    return f"{own} was asked, and there is also {', '.join(ports)}: unplug it, or try --port" if ports else ""
 
 
 def find_port(dev: Path = DEV) -> str:
@@ -33,7 +33,7 @@ def find_port(dev: Path = DEV) -> str:
     ports = list_ports(dev)
     if len(ports) == 1:
         return str(next(iter(ports)))
-    found = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
+    names = ", ".join(f"{port} ({name})" if name else str(port) for port, name in ports.items())
     if not ports:
         raise RoverError("no Arduino is plugged in", remedy="plug it in; dmesg | tail says what the kernel saw")
-    raise RoverError("which port is the Arduino's?", found=found, remedy=f"pass it: --port {next(iter(ports))}")
+    raise RoverError("which port is the Arduino's?", found=names, remedy=f"pass it: --port {next(iter(ports))}")

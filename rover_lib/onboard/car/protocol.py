@@ -132,15 +132,15 @@ def parse(line: bytes, host_s: float) -> Hello | Telemetry | None:
     if not star or crc != b"%08X" % zlib.crc32(body):
         return None
     text = body.decode("ascii", "replace")
-    if found := _HELLO.fullmatch(text):
-        protocol, firmware, boot, sequence, reset, car = found.groups()
+    if match := _HELLO.fullmatch(text):
+        protocol, firmware, boot, sequence, reset, car = match.groups()
         if int(protocol) == PROTOCOL_VERSION and boot is None:
             return None
         # In another protocol only the first two fields are sure to mean the same.
         return Hello(int(protocol), firmware, int(boot or 0), int(sequence or 0), RESETS[reset or "-"], int(car or 0))
-    found = _STATUS.fullmatch(text)
-    if not found:
+    match = _STATUS.fullmatch(text)
+    if not match:
         return None
-    boot, uptime, sequence, result, state, reason, missing, *numbers = found.groups()
+    boot, uptime, sequence, result, state, reason, missing, *numbers = match.groups()
     values: list[Any] = [None if n is None else int(n) for n in numbers]  # the pattern says which may be None
     return Telemetry(host_s, int(boot), int(uptime), int(sequence), result, State(state), reason, missing, *values)

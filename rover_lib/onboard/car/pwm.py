@@ -18,8 +18,8 @@ NEUTRAL = (0.0, 0.0)  # (steering, throttle): straight and stopped
 def _finite(value: object, what: str) -> float:
     """Return `value` as a float. Raises CarError for None, strings, booleans, NaN and infinities."""
     with contextlib.suppress(OverflowError):
-        if isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(found := float(value)):
-            return found
+        if isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(number := float(value)):
+            return number
     raise CarError(f"{what} must be a finite number", found=f"{type(value).__name__} {value!r}"[:80])
 
 

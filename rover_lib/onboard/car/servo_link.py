@@ -166,9 +166,9 @@ class ServoLink:
         if self.car.human == "gamepad":
             build, make = f"{build}-gamepad", f"{make} HUMAN=gamepad"
         if (hello.protocol, hello.firmware) != (PROTOCOL_VERSION, build):
-            what = f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})"
-            found = f"{hello.firmware} (protocol {hello.protocol})"
-            raise LinkError(what, found=found, remedy=f"put the matching firmware on it: {make} PORT={self.port}")
+            problem = f"{self.port}: the Arduino must have firmware {build} (protocol {PROTOCOL_VERSION})"
+            actual = f"{hello.firmware} (protocol {hello.protocol})"
+            raise LinkError(problem, found=actual, remedy=f"put the matching firmware on it: {make} PORT={self.port}")
         if not self._await(lambda: self._telemetry, STALE_S):
             raise LinkError(f"{self.port}: the Arduino sends no status", remedy="press its reset button")
         return hello
@@ -197,8 +197,9 @@ class ServoLink:
                 self._told_boot = telemetry.boot
                 return
             if telemetry.result in "rt":
-                what = f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml ({RESULTS[telemetry.result]})"
-                raise LinkError(what, remedy="let go of the throttle stick, or measure the car with `rover calibrate`")
+                problem = f"{self.port}: the Arduino refuses {self.car.name!r} of car.yml ({RESULTS[telemetry.result]})"
+                remedy = "let go of the throttle stick, or measure the car with `rover calibrate`"
+                raise LinkError(problem, remedy=remedy)
         raise self._no_answer("being told of the car")
 
     def close(self) -> None:
@@ -243,12 +244,12 @@ class ServoLink:
         """
         hello = self.hello
         with self._heard:
-            asked, self._requested = self._requested or self._telemetry, None
-        if hello and asked and asked.boot != hello.boot:
+            before, self._requested = self._requested or self._telemetry, None
+        if hello and before and before.boot != hello.boot:
             raise LinkError(f"{self.port}: the Arduino was reset since the car was asked for", remedy="ask again")
         if hello and self._told_boot != hello.boot:
             self._tell_car(hello)
-        for telemetry in self._ask(">A", asked.uptime_ms if asked else 0, self.car.id):
+        for telemetry in self._ask(">A", before.uptime_ms if before else 0, self.car.id):
             if telemetry.state is State.AUTONOMOUS:
                 return telemetry
             if telemetry.result in "cestw":
@@ -301,13 +302,13 @@ class ServoLink:
         while self._clock() < end:
             number = self._send(kind, *values)
             first = number if first is None else first
-            until, seen = self._clock() + REPEAT_S, None
-            while (left := until - self._clock()) > 0:
-                self._await(lambda: self._telemetry is not seen, left)  # noqa: B023
-                seen = self._telemetry
+            until, telemetry = self._clock() + REPEAT_S, None
+            while (rest_s := until - self._clock()) > 0:
+                self._await(lambda: self._telemetry is not telemetry, rest_s)  # noqa: B023
+                telemetry = self._telemetry
                 # An earlier status says nothing about the command.
-                if seen and _reached(seen, first) and seen.boot == self._boot:
-                    yield seen
+                if telemetry and _reached(telemetry, first) and telemetry.boot == self._boot:
+                    yield telemetry
 
     def send(self, steering_us: int, throttle_us: int) -> int:
         """Send two pulses, whole microseconds, without waiting for an answer. Return the command's number.
@@ -323,8 +324,8 @@ class ServoLink:
         low, high = channel.ends_us
         whole_us = int(pulse_us) if isinstance(pulse_us, Integral) and not isinstance(pulse_us, bool) else None
         if whole_us is None or not low <= whole_us <= high:
-            what = f"{channel.name} pulse must be whole microseconds from {low} to {high}"
-            raise LinkError(what, found=repr(pulse_us), remedy="it was not sent")
+            problem = f"{channel.name} pulse must be whole microseconds from {low} to {high}"
+            raise LinkError(problem, found=repr(pulse_us), remedy="it was not sent")
         return whole_us
 
     def latest(self) -> Telemetry | None:
@@ -379,10 +380,10 @@ class ServoLink:
             with self._sending:
                 # Not pyserial's write, which may wait for ever, or report a line as failed that went out whole.
                 try:
-                    taken = os.write(port.fileno(), line)
+                    count = os.write(port.fileno(), line)
                 except BlockingIOError:
-                    taken = 0
-                if taken == len(line):
+                    count = 0
+                if count == len(line):
                     return
                 # What waits in the buffer would be old when it got through: the next line sent must be the newest.
                 with contextlib.suppress(*PORT_ERRORS):

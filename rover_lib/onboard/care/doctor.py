@@ -25,7 +25,8 @@ from rover_lib.onboard.car.car import car_file, this_car
 from rover_lib.onboard.car.gamepad import list_gamepads, open_gamepad
 from rover_lib.onboard.car.host import Host, throttled_means
 from rover_lib.onboard.car.ports import DEV, find_port, list_ports
-from rover_lib.onboard.car.servo_link import PROTOCOL_VERSION, ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import PROTOCOL_VERSION, Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import log_limits
 from rover_lib.onboard.drive.inference import PolicyProcess
 from rover_lib.onboard.drive.pilot import blank, frozen
@@ -83,13 +84,13 @@ def examine(
     host, manifest = host or Host(), None
     with contextlib.suppress(ArtifactError, OSError):  # the artifact's own check reports it
         manifest = read_manifest(artifact) if artifact else None
-    seen = seen_size(manifest) if manifest else None
+    size = seen_size(manifest) if manifest else None
     device = path_of(str(camera))
     checks: dict[str, Callable[[], Iterable[Check]]] = {}
     if device.is_relative_to(DEV):  # otherwise it is a file or a pipe, and no camera needs to be there
         checks["group video"] = lambda: access("group video", device)
     checks |= {
-        "camera": lambda: camera_rate(device, seen, rate_hz=rate_hz),
+        "camera": lambda: camera_rate(device, size, rate_hz=rate_hz),
         "group dialout": lambda: access("group dialout", Path(port or next(iter(list_ports()), DEV / "none"))),
         "Arduino": lambda: arduino(port or find_port()),
         "ModemManager": lambda: modem_manager(host.proc_root),
@@ -105,8 +106,8 @@ def examine(
         try:
             yield from check()
         except RoverError as error:
-            found = error.what if error.found is None else f"{error.what}, found {error.found}"
-            yield Check(name, "fail", found, error.remedy)
+            finding = error.what if error.found is None else f"{error.what}, found {error.found}"
+            yield Check(name, "fail", finding, error.remedy)
         except Exception as error:
             yield Check(name, "fail", f"could not be checked: {type(error).__name__}: {error}", "report this, please")
 
@@ -137,23 +138,23 @@ def camera_rate(source: Path | str, seen: tuple[int, int] | None = None, *, rate
     number = last.number - first.number
     measured_hz = number / (last.captured_s - first.captured_s) if number and last.captured_s > first.captured_s else 0
     height, width = last.image.shape[:2]
-    found = f"{source}: {width}x{height}, {clock} time stamps, {measured_hz:.1f} frames a second"
+    finding = f"{source}: {width}x{height}, {clock} time stamps, {measured_hz:.1f} frames a second"
     settings = Settings.of(params()["drive"])
     if not measured_hz:
         yield Check("camera", "fail", f"{source}: no new frame within {MEASURE_S:g} s", "plug it in again")
     elif measured_hz < RATE_SHARE * rate_hz:
         light = "more light (long exposures halve the rate), a USB 3 port, or --hz of what it gives"
-        yield Check("camera", "warning", f"{found}, wanted {rate_hz:g}", light)
+        yield Check("camera", "warning", f"{finding}, wanted {rate_hz:g}", light)
     elif fault := frozen(last, settings) or blank(last, settings):
-        yield Check("camera", "fail", f"{found}, but {fault.what}", fault.remedy)
+        yield Check("camera", "fail", f"{finding}, but {fault.what}", fault.remedy)
     else:
-        yield Check("camera", "ok", found)
+        yield Check("camera", "ok", finding)
 
 
 def _newest_after(camera: Any, seconds: float) -> Frame:
     """Watch a camera for a while, and return its last frame."""
     end, last = time.monotonic() + seconds, camera.latest()
-    while (left := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, left)):
+    while (rest_s := end - time.monotonic()) > 0 and (frame := camera.wait(last.number, rest_s)):
         last = frame
     return last
 
@@ -165,11 +166,11 @@ def arduino(port: str) -> Iterator[Check]:
         yield Check("Arduino", "ok", f"{port}: firmware {firmware}, protocol {PROTOCOL_VERSION}")
         times_ms = [link.round_trip_s() * 1000 for _ in range(ROUND_TRIPS)]
         median_ms, most_ms = statistics.median(times_ms), max(times_ms)
-        found = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
+        finding = f"round trip {median_ms:.1f} ms median, {most_ms:.1f} ms at most of {ROUND_TRIPS}"
         if link.garbled:
-            found += f"; {link.garbled} lines were garbled"
+            finding += f"; {link.garbled} lines were garbled"
         remedy = "a shorter or better USB cable, plugged into the Pi itself, not a hub"
-        yield warn_unless(median_ms <= SLOW_MS and not link.garbled, "link", found, remedy)
+        yield warn_unless(median_ms <= SLOW_MS and not link.garbled, "link", finding, remedy)
         yield _transmitter(link)
 
 
@@ -178,13 +179,13 @@ def _transmitter(link: ServoLink) -> Check:
     if steering_us is None or throttle_us is None:
         if link.car.human == "gamepad":
             return Check("transmitter", "warning", "nobody holds L1: arming will be refused", "hold L1 of the gamepad")
-        found = f"no signal (steering {steering_us}, throttle {throttle_us}): arming will be refused"
+        finding = f"no signal (steering {steering_us}, throttle {throttle_us}): arming will be refused"
         remedy = "switch it on; if the car is another, rover calibrate; then look at the wires (firmware/README.md)"
-        return Check("transmitter", "fail", found, remedy)
-    found = f"steering {steering_us} us, throttle {throttle_us} us"
+        return Check("transmitter", "fail", finding, remedy)
+    finding = f"steering {steering_us} us, throttle {throttle_us} us"
     rests = abs(throttle_us - link.calibration.throttle.pulse_us(0.0)) <= REST_US
-    found += "" if rests else ": arming will be refused"
-    return warn_unless(rests, "transmitter", found, "let go of the throttle")
+    finding += "" if rests else ": arming will be refused"
+    return warn_unless(rests, "transmitter", finding, "let go of the throttle")
 
 
 def receiver(port: str, ask: Callable[[str], object]) -> Iterator[Check]:
@@ -199,9 +200,9 @@ def receiver(port: str, ask: Callable[[str], object]) -> Iterator[Check]:
         if check.verdict != "ok":
             return
         ask("Steer far to both sides, and let go.")
-        seen = _soon(link, lambda status: status.missing == "-", RITUAL_S)
-        if seen.missing != "-":
-            yield Check("arming", "fail", "the receiver's pulses did not show it", link.remedy(seen.missing))
+        answer = _soon(link, lambda status: status.missing == "-", RITUAL_S)
+        if answer.missing != "-":
+            yield Check("arming", "fail", "the receiver's pulses did not show it", link.remedy(answer.missing))
             return
         yield Check("arming", "ok", "transmitter on, throttle at rest, stick wiggled: it could be armed for 30 s now")
         ask("Switch the transmitter off.")
@@ -226,10 +227,10 @@ def _failsafe(after: tuple[int | None, ...], rest_us: int) -> Check:
     if None in after:
         return Check(name, "ok", "without its transmitter the receiver sends no pulses: the car stops within 100 ms")
     steering_us, throttle_us = (us or 0 for us in after)
-    found = f"without its transmitter the receiver goes on: steering {steering_us} us, throttle {throttle_us} us"
+    finding = f"without its transmitter the receiver goes on: steering {steering_us} us, throttle {throttle_us} us"
     if abs(throttle_us - rest_us) > REST_US:
-        return Check(name, "fail", f"{found}: a car that a human drives runs away", remedy)
-    return Check(name, "warning", f"{found}: an armed car may drive on, and nobody can tell", remedy)
+        return Check(name, "fail", f"{finding}: a car that a human drives runs away", remedy)
+    return Check(name, "warning", f"{finding}: an armed car may drive on, and nobody can tell", remedy)
 
 
 def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
@@ -241,12 +242,12 @@ def car(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
     yield Check("car", "ok", f"{this.name}, of {path}" if path else f"{this.name}: no car.yml is here")
     if this.human == "gamepad":
         open_gamepad().close()
-        found = ", ".join(map(str, list_gamepads()))
-        yield Check("gamepad", "ok", f"{found}: with L1 held, the left stick steers, and the right one is the throttle")
+        pads = ", ".join(map(str, list_gamepads()))
+        yield Check("gamepad", "ok", f"{pads}: with L1 held, the left stick steers, and the right one is the throttle")
     if manifest and (unlike := (meant := car_of(manifest)).unlike(this)):
         remedy = "deploy one that was calibrated with recordings of this car, or put its car.yml here"
-        found = f"the artifact was calibrated for another car: {unlike}"
-        yield Check("car", "warning" if meant.positive == this.positive else "fail", found, remedy)
+        finding = f"the artifact was calibrated for another car: {unlike}"
+        yield Check("car", "warning" if meant.positive == this.positive else "fail", finding, remedy)
 
 
 def stops(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
@@ -255,11 +256,11 @@ def stops(manifest: dict[str, Any] | None = None) -> Iterator[Check]:
     off = [] if settings.unfamiliar == STOP else [f"unfamiliar: {settings.unfamiliar}"]
     off += [f"{name}: 0" for name in ("stuck_s", "undervoltage_s") if not getattr(settings, name)]
     off += [f"{name}: {value:g}" for name in ("black_level", "flat_level") if (value := getattr(settings, name)) <= 0]
-    off += [f"{name}: {value}" for name, most in LATEST.items() if (value := getattr(settings, name)) > most]
+    off += [f"{name}: {value}" for name, limit in LATEST.items() if (value := getattr(settings, name)) > limit]
     if manifest is not None and "familiar" not in manifest:
         off.append("unfamiliar: this artifact knows no limit")
-    found = f"off or late: {', '.join(off)}" if off else "all that params.yml may switch off are on"
-    yield warn_unless(not off, "stops", found, "see drive in params.yml, and docs/safety.md for what each prevents")
+    finding = f"off or late: {', '.join(off)}" if off else "all that params.yml may switch off are on"
+    yield warn_unless(not off, "stops", finding, "see drive in params.yml, and docs/safety.md for what each prevents")
 
 
 def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
@@ -268,8 +269,8 @@ def modem_manager(proc_root: Path = Path("/proc")) -> Iterator[Check]:
     for process in proc_root.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has just ended
             runs |= (process / "comm").read_text().strip() == "ModemManager"
-    found = "runs: it writes to serial ports that appear" if runs else "does not run"
-    yield warn_unless(not runs, "ModemManager", found, "sudo systemctl disable --now ModemManager")
+    finding = "runs: it writes to serial ports that appear" if runs else "does not run"
+    yield warn_unless(not runs, "ModemManager", finding, "sudo systemctl disable --now ModemManager")
 
 
 def policy(artifact: Path | str | None) -> Iterator[Check]:
@@ -282,11 +283,11 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
         loaded = process.manifest
         camera = loaded["cameras"][0]
         size = f"{camera['name']} {camera['width']}x{camera['height']}"
-        about = f"{loaded['mode']}, {loaded['chunk']} actions at {loaded['rate_hz']:g} Hz, camera {size}"
-        yield Check("artifact", "ok", f"{artifact}: verified; {about}")
-        found = process.unconfined or "the policy's process opens no file to write, no port and no socket"
+        description = f"{loaded['mode']}, {loaded['chunk']} actions at {loaded['rate_hz']:g} Hz, camera {size}"
+        yield Check("artifact", "ok", f"{artifact}: verified; {description}")
+        finding = process.unconfined or "the policy's process opens no file to write, no port and no socket"
         remedy = "a kernel with seccomp, as Raspberry Pi OS has; until then drive only what you made"
-        yield warn_unless(not process.unconfined, "confinement", found, remedy)
+        yield warn_unless(not process.unconfined, "confinement", finding, remedy)
         frame = np.zeros((camera["height"], camera["width"], 3), np.uint8)
         for _ in range(3):
             start = time.perf_counter()
@@ -294,9 +295,9 @@ def policy(artifact: Path | str | None) -> Iterator[Check]:
             times_s.append(time.perf_counter() - start)
     median_s, fade_s = statistics.median(times_s), float(params()["drive"]["fade_s"])
     # just before the next plan is ready, a plan is two inferences old
-    found = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
+    finding = f"{1000 * median_s:.0f} ms; the throttle fades from {1000 * fade_s:g} ms of age on"
     remedy = "choose a static artifact or a smaller image, cool the processor, end what else runs"
-    yield warn_unless(median_s < fade_s / 2, "inference", found, remedy)
+    yield warn_unless(median_s < fade_s / 2, "inference", finding, remedy)
 
 
 def power(host: Host) -> Iterator[Check]:
@@ -305,8 +306,8 @@ def power(host: Host) -> Iterator[Check]:
     means = throttled_means(value)
     if means is None:
         trouble = shutil.which(host.vcgencmd)
-        found = "cannot be read, so low voltage would not be seen" if trouble else "no vcgencmd here"
-        yield warn_unless(not trouble, "power", found, "sudo usermod -aG video $USER, log in again")
+        finding = "cannot be read, so low voltage would not be seen" if trouble else "no vcgencmd here"
+        yield warn_unless(not trouble, "power", finding, "sudo usermod -aG video $USER, log in again")
         return
     supply = any("voltage" in m for m in means)
     remedy = "a supply of 5 V and 5 A with a short thick cable; a charged battery" if supply else "a fan, or air"
@@ -316,21 +317,21 @@ def power(host: Host) -> Iterator[Check]:
 def governor(sys_root: Path = Path("/sys")) -> Iterator[Check]:
     """Check which frequency governor sets the cores' clock."""
     files = sorted(sys_root.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
-    found = sorted({f.read_text().strip() for f in files})
+    governors = sorted({f.read_text().strip() for f in files})
     remedy = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
-    fine = found in ([], ["performance"])
-    yield warn_unless(fine, "governor", ", ".join(found) or "not reported", remedy)
+    fine = governors in ([], ["performance"])
+    yield warn_unless(fine, "governor", ", ".join(governors) or "not reported", remedy)
 
 
 def disk(log_folder: Path, recordings: Path) -> Iterator[Check]:
     """Check that there is room for flight logs and recordings, and that their folders can be written."""
     max_bytes, keep = log_limits()
     log_mb = max_bytes / 1e6 * (keep + 1)
-    for what, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
+    for purpose, folder, need_mb in (("flight logs", log_folder, log_mb), ("recordings", recordings, RECORDINGS_MB)):
         there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         free_mb = shutil.disk_usage(there).free / 1e6 if os.access(there, os.W_OK | os.X_OK) else 0
-        found = f"{free_mb:.0f} MB free to write {what} to {folder}, {need_mb:.0f} are wanted"
-        yield warn_unless(free_mb >= need_mb, "disk", found, f"delete what is old, or sudo chown $USER {there}")
+        finding = f"{free_mb:.0f} MB free to write {purpose} to {folder}, {need_mb:.0f} are wanted"
+        yield warn_unless(free_mb >= need_mb, "disk", finding, f"delete what is old, or sudo chown $USER {there}")
 
 
 def memory(proc_root: Path = Path("/proc")) -> Iterator[Check]:

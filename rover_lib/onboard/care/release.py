@@ -91,18 +91,18 @@ class Releases:
         return self._look_at(name)["wrong"]
 
     def _look_at(self, name: str) -> dict[str, Any]:
-        policy, about, megabytes, wrong = self.releases / name / POLICY, {}, 0.0, ""
+        policy, origin, megabytes, wrong = self.releases / name / POLICY, {}, 0.0, ""
         try:
             megabytes = round(policy.stat().st_size / 1e6, 1)
-            about = json.loads(policy.with_name(ORIGIN).read_text())
-            if about["name"] != name or about["sha256"] != sha256_of(policy):
+            origin = json.loads(policy.with_name(ORIGIN).read_text())
+            if origin["name"] != name or origin["sha256"] != sha256_of(policy):
                 wrong = f"{POLICY} is not what {ORIGIN} says"
         except (OSError, ValueError, KeyError, TypeError, RoverError) as e:
             wrong = f"not readable ({type(e).__name__}: {e})"
-        told = dict.fromkeys(("mode", "origin", "sha256"), "?")
-        if isinstance(about, dict):
-            told |= {key: str(about[key]) for key in told if key in about}
-        return {"name": name, "current": name == self.current, "megabytes": megabytes, "wrong": wrong, **told}
+        facts = dict.fromkeys(("mode", "origin", "sha256"), "?")
+        if isinstance(origin, dict):
+            facts |= {key: str(origin[key]) for key in facts if key in origin}
+        return {"name": name, "current": name == self.current, "megabytes": megabytes, "wrong": wrong, **facts}
 
     def status(self) -> dict[str, Any]:
         """Return the present state: current, mode, since, healthy, trouble, releases, disk_free_mb.
@@ -160,8 +160,8 @@ class Releases:
         with self._lock():
             free_mb = shutil.disk_usage(self.models).free / 1e6
             if free_mb < (wanted_mb := (source.stat().st_size + SPARE_BYTES) / 1e6):
-                what = f"{self.models}: {free_mb:.0f} MB free, {wanted_mb:.0f} are needed"
-                raise RoverError(what, remedy="prune releases")
+                problem = f"{self.models}: {free_mb:.0f} MB free, {wanted_mb:.0f} are needed"
+                raise RoverError(problem, remedy="prune releases")
             new = self.releases / ".new"
             new.mkdir()
             shutil.copyfile(source, new / POLICY)
@@ -171,14 +171,14 @@ class Releases:
             try:
                 artifact = inspect_artifact(new / POLICY, self.expected, allow)
             except RoverError as e:
-                what = e.what.replace(str(new / POLICY), str(source))
-                raise type(e)(what, found=e.found, remedy=e.remedy) from None
+                problem = e.what.replace(str(new / POLICY), str(source))
+                raise type(e)(problem, found=e.found, remedy=e.remedy) from None
             release = self.releases / artifact.content_hash
             if release.exists() and not self.wrong_with(release.name):
                 return Staged(release.name, False)
-            where = printable(origin or f"{socket.gethostname()}:{source.absolute()}")
-            about = {"schema": 1, "name": release.name, "sha256": arrived, "origin": where}
-            (new / ORIGIN).write_text(json.dumps(about | {"mode": artifact.manifest["mode"]}, indent=1) + "\n")
+            place = printable(origin or f"{socket.gethostname()}:{source.absolute()}")
+            facts = {"schema": 1, "name": release.name, "sha256": arrived, "origin": place}
+            (new / ORIGIN).write_text(json.dumps(facts | {"mode": artifact.manifest["mode"]}, indent=1) + "\n")
             for path, mode in ((new / POLICY, 0o644), (new / ORIGIN, 0o644), (new, 0o755)):
                 path.chmod(mode)  # for the service's user, whatever the umask is
                 sync(path)
@@ -242,8 +242,8 @@ class Releases:
         """
         with self._lock():
             names = self._by_use()
-            kept = [name for name in names if not self.wrong_with(name)][:keep]
-            removed = [name for name in names if name not in kept and name != self.current]
+            healthy = [name for name in names if not self.wrong_with(name)][:keep]
+            removed = [name for name in names if name not in healthy and name != self.current]
             for name in removed:
                 away = self.releases / f".gone-{name}"  # after a power cut it is there completely, or not at all
                 (self.releases / name).rename(away)
@@ -273,8 +273,8 @@ class Releases:
 
     def _tidy(self) -> None:
         ours = (*self.releases.glob(".new"), *self.releases.glob(".gone-*"), *self.models.glob(".new-*"))
-        for left in ours:  # other files, such as a .git, stay
-            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
+        for path in ours:  # other files, such as a .git, stay
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         history = self._history()
         if (current := self.current) in self._by_use() and history[-1:] != [current]:
             self._write_history([*history, current])  # a switch was interrupted before the history was written
@@ -327,8 +327,8 @@ def check_in_sandbox(name: str) -> None:
     started = subprocess.run(["systemctl", "start", unit], capture_output=True, text=True)
     if started.returncode:
         ask = ["journalctl", "--unit", unit, "--output=cat", "--grep=^rover: ", "--lines=1"]
-        said = subprocess.run(ask, capture_output=True, text=True).stdout.strip().removeprefix("rover: ")
-        raise RoverError(f"{unit}: {said or started.stderr.strip() or f'exit code {started.returncode}'}")
+        message = subprocess.run(ask, capture_output=True, text=True).stdout.strip().removeprefix("rover: ")
+        raise RoverError(f"{unit}: {message or started.stderr.strip() or f'exit code {started.returncode}'}")
 
 
 def _up_to_last(history: list[str], name: str | None) -> list[str]:

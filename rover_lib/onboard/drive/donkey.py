@@ -42,11 +42,7 @@ class RoverPilot:
     """
 
     def __init__(
-        self,
-        artifact: Path | str,
-        *,
-        throttle_limit: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, artifact: Path | str, *, throttle_limit: float | None = None, clock: Callable[[], float] = time.monotonic
     ):
         self._settings = Settings.of(params()["drive"], throttle_limit=throttle_limit)
         self._clock, self._policy = clock, PolicyProcess(Path(artifact).resolve())

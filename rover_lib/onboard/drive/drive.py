@@ -46,7 +46,7 @@ def drive_car(
     with ExitStack() as stack:
         # Resolved: `current` may point to another one later. Opened first: it may be missing, or no artifact.
         artifact = stack.enter_context(Artifact(options.artifact.resolve()))
-        seen = seen_size(artifact.manifest)
+        size = seen_size(artifact.manifest)
         warning = another_car(artifact.manifest, this_car())
         log = stack.enter_context(open_flight_log(options, settings, report))
         most_m = settings.throttle_limit * params()["view"]["speed_mps"] * settings.blind_s
@@ -64,9 +64,9 @@ def drive_car(
         place = options.view or default_view()
         feed = stack.enter_context(contextlib.closing(Feed(place, log, options.artifact.name)))
         link = None if options.dry_run else stack.enter_context(ServoLink(options.port, car=this_car()))
-        camera = stack.enter_context(Camera(options.camera, size=size_like(*seen)))
+        camera = stack.enter_context(Camera(options.camera, size=size_like(*size)))
         if frame := camera.latest():
-            check_shape(options.camera, frame.image, seen)
+            check_shape(options.camera, frame.image, size)
         policy = stack.enter_context(PolicyProcess(artifact, threads=options.threads))
         if policy.unconfined:
             log.event(f"the policy's process is not confined: {policy.unconfined}", level=logging.WARNING)

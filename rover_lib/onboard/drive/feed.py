@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from rover_lib.onboard.car.camera import Camera
-from rover_lib.onboard.car.servo_link import REASONS, ServoLink
+from rover_lib.onboard.car.protocol import REASONS
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog, Tick
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.drive.pilot import PolicyPilot
@@ -90,16 +91,16 @@ class Feed:
         """Why this drive must end; None if nobody asked for a stop. The loop calls this at each tick."""
         for _ in range(ASKED_MOST):
             try:
-                asked = self._socket.recv(64) if self._socket else None
+                request = self._socket.recv(64) if self._socket else None
             except BlockingIOError:
                 return None
             except OSError:
-                asked = b""
-            if not asked:
+                request = b""
+            if not request:
                 if self._socket:  # an empty message: the other end has closed it
                     self._lost("the view is gone")
                 return None
-            if stop := STOP.fullmatch(asked):
+            if stop := STOP.fullmatch(request):
                 return f"stopped from the view ({stop[1].decode()})"
         return None
 
@@ -139,10 +140,10 @@ class Feed:
 
     def _send(self, phase: str, text: str, report: Report, camera: Camera, message: dict[str, Any]) -> bool:
         try:
-            shown, picture = self._picture(camera)
+            view, picture = self._picture(camera)
             events = [[round(event.t_s, 2), event.text[:200]] for event in tuple(self._log.recent)]
-            about = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
-            line = about | {"missed": report.missed, "machine": self._log.machine, "events": events} | message | shown
+            head = {"phase": phase, "text": text, "title": self._title, "sent_s": self._clock(), "tick": None}
+            line = head | {"missed": report.missed, "machine": self._log.machine, "events": events} | message | view
             return self._put(json.dumps(line).encode() + b"\n", picture)
         except Exception as error:  # whatever fails here, the drive goes on without a view
             self._lost(f"the view is not fed any more: {type(error).__name__}: {error}")
@@ -157,8 +158,8 @@ class Feed:
         if frame is None:
             return {}, b""
         height, width = frame.image.shape[:2]
-        shown: dict[str, Any] = {"frame": frame.number, "captured_s": frame.captured_s, "size": [width, height]}
-        return shown, frame.jpeg or b""
+        view: dict[str, Any] = {"frame": frame.number, "captured_s": frame.captured_s, "size": [width, height]}
+        return view, frame.jpeg or b""
 
     def _put(self, line: bytes, picture: bytes) -> bool:
         """Give the view a message unless it has not read the previous one. Never waits."""

@@ -86,8 +86,8 @@ def log_limits() -> tuple[int, int]:
     section = params()["flight_log"]
     max_mb, keep = section["max_mb"], section["keep"]
     if not is_number(max_mb, 0.02, FILE_BYTES / 1e6) or not is_whole(keep, 0):
-        what = f"flight_log: max_mb must be from 0.02 to {FILE_BYTES / 1e6:g}, keep whole and not negative"
-        raise ParamsError(what, found=f"{max_mb!r} and {keep!r}", remedy="see params.yml")
+        problem = f"flight_log: max_mb must be from 0.02 to {FILE_BYTES / 1e6:g}, keep whole and not negative"
+        raise ParamsError(problem, found=f"{max_mb!r} and {keep!r}", remedy="see params.yml")
     return int(max_mb * 1e6), keep
 
 
@@ -312,8 +312,8 @@ def figures(late_ms: Any, plan_age_ms: Any, latency_ms: Any) -> dict[str, float 
 
 
 def _percentile(values: Any, q: float) -> float | None:
-    known = np.asarray(values)[np.isfinite(values)]
-    return round(float(np.percentile(known, q)), 3) if len(known) else None
+    numbers = np.asarray(values)[np.isfinite(values)]
+    return round(float(np.percentile(numbers, q)), 3) if len(numbers) else None
 
 
 def read_log(path: Path | str, drive: int = -1) -> Flight:
@@ -327,15 +327,15 @@ def read_log(path: Path | str, drive: int = -1) -> Flight:
     drives = _drives_of([row for row in rows if row is not None])
     if not -len(drives) <= drive < len(drives):
         raise RoverError(f"{path}: no drive {drive} in it", found=f"{len(drives)} drives", remedy=NAME_A_LOG)
-    header, *chosen = drives[drive]
-    ticks = [row for row in chosen if isinstance(row, list)]
-    machine = [row for row in chosen if type(row) is tuple]
+    header, *lines = drives[drive]
+    ticks = [row for row in lines if isinstance(row, list)]
+    machine = [row for row in lines if type(row) is tuple]
     columns = zip(*ticks, strict=True) if ticks else [()] * len(Tick._fields)
     return Flight(
         path=path,
         header=header,
         ticks={n: np.array(c, str if n in _TEXTS else float) for n, c in zip(Tick._fields, columns, strict=True)},
-        events=sorted((row for row in chosen if isinstance(row, Event)), key=lambda e: e.t_s),
+        events=sorted((row for row in lines if isinstance(row, Event)), key=lambda e: e.t_s),
         machine=machine,
         drive=drive % len(drives),
         drives=len(drives),
@@ -382,8 +382,8 @@ def _row(line: bytes) -> list[Any] | Event | tuple[Any, ...] | dict[str, Any] | 
             case {"kind": "event", "t_s": t_s, "event": str(text)} if is_number(t_s):
                 return Event(float(t_s), text)
             case {"kind": "machine", "t_s": t_s, "temperature_c": heat, "throttled": bits} if is_number(t_s):
-                known = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
-                return (float(t_s), heat, bits) if known else None
+                valid = (heat is None or is_number(heat)) and (bits is None or THROTTLED_VALUE.fullmatch(bits))
+                return (float(t_s), heat, bits) if valid else None
             case {"kind": "header", "schema": schema, "drive": dict()} as header if schema == SCHEMA:
                 return header
     except (ValueError, TypeError, RecursionError):

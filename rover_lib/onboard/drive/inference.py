@@ -166,8 +166,8 @@ class PolicyProcess:
 
     def __enter__(self) -> "PolicyProcess":
         try:
-            given = self._source
-            self.manifest = given.manifest if isinstance(given, Artifact) else read_manifest(given)
+            source = self._source
+            self.manifest = source.manifest if isinstance(source, Artifact) else read_manifest(source)
         except ArtifactError as error:
             raise PolicyError(error.what, found=error.found, remedy=error.remedy) from None
         self.rate_hz, self.chunk = float(self.manifest["rate_hz"]), int(self.manifest["chunk"])
@@ -209,11 +209,11 @@ class PolicyProcess:
             self._pipe.send_bytes(frame.data.cast("B"))
         except (OSError, ValueError) as error:
             raise self._ended() from error
-        answer, known = np.frombuffer(self._answer(None), np.uint8), "familiar" in self.manifest
-        if answer.size != 4 * (2 * self.chunk + known):
+        answer, tells = np.frombuffer(self._answer(None), np.uint8), "familiar" in self.manifest
+        if answer.size != 4 * (2 * self.chunk + tells):
             raise PolicyError(f"{self.artifact}: unexpected size of a plan", found=f"{answer.size} bytes")
         values = answer.view(np.float32)
-        self.strange = float(np.nan_to_num(values[-1], nan=UNTOLD, posinf=UNTOLD)) if known else None
+        self.strange = float(np.nan_to_num(values[-1], nan=UNTOLD, posinf=UNTOLD)) if tells else None
         return values[: 2 * self.chunk].reshape(self.chunk, 2)
 
     def _answer(self, timeout_s: float | None) -> bytes:
@@ -236,8 +236,8 @@ class PolicyProcess:
         assert self._process, "it was started"
         self._process.join(END_S)
         code = self._process.exitcode
-        how = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
-        return PolicyError(f"{self.artifact}: the policy's process ended ({how})", remedy="is there enough memory?")
+        cause = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
+        return PolicyError(f"{self.artifact}: the policy's process ended ({cause})", remedy="is there enough memory?")
 
 
 def serve(pipe: Connection, artifact: str, threads: int) -> None:
@@ -277,8 +277,8 @@ def _load_confined(artifact: str, threads: int) -> tuple[Any, str]:
     policy = policies["policy"]
     names = list(policy.state_names), list(policy.action_names)
     if names != (["steering", "throttle"],) * 2 or len(policy.cameras) != 1:
-        what = f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}"
-        raise PolicyError(what, remedy="this car has one camera, steering and throttle (rover run: --action-names)")
+        problem = f"{artifact}: takes {names[0]} and {len(policy.cameras)} cameras and gives {names[1]}"
+        raise PolicyError(problem, remedy="this car has one camera, steering and throttle (rover run: --action-names)")
     return policy, "".join(reasons)
 
 

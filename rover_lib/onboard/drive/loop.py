@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.servo_link import LATE_S, SEQUENCES, LinkError, ServoLink, State, Telemetry
+from rover_lib.onboard.car.protocol import SEQUENCES, State, Telemetry
+from rover_lib.onboard.car.servo_link import LATE_S, LinkError, ServoLink
 from rover_lib.onboard.drive.flight_log import ARMED, FlightLog, Tick, figures
 from rover_lib.onboard.drive.pilot import Order, Pilot
 from rover_lib.onboard.errors import DriveFault, ParamsError, RoverError, sentence_of
@@ -240,8 +241,8 @@ class _Loop:
                 self._put(link, last)
             except LinkError:  # the next tick raises what it means
                 break
-        if (left := deadline - self.clock()) > 0:
-            self.sleep(left)
+        if (rest_s := deadline - self.clock()) > 0:
+            self.sleep(rest_s)
 
     def _telemetry(self) -> Telemetry | None:
         """Return the Arduino's newest status, if it lets the host drive. Raises DriveFault, LinkError."""
@@ -262,8 +263,8 @@ class _Loop:
         if telemetry.state is not State.AUTONOMOUS:
             raise DriveFault(f"the Arduino stopped the car: {telemetry.why}")
         if (age_s := self.link.unacknowledged_s(self.clock())) > LATE_S:
-            what = f"the Arduino has not answered for {age_s * 1e3:.0f} ms, the link is behind"
-            raise DriveFault(what, remedy="what is between this machine and the Arduino?")
+            problem = f"the Arduino has not answered for {age_s * 1e3:.0f} ms, the link is behind"
+            raise DriveFault(problem, remedy="what is between this machine and the Arduino?")
         return telemetry
 
     def _check_time(self, now: float, late_s: float) -> None:
@@ -272,8 +273,10 @@ class _Loop:
             self.late.popleft()
         late_s = sum(seconds for _, seconds in self.late)
         if late_s > LATE_MOST_S:
-            what = f"the loop had no time for its ticks in {late_s * 1e3:.0f} of the last {LATE_WITHIN_S * 1e3:.0f} ms"
-            raise DriveFault(what, remedy="is this machine too busy?")
+            problem = (
+                f"the loop had no time for its ticks in {late_s * 1e3:.0f} of the last {LATE_WITHIN_S * 1e3:.0f} ms"
+            )
+            raise DriveFault(problem, remedy="is this machine too busy?")
 
     def _send(self, order: Order) -> None:
         self.last = order

@@ -42,8 +42,8 @@ class Motion:
         elif not self._off_s:
             self.still_s += passed_s
         if self.still_s >= self.stuck_s:
-            what = f"the throttle has been on for {self.still_s:.1f} s, and the picture does not move"
-            raise DriveFault(what, remedy="is the car stuck? (drive.stuck_s in params.yml)")
+            problem = f"the throttle has been on for {self.still_s:.1f} s, and the picture does not move"
+            raise DriveFault(problem, remedy="is the car stuck? (drive.stuck_s in params.yml)")
 
 
 def cells_of(image: np.ndarray) -> np.ndarray:

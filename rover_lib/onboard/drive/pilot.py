@@ -208,10 +208,10 @@ def unfamiliar(strange: float | None) -> str:
 
 def frozen(frame: Frame, settings: Settings) -> CameraError | None:
     """Return an error if the pictures have stopped changing. It matters only while the car moves."""
-    seen = frame.repeats + 1
-    if seen < settings.frozen_frames:
+    count = frame.repeats + 1
+    if count < settings.frozen_frames:
         return None
-    return CameraError(f"the camera is frozen: {seen} frames showed nothing new", remedy="plug it in again")
+    return CameraError(f"the camera is frozen: {count} frames showed nothing new", remedy="plug it in again")
 
 
 def blank(frame: Frame, settings: Settings) -> CameraError | None:

@@ -58,16 +58,16 @@ class Settings:
     stuck_s: float = 1.5
     undervoltage_s: float = 3.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         remedy = "look at the section 'drive' of params.yml"
         if broken := broken_rule(vars(self), RULES):
-            name, wanted, found = broken
-            raise ParamsError(f"drive: {name} must be {wanted}", found=found, remedy=remedy)
+            name, rule, actual = broken
+            raise ParamsError(f"drive: {name} must be {rule}", found=actual, remedy=remedy)
         if self.fade_s > self.stop_s:
             raise ParamsError("drive: fade_s must not be above stop_s", found=self.fade_s, remedy=remedy)
         if (blind_m := self.blind_s * RECORDED_MPS) > BLIND_M:
-            what = f"by one picture the car would go {blind_m:.1f} m at {RECORDED_MPS:g} m/s, and it may {BLIND_M:g}"
-            raise ParamsError(f"drive: {what}", found=(self.fade_s, self.stop_s), remedy=remedy)
+            problem = f"by one picture the car would go {blind_m:.1f} m at {RECORDED_MPS:g} m/s, and it may {BLIND_M:g}"
+            raise ParamsError(f"drive: {problem}", found=(self.fade_s, self.stop_s), remedy=remedy)
 
     @property
     def blind_s(self) -> float:
@@ -77,13 +77,13 @@ class Settings:
     @classmethod
     def of(cls, section: Mapping[str, Any], **overrides: Any) -> "Settings":
         """Make settings of a mapping such as params.yml's; overrides that are not None win. Raises ParamsError."""
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(section) - known):
-            raise ParamsError(f"drive: unknown {unknown}, known are {sorted(known)}", remedy="look at params.yml")
-        given = {**section, **{k: v for k, v in overrides.items() if v is not None}}
-        if given.get("unfamiliar") is False:  # YAML's `off`
-            given["unfamiliar"] = OFF
-        return cls(**given)
+        names = {f.name for f in fields(cls)}
+        if unknown := sorted(set(section) - names):
+            raise ParamsError(f"drive: unknown {unknown}, known are {sorted(names)}", remedy="look at params.yml")
+        values = {**section, **{k: v for k, v in overrides.items() if v is not None}}
+        if values.get("unfamiliar") is False:  # YAML's `off`
+            values["unfamiliar"] = OFF
+        return cls(**values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class Plan:
     limits: np.ndarray = field(default_factory=lambda: LIMITS)
     strange: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         actions = np.asarray(self.actions, float)
         if actions.ndim != 2 or actions.shape[1] != 2 or len(actions) == 0:
             raise PolicyError("a plan must be (chunk, 2) actions", found=actions.shape)
@@ -212,8 +212,8 @@ class Follower:
         steering, throttle = np.clip(self._wanted(plan, now_s) * [1.0, fade], *plan.limits)
         self._blended += 1
         limit = self.settings.throttle_limit  # forwards and backwards
-        kept = max(min(float(throttle), limit), -limit)
-        return Command(float(steering), kept, plan, age_s, fade, abs(float(throttle) - kept))
+        throttle_sent = max(min(float(throttle), limit), -limit)
+        return Command(float(steering), throttle_sent, plan, age_s, fade, abs(float(throttle) - throttle_sent))
 
     def _fade(self, age_s: float) -> float:
         stop_s = self.stop_s()
@@ -225,8 +225,8 @@ class Follower:
         return max(0.0, (stop_s - age_s) / (stop_s - fade_s))
 
     def _wanted(self, plan: Plan, now_s: float) -> np.ndarray:
-        left = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
-        return self._meant(plan, now_s) + self._offset * max(0.0, left)
+        weight = 1 - (self._blended + 1) / (self.settings.blend_ticks + 1)
+        return self._meant(plan, now_s) + self._offset * max(0.0, weight)
 
     def _meant(self, plan: Plan, now_s: float) -> np.ndarray:
         began_s = plan.captured_s if self.settings.compensate else plan.ready_s

@@ -35,7 +35,7 @@ from rover_lib.onboard.car.host import boottime, is_listened_at
 from rover_lib.onboard.errors import RoverError
 
 if TYPE_CHECKING:  # asking for the service's state, as every playbook does, must not import numpy or OpenCV
-    from rover_lib.onboard.car.servo_link import Telemetry
+    from rover_lib.onboard.car.protocol import Telemetry
     from rover_lib.onboard.drive.loop import Arm, Report
 
 UNIT = "rover-drive.service"
@@ -69,8 +69,8 @@ def check_age(age_s: float, most_s: float | None = None) -> None:
     """Raise RoverError for a request that is too old: whoever sent it may no longer be watching the car."""
     most_s = REQUEST_S if most_s is None else most_s
     if not 0 <= age_s <= most_s:  # also refuses NaN, and a time that has not come yet
-        what = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
-        raise RoverError(what, remedy="ask again", kind="not armed")
+        problem = f"{age_s:.1f} s have passed since the car was asked for, at most {most_s:g} may"
+        raise RoverError(problem, remedy="ask again", kind="not armed")
 
 
 class Service:
@@ -254,15 +254,15 @@ class Service:
     # ---- systemd
 
     def _feed(self) -> None:
-        seen, ended, told_s = -1, 0, 0.0
+        number, ended, told_s = -1, 0, 0.0
         while not self._done.wait(FEED_S):
             if self._report.ended and self._stop.is_set():
                 return self._stopping(self._report.ended)
             happened = self._rounds + self._report.ticks
-            ended = ended + 1 if self._report.ended and happened == seen else 0
-            if not self._rounds or (happened == seen and not 0 < ended * FEED_S < FINISH_S):
+            ended = ended + 1 if self._report.ended and happened == number else 0
+            if not self._rounds or (happened == number and not 0 < ended * FEED_S < FINISH_S):
                 continue
-            seen = happened
+            number = happened
             with contextlib.suppress(OSError):
                 self._systemd.notify()
             if self._state == DRIVING and time.monotonic() - told_s > STATUS_S and self._report.ticks:
@@ -316,8 +316,8 @@ def ask_service(**question: Any) -> dict[str, Any]:
             return json.loads(connection.recv(QUESTION_BYTES))
         except (FileNotFoundError, ConnectionRefusedError):
             state = state_of()
-            what = f"{UNIT} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
-            raise RoverError(what, remedy=f"sudo systemctl start {UNIT}") from None
+            problem = f"{UNIT} is {state['active']}, not waiting to be armed ({state['text'] or 'it says nothing'})"
+            raise RoverError(problem, remedy=f"sudo systemctl start {UNIT}") from None
         except (OSError, ValueError) as error:
             raise RoverError(f"{UNIT} gave no answer ({error})", remedy="use sudo") from None
 
@@ -332,11 +332,11 @@ def arm_car(
     """
     state = ask_service(ask="state")
     if model and state["model"] != model:
-        what = f"{UNIT} has loaded another model than {model[:12]}"
-        raise RoverError(what, found=state["model"][:12], remedy="did somebody else deploy meanwhile?")
+        problem = f"{UNIT} has loaded another model than {model[:12]}"
+        raise RoverError(problem, found=state["model"][:12], remedy="did somebody else deploy meanwhile?")
     confirm(state)
-    asked = {"model": state["model"], "ticket": state["ticket"], "asked_s": boottime()}
-    answer = ask_service(ask="arm", **asked, **vars(request))
+    question = {"model": state["model"], "ticket": state["ticket"], "asked_s": boottime()}
+    answer = ask_service(ask="arm", **question, **vars(request))
     if not answer["armed"]:
         raise RoverError(f"{UNIT} did not arm: {answer['text']}", remedy="'rover doctor' says what it needs")
     return answer["text"]

@@ -16,7 +16,8 @@ from typing import Any
 from rover_lib.onboard.car.camera import Camera
 from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.car.host import boottime
-from rover_lib.onboard.car.servo_link import ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.drive.feed import TAKEN, WAITING, Feed
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.inference import Planner
@@ -125,8 +126,8 @@ class Session:
 
     def make_recorder(self, folder: Path, room: int | None) -> AbstractContextManager[Recorder]:
         port = self.link.port if self.link else ""
-        about = About(f"driven by {self.mode}", arduino_port=port, source="rover drive", car=self.car)
-        return Recorder(folder, self.camera, about, rate_hz=self.options.hz, most_bytes=room)
+        facts = About(f"driven by {self.mode}", arduino_port=port, source="rover drive", car=self.car)
+        return Recorder(folder, self.camera, facts, rate_hz=self.options.hz, most_bytes=room)
 
     def attempt(self, arming: "Arming") -> Telemetry | None:
         return arming.arm()
@@ -151,10 +152,10 @@ class Session:
         return arm_when_ready(attempt, self.link, stop, self.log.event, checks, self.check_wanted)
 
     def _show_waiting(self, said: str) -> None:
-        asked = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
+        request = self.feed.over()  # a waiting service ignores a stop from the view: it is disarmed anyway
         self.feed.show(WAITING, said, self.report, self.camera, self.link)
-        if asked and not self.service:
-            raise RoverError(asked, kind="not armed")
+        if request and not self.service:
+            raise RoverError(request, kind="not armed")
 
     def _human_over(self) -> str | None:
         if self.service:
@@ -224,8 +225,13 @@ class Arming:
         recorder, log = self._recorder.recorder, session.log
         log.event(TAKEN_OVER)
         try:
-            given: dict[str, Any] = {"rate_hz": session.options.hz, "stop": stop, "over": over, "clock": session.clock}
-            takeover = self._recorder.human(session.link, self._armed, **given)
+            options: dict[str, Any] = {
+                "rate_hz": session.options.hz,
+                "stop": stop,
+                "over": over,
+                "clock": session.clock,
+            }
+            takeover = self._recorder.human(session.link, self._armed, **options)
             recorder.note(takeover=vars(takeover))
             log.event(str(takeover))
             recorder.close(takeover.ended if takeover.fault else None)
@@ -253,12 +259,12 @@ def arm_when_ready(
     """
     still_wanted = still_wanted or wanted_since(boottime())
     link.request()
-    told = ""
+    message = ""
     while missing := what_is_missing(link):
         still_wanted()
-        if missing != told:
+        if missing != message:
             notify(f"before the car can drive: {missing}")
-            told = missing
+            message = missing
         for check in checks:
             check()
         if stop.wait(CHECK_S):
@@ -287,7 +293,7 @@ def arm_capped(
     span_us = abs(channel.pulse_us(limit) - channel.neutral_us)
     if cap_us - channel.neutral_us < span_us:
         cap = limit * (cap_us - channel.neutral_us) / span_us
-        what = f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), this drive may ask for {limit:.2f}"
-        notify(f"{what}: what is above is cut; a reset of the Arduino raises a lowered cap")
+        problem = f"the Arduino gives at most throttle {cap:.2f} ({cap_us} us), this drive may ask for {limit:.2f}"
+        notify(f"{problem}: what is above is cut; a reset of the Arduino raises a lowered cap")
     still_wanted()
     return link.arm()

@@ -16,8 +16,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rover_lib.onboard.car.protocol import State, Telemetry
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
-from rover_lib.onboard.car.servo_link import ServoLink, State, Telemetry
+from rover_lib.onboard.car.servo_link import ServoLink
 from rover_lib.onboard.errors import RoverError
 from rover_lib.onboard.recording.episode import HUMAN, NOBODY, POLICY
 from rover_lib.onboard.recording.recorder import SILENT_S, Recorder

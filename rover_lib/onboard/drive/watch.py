@@ -16,7 +16,8 @@ from pathlib import Path
 from types import FrameType
 
 from rover_lib.onboard.car.host import UNDER_VOLTAGE, throttled_means
-from rover_lib.onboard.car.servo_link import LinkError, ServoLink, Telemetry
+from rover_lib.onboard.car.protocol import Telemetry
+from rover_lib.onboard.car.servo_link import LinkError, ServoLink
 from rover_lib.onboard.drive.flight_log import FlightLog
 from rover_lib.onboard.drive.loop import Report
 from rover_lib.onboard.errors import DriveFault
@@ -149,10 +150,10 @@ class HealthWatch:
         now = throttled_means(None if old else machine["throttled"], since_the_start=False)
         slow = "; plans take longer" if set(now or ()) - {UNDER_VOLTAGE} else ""
         self._report.machine = ", ".join(now or ()) + slow
-        said = NOT_REPORTED if now is None else self._report.machine
-        if said and said != self._said:
-            yield said
-        self._said = said
+        supply = NOT_REPORTED if now is None else self._report.machine
+        if supply and supply != self._said:
+            yield supply
+        self._said = supply
         if now is None:
             return  # unknown: neither low nor good again
         if UNDER_VOLTAGE not in now:
@@ -163,10 +164,10 @@ class HealthWatch:
             raise DriveFault(f"{UNDER_VOLTAGE} for {low_s:.0f} s", remedy="charge the battery")
 
     def _of_the_link(self, garbled: int, t: Telemetry) -> Iterator[str]:
-        counted = (self._report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
-        before, self._counted = self._counted or counted, counted
+        counts = (self._report.resent, garbled, t.bad_lines, t.old_commands, t.out_of_range, t.lost_bytes)
+        before, self._counted = self._counted or counts, counts
         # An Arduino that was reset counts from 0 again.
-        news = (now - then if now >= then else now for now, then in zip(counted, before, strict=True))
+        news = (now - then if now >= then else now for now, then in zip(counts, before, strict=True))
         again, garbled, bad, old, beyond, lost = news
         if again > OFTEN or garbled or bad or old or beyond or lost:
             yield (

@@ -105,6 +105,6 @@ def forbid_opening() -> None:
 
 
 def _lower(limit: int, value: int) -> None:
-    most = resource.getrlimit(limit)[1]
-    value = value if most == resource.RLIM_INFINITY else min(value, most)
+    maximum = resource.getrlimit(limit)[1]
+    value = value if maximum == resource.RLIM_INFINITY else min(value, maximum)
     resource.setrlimit(limit, (value, value))

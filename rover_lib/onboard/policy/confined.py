@@ -27,26 +27,23 @@ def run_confined(function: Callable[..., Any], *, timeout_s: float | None = None
     the function's RoverError as a PolicyError, and PolicyError if the process ends otherwise or after timeout_s.
     """
     command = [sys.executable, "-m", __name__, function.__module__, function.__qualname__, json.dumps(plain(arguments))]
-    what = f"the process of {function.__qualname__}"
+    problem = f"the process of {function.__qualname__}"
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, timeout=timeout_s)
     except subprocess.TimeoutExpired:
-        raise PolicyError(f"{what} took longer than {timeout_s:g} s") from None
+        raise PolicyError(f"{problem} took longer than {timeout_s:g} s") from None
     try:
         result, error = json.loads(done.stdout)
         refused = error and PolicyError(str(error["what"]), found=error["found"], remedy=str(error["remedy"]))
     except (ValueError, LookupError, TypeError):
-        raise PolicyError(f"{what} ended ({done.returncode})", remedy="is there enough memory?") from None
+        raise PolicyError(f"{problem} ended ({done.returncode})", remedy="is there enough memory?") from None
     if refused:
         raise refused
     return result
 
 
 def load_confined(
-    paths: Mapping[str, Path | str],
-    *,
-    threads: int,
-    notify: Callable[[str], object] | None = None,
+    paths: Mapping[str, Path | str], *, threads: int, notify: Callable[[str], object] | None = None
 ) -> tuple[dict[str, Policy], dict[str, Artifact]]:
     """Give up every right that no inference needs, for good, and load artifacts. Return policies and open artifacts.
 
@@ -76,8 +73,8 @@ def main(module: str, name: str, arguments: str) -> None:
     try:
         result = getattr(importlib.import_module(module), name)(**json.loads(arguments))
     except RoverError as error:
-        found = None if error.found is None else str(error.found)
-        refusal = {"what": error.what, "found": found, "remedy": error.remedy}
+        actual = None if error.found is None else str(error.found)
+        refusal = {"what": error.what, "found": actual, "remedy": error.remedy}
     with os.fdopen(answers, "w") as file:
         json.dump(plain([result, refusal]), file)
 

@@ -18,10 +18,7 @@ from rover_lib.onboard.policy.preprocess import prepare_frame
 
 # Each module has load(artifact, threads) -> Engine, which raises ArtifactError if it cannot run the open Artifact here.
 # threads: None lets the engine choose.
-MODULES = {
-    TORCH: "rover_lib.onboard.policy.torch_engine",
-    ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine",
-}
+MODULES = {TORCH: "rover_lib.onboard.policy.torch_engine", ONNXRUNTIME: "rover_lib.onboard.policy.onnx_engine"}
 
 
 class Engine(Protocol):
@@ -42,8 +39,8 @@ class Engine(Protocol):
 
 def action_limits(names: Sequence[str], car: Car) -> np.ndarray:
     """Return (2, A) float32: the least and the greatest action of the car's pulses; infinite for other actions."""
-    known = dict(zip(("steering", "throttle"), car.limits.T.tolist(), strict=True))
-    return np.array([known.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
+    limits = dict(zip(("steering", "throttle"), car.limits.T.tolist(), strict=True))
+    return np.array([limits.get(name, (-np.inf, np.inf)) for name in names], np.float32).T
 
 
 class Policy:
@@ -100,8 +97,8 @@ class Policy:
         """Run the bare graph on a state, (S,) float32, and prepared frames. Return (chunk, A) float32, not clipped."""
         y, *embeddings = self._engine.run(state, frames_rgb)
         if y.dtype != np.float32 or y.shape != (1, self.chunk, len(self.action_names)):
-            what = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
-            raise PolicyError(what, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
+            problem = f"{self.path}: the policy must give {self.chunk} times {len(self.action_names)} float32"
+            raise PolicyError(problem, found=f"{tuple(y.shape)} {y.dtype}", remedy="do not drive with it")
         shapes = [embedding.shape for embedding in embeddings]
         if shapes != ([(1, *self.familiar.mean.shape)] if self.familiar else []):
             raise PolicyError(f"{self.path}: gives another embedding than its manifest says", found=shapes)
@@ -121,11 +118,11 @@ def import_engine(artifact: Artifact) -> Any:
     try:
         return importlib.import_module(MODULES[name])
     except KeyError:
-        known = f"this rover_lib knows {', '.join(PACKAGES)}"
-        raise ArtifactError(f"{path}: needs the engine '{name[:80]}'", remedy=known) from None
+        names = f"this rover_lib knows {', '.join(PACKAGES)}"
+        raise ArtifactError(f"{path}: needs the engine '{name[:80]}'", remedy=names) from None
     except ImportError as e:
-        what = f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})"
-        raise ArtifactError(what, remedy=f"install {PACKAGES[name]}, or use an artifact of another engine") from None
+        problem = f"{path}: needs {PACKAGES[name]}, which cannot be imported here ({e})"
+        raise ArtifactError(problem, remedy=f"install {PACKAGES[name]}, or use an artifact of another engine") from None
 
 
 def load_policy(source: Path | str | Artifact, *, threads: int | None = None) -> Policy:
@@ -179,13 +176,15 @@ def _check(policy: Policy, chunks: np.ndarray, strange: list[float | None], vect
     tolerance = dict(policy.manifest["parity"]["tolerance"])
     if policy.familiar:
         shares = policy.familiar.scores(vectors["embedding"]) / policy.familiar.limits
-        if not (least := float(shares.max(0).min())) >= LEAST_SHARE:
-            what = f"{policy.path}: its limits of the unfamiliar are so wide that they would stop nothing"
-            raise ArtifactError(what, found=f"{least:.2g} of a limit in recorded pictures", remedy="quantize it again")
-        told = "how unfamiliar a picture is, of the threshold,"
-        differences[told] = np.abs(shares.max(1) - np.array(strange)).max()
-        tolerance[told] = TOLERANCE[policy.manifest["mode"] != "fp32"]
+        if not (smallest := float(shares.max(0).min())) >= LEAST_SHARE:
+            problem = f"{policy.path}: its limits of the unfamiliar are so wide that they would stop nothing"
+            raise ArtifactError(
+                problem, found=f"{smallest:.2g} of a limit in recorded pictures", remedy="quantize it again"
+            )
+        measure = "how unfamiliar a picture is, of the threshold,"
+        differences[measure] = np.abs(shares.max(1) - np.array(strange)).max()
+        tolerance[measure] = TOLERANCE[policy.manifest["mode"] != "fp32"]
     for name, d in differences.items():
         if not d <= tolerance[name]:  # so that NaN fails too
-            what = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
-            raise ArtifactError(what, remedy="do not drive with it")
+            problem = f"{policy.path}: computes something else here than where it was made: {name} differs by {d:.3g}"
+            raise ArtifactError(problem, remedy="do not drive with it")

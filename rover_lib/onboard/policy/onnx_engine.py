@@ -53,7 +53,7 @@ def load(artifact: Artifact, threads: int | None) -> OnnxEngine:
     """Load an artifact. Raises ArtifactError if ONNX Runtime refuses it, or its inputs are not the manifest's."""
     path, manifest = artifact.path, artifact.manifest
     engine = OnnxEngine(path, artifact.record(ONNX), threads or usable_cores())
-    wanted = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
-    if engine.names != wanted:
-        raise refused(path, f"its model takes {engine.names}, its manifest says {wanted}"[:300])
+    names = ["state", *(f"frame_{c['name']}" for c in manifest["cameras"])]
+    if engine.names != names:
+        raise refused(path, f"its model takes {engine.names}, its manifest says {names}"[:300])
     return engine

@@ -17,13 +17,13 @@ def prepare_frame(frame_bgr: np.ndarray, height: int, width: int) -> np.ndarray:
     normalised: the artifact's graph does that. Raises PolicyError for anything that is not such a picture.
     """
     if not isinstance(frame_bgr, np.ndarray) or frame_bgr.ndim != 3 or frame_bgr.shape[2] != 3:
-        found = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
-        raise PolicyError("a frame must be (height, width, 3) BGR", found=found, remedy="does the camera give colour?")
+        actual = getattr(frame_bgr, "shape", type(frame_bgr).__name__)
+        raise PolicyError("a frame must be (height, width, 3) BGR", found=actual, remedy="does the camera give colour?")
     h, w = frame_bgr.shape[:2]
     if frame_bgr.dtype != np.uint8 or h == 0 or w == 0:
-        found = f"{w}x{h} of {frame_bgr.dtype}"
-        raise PolicyError("a frame must be pixels of uint8", found=found, remedy="pass the picture as OpenCV reads it")
+        actual = f"{w}x{h} of {frame_bgr.dtype}"
+        raise PolicyError("a frame must be pixels of uint8", found=actual, remedy="pass the picture as OpenCV reads it")
     if (h, w) != (height, width):
-        how = cv2.INTER_AREA if height < h or width < w else cv2.INTER_LINEAR
-        frame_bgr = cv2.resize(frame_bgr, (width, height), interpolation=how)
+        interpolation = cv2.INTER_AREA if height < h or width < w else cv2.INTER_LINEAR
+        frame_bgr = cv2.resize(frame_bgr, (width, height), interpolation=interpolation)
     return cv2.cvtColor(frame_bgr, cv2.COLOR_BGR2RGB)

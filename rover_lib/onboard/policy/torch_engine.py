@@ -30,7 +30,7 @@ class TorchEngine:
         # TorchScript re-optimises in its second call (0.37 G instructions on a Cortex-A76); the switch is thread-local.
         with torch.inference_mode(), torch.jit.optimized_execution(False):
             y = self._module(torch.from_numpy(state)[None], *(torch.from_numpy(f) for f in frames_rgb))
-        return [each.numpy() for each in (y if isinstance(y, tuple) else (y,))]
+        return [output.numpy() for output in (y if isinstance(y, tuple) else (y,))]
 
     def give_back(self) -> bool:
         return give_back_packed_weights(self._module) > 0
@@ -63,14 +63,14 @@ def give_back_packed_weights(module: torch.jit.ScriptModule) -> int:
     module: frozen, and has run once, so that its weights are packed. It cannot be saved afterwards, and the caller must
     check that it still predicts the same.
     """
-    libc, given = ctypes.CDLL(None), 0
+    libc, total = ctypes.CDLL(None), 0
     for weight in _originals(module.graph):
         start, size = weight.untyped_storage().data_ptr(), weight.untyped_storage().nbytes()
         first = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE  # only whole pages, because others may share the rest
         length = (start + size) // mmap.PAGESIZE * mmap.PAGESIZE - first
         if length > 0 and libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), DONT_NEED) == 0:
-            given += length
-    return given
+            total += length
+    return total
 
 
 def _originals(block: Any) -> Iterator[torch.Tensor]:

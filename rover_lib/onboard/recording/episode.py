@@ -134,15 +134,15 @@ class EpisodeWriter:
                 part.mkdir()
                 self._lock = lock_folder(part)
         if self._lock is None:
-            what = f"{self.folder}: is being recorded, or was when its program was killed"
+            problem = f"{self.folder}: is being recorded, or was when its program was killed"
             remedy = f"name another folder; {_finish_by(self.folder.parent)}"
-            raise EpisodeError(what, remedy=remedy, kind="exists")
+            raise EpisodeError(problem, remedy=remedy, kind="exists")
         self._part = part
         try:
             with self._disk():
                 (part / "frames").mkdir()
-                told = {"about": vars(replace(self.about, car=None)), "metadata": self.metadata, "flags": self.flags}
-                (part / ABOUT).write_text(json.dumps(told))
+                head = {"about": vars(replace(self.about, car=None)), "metadata": self.metadata, "flags": self.flags}
+                (part / ABOUT).write_text(json.dumps(head))
                 for kind in KINDS:
                     self._rows[kind] = (part / f"{kind}.rows").open("ab", buffering=0)
             self._syncing.start()
@@ -173,8 +173,8 @@ class EpisodeWriter:
             action = None
             if not (self.flags and (pulse_us is None or period_us is None)):
                 if not is_whole(pulse_us, 0) or not is_whole(period_us, 0):
-                    what = f"{self.folder.name}: pulse and period of {name} must be whole numbers from 0"
-                    raise EpisodeError(what, found=f"{pulse_us!r} and {period_us!r}")
+                    problem = f"{self.folder.name}: pulse and period of {name} must be whole numbers from 0"
+                    raise EpisodeError(problem, found=f"{pulse_us!r} and {period_us!r}")
                 action = self.pwm.channel(name).action(pulse_us, period_us)
             if action is not None or not self.flags:
                 row[f"{name}_normalized"] = round(action or 0.0, 4) + 0.0  # + 0.0: no "-0.0" in the file
@@ -194,9 +194,9 @@ class EpisodeWriter:
             self.resolution = frame_bgr.shape[1], frame_bgr.shape[0]
         shape = (self.resolution[1], self.resolution[0], 3) if self.resolution else ("height", "width", 3)
         if not isinstance(frame_bgr, np.ndarray) or frame_bgr.shape != shape or frame_bgr.dtype != np.uint8:
-            found = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
-            what = f"{self.folder.name}: frames must be uint8 {shape}"
-            raise EpisodeError(what, found=found, remedy="check the camera")
+            actual = f"{getattr(frame_bgr, 'dtype', type(frame_bgr).__name__)} {getattr(frame_bgr, 'shape', '')}"
+            problem = f"{self.folder.name}: frames must be uint8 {shape}"
+            raise EpisodeError(problem, found=actual, remedy="check the camera")
         number = self.frames + 1
         relative = f"frames/frame_{number:06d}.jpg"
         _, jpeg = cv2.imencode(".jpg", frame_bgr, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
@@ -246,7 +246,7 @@ class EpisodeWriter:
     def _take(self, part: Path, lock: int) -> None:
         """Go on with what an ended process has left in a hidden folder."""
         self._part, self._lock = part, lock
-        known = {*CONTROL_FIELDS, *FLAG_FIELDS}
+        names = {*CONTROL_FIELDS, *FLAG_FIELDS}
         for kind, time in KINDS.items():
             for row in _rows(part, kind):
                 if row and kind == "frame":
@@ -259,7 +259,7 @@ class EpisodeWriter:
                     continue
                 self.controls += kind == "control"
                 self.frames += kind == "frame"
-                self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in known)
+                self._extra |= dict.fromkeys(name for name in row if kind == "control" and name not in names)
                 self._first_s, self._last_s = min(self._first_s, row[time]), max(self._last_s, row[time])
                 if kind == "frame" and self.resolution is None:
                     image = cv2.imread(str(part / row["image_path"]))
@@ -276,8 +276,8 @@ class EpisodeWriter:
             if self._unsynced:
                 raise self._unsynced
             file = self._rows[kind]
-            if (written := file.write(line)) < len(line):
-                file.truncate(file.tell() - written)  # half a row would spoil the next one
+            if (count := file.write(line)) < len(line):
+                file.truncate(file.tell() - count)  # half a row would spoil the next one
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._first_s, self._last_s = min(self._first_s, t_s), max(self._last_s, t_s)
 
@@ -309,24 +309,24 @@ class EpisodeWriter:
     def _write(self, part: Path) -> None:
         """Write the three files in the hidden folder."""
         if not self.controls or not self.frames:
-            found = f"{self.controls} controls and {self.frames} frames"
+            content = f"{self.controls} controls and {self.frames} frames"
             remedy = f"check that the camera and the Arduino deliver; {part.name} has what there is"
-            raise EpisodeError(f"{self.folder.name}: too little for an episode", found=found, remedy=remedy)
-        about = self.about
-        start_s = self._first_s if about.start_time_s is None else about.start_time_s
-        end_s = self._last_s if about.end_time_s is None else about.end_time_s
+            raise EpisodeError(f"{self.folder.name}: too little for an episode", found=content, remedy=remedy)
+        note = self.about
+        start_s = self._first_s if note.start_time_s is None else note.start_time_s
+        end_s = self._last_s if note.end_time_s is None else note.end_time_s
         duration_s = end_s - start_s
         rates = [count / duration_s if duration_s > 0 else 0 for count in (self.controls, self.frames)]
         head = {
             "episode_id": self.folder.name,
-            "action_label": about.label,
+            "action_label": note.label,
             "start_time": start_s,
             "end_time": end_s,
             "duration": duration_s,
             "metadata": {
-                "camera_fps": about.fps,
+                "camera_fps": note.fps,
                 "camera_resolution": list(self.resolution or ()),
-                "arduino_port": about.arduino_port,
+                "arduino_port": note.arduino_port,
                 "total_control_samples": self.controls,
                 "total_frames": self.frames,
                 "avg_control_rate": rates[0],
@@ -360,12 +360,12 @@ def _finish_by(folder: Path) -> str:
 
 def find_killed(folder: Path) -> list[Path]:
     """Return the hidden folders of recordings whose program was killed, in a folder of episodes."""
-    found = []
+    folders = []
     for part in sorted(folder.glob(f".*{PART}")):
         if (lock := lock_folder(part)) is not None:
             os.close(lock)
-            found.append(part)
-    return found
+            folders.append(part)
+    return folders
 
 
 def remove_if_empty(part: Path) -> bool:
@@ -387,12 +387,12 @@ def finish_killed(part: Path) -> Path | None:
     if remove_if_empty(part):
         return None
     if (lock := lock_folder(part)) is None:
-        what = f"{folder}: is being recorded, or finished by another process"
-        raise EpisodeError(what, remedy="wait until it is", kind="exists")
+        problem = f"{folder}: is being recorded, or finished by another process"
+        raise EpisodeError(problem, remedy="wait until it is", kind="exists")
     try:
-        told = json.loads(_data_of(part / ABOUT))
-        writer = EpisodeWriter(folder, About(**told["about"]), resolution=None, flags=told["flags"])
-        writer.metadata = dict(told["metadata"])
+        head = json.loads(_data_of(part / ABOUT))
+        writer = EpisodeWriter(folder, About(**head["about"]), resolution=None, flags=head["flags"])
+        writer.metadata = dict(head["metadata"])
     except (ValueError, TypeError, KeyError):
         writer = EpisodeWriter(folder, About(), resolution=None, flags=True)
     writer._take(part, lock)
@@ -419,12 +419,12 @@ def number_of(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     try:
-        found = float(value)
+        number = float(value)
     except OverflowError:
         return math.nan
     except ValueError:
         return None
-    return found if abs(found) < LARGEST else math.nan
+    return number if abs(number) < LARGEST else math.nan
 
 
 def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
@@ -436,10 +436,10 @@ def no_pulse(row: Mapping[str, Any], channel: str) -> bool:
 
 def driver_of(row: Mapping[str, Any]) -> str | None:
     """Return who drove, one of DRIVERS; by default a policy if it names a mode, else a human. None: unknown."""
-    said = row.get("driver")
-    if said is None or said == "":
+    driver = row.get("driver")
+    if driver is None or driver == "":
         return POLICY if row.get("mode") else HUMAN
-    return said if said in DRIVERS else None
+    return driver if driver in DRIVERS else None
 
 
 def arduino_step_s(before_s: float, after_s: float) -> float:
@@ -469,8 +469,8 @@ def car_in(metadata: Any, folder: Path | str) -> Car:
     """Return the car that an episode's metadata describe, or the default. Raises CarError for no car."""
     described = metadata.get("car") if isinstance(metadata, dict) else None
     if described is None:  # the balloon world once noted a mirrored car by its side alone
-        left = isinstance(metadata, dict) and metadata.get("steering_positive") == "left"
-        return Car(positive="left") if left else Car()
+        to_left = isinstance(metadata, dict) and metadata.get("steering_positive") == "left"
+        return Car(positive="left") if to_left else Car()
     return Car.of(described, f"{folder}: its car")
 
 

@@ -128,12 +128,12 @@ class Recorder:
     def _check_room(self) -> None:
         folder, rows = self.folder.parent, ROW_BYTES * (self._writer.controls + self._writer.frames)
         if self._most_bytes is not None and self._most_bytes - rows - self._writer.picture_bytes < LEAST_BYTES:
-            what = f"{folder}: no room is left of what episodes may take here"
-            raise EpisodeError(what, remedy="fetch them by `rover playbook drive`, or delete some")
+            problem = f"{folder}: no room is left of what episodes may take here"
+            raise EpisodeError(problem, remedy="fetch them by `rover playbook drive`, or delete some")
         disk = os.statvfs(folder)
         if (free := disk.f_bavail * disk.f_frsize) < (needed := SPARE_BYTES + rows):
-            found = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} are kept in reserve"
-            raise EpisodeError(f"{folder}: the disk is almost full", found=found, remedy="make room, or use another")
+            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} are kept in reserve"
+            raise EpisodeError(f"{folder}: the disk is almost full", found=room, remedy="make room, or use another")
 
     def _run(self) -> None:
         try:
@@ -153,10 +153,10 @@ class Recorder:
 
     def _collect(self) -> None:
         newest = self._camera.latest()
-        seen = newest.number if newest else 0  # that frame came before the episode began
+        number = newest.number if newest else 0  # that frame came before the episode began
         last_s, captured_s = self._clock(), -1e9
         while True:
-            frame = self._camera.wait(seen, 0.1)
+            frame = self._camera.wait(number, 0.1)
             closing = self._closing.is_set()  # read before the queue is emptied, so that nothing is lost
             for _ in range(len(self._queue)):
                 host_s, reading, extra = self._queue.popleft()
@@ -166,10 +166,10 @@ class Recorder:
             now = self._clock()
             if frame is None:
                 if now - last_s > SILENT_S:
-                    what = f"{self._camera.source}: no frame for {SILENT_S:g} s"
-                    raise EpisodeError(what, remedy="is the camera plugged in?")
+                    problem = f"{self._camera.source}: no frame for {SILENT_S:g} s"
+                    raise EpisodeError(problem, remedy="is the camera plugged in?")
                 continue
-            seen, last_s = frame.number, now
+            number, last_s = frame.number, now
             if frame.captured_s - captured_s < self._frame_s:
                 continue
             captured_s = frame.captured_s
@@ -183,10 +183,10 @@ def room_for(folder: Path | str, most_mb: float) -> int:
     At most half of the free disk: an episode is packed on it to be fetched, and a new model needs room as well.
     """
     folder = Path(folder)
-    taken = sum(path.lstat().st_size for path in folder.rglob("*"))
+    size = sum(path.lstat().st_size for path in folder.rglob("*"))
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     disk = os.statvfs(there)
-    return int(min(most_mb * 1e6 - taken, disk.f_bavail * disk.f_frsize / 2))
+    return int(min(most_mb * 1e6 - size, disk.f_bavail * disk.f_frsize / 2))
 
 
 def _new_episode(folder: Path, start_s: float, about: About) -> EpisodeWriter:
@@ -222,8 +222,8 @@ class RecordReport:
     fault: str | None
 
     def __str__(self) -> str:
-        where = self.folder or "nothing"
-        text = f"recorded: {where} ({self.controls} controls and {self.frames} frames in {self.seconds:.1f} s)"
+        place = self.folder or "nothing"
+        text = f"recorded: {place} ({self.controls} controls and {self.frames} frames in {self.seconds:.1f} s)"
         for channel, lost in zip(("steering", "throttle"), self.not_measured, strict=True):
             if lost > self.controls / 10:
                 text += f"; {channel} was not measured in {lost} of them: is the transmitter on?"
@@ -249,8 +249,8 @@ def record(
     stop = stop or threading.Event()
     lost = 0, 0
     with contextlib.ExitStack() as stack:
-        about = About(label, arduino_port=link.port, source="human", car=link.car)
-        recorder = stack.enter_context(Recorder(folder, camera, about, rate_hz=rate_hz, clock=clock))
+        description = About(label, arduino_port=link.port, source="human", car=link.car)
+        recorder = stack.enter_context(Recorder(folder, camera, description, rate_hz=rate_hz, clock=clock))
         start = heard_s = recorder.start_s  # earlier statuses do not belong to this episode
 
         def words() -> str:
@@ -267,8 +267,8 @@ def record(
             try:
                 telemetry = link.latest()
                 if now - heard_s > SILENT_S:
-                    what = f"{link.port}: no status for {SILENT_S:g} s"
-                    raise EpisodeError(what, remedy="is the Arduino plugged in?")
+                    problem = f"{link.port}: no status for {SILENT_S:g} s"
+                    raise EpisodeError(problem, remedy="is the Arduino plugged in?")
             except RoverError as error:
                 recorder.close(str(error))
                 break

@@ -80,7 +80,7 @@ class CarShape:
             side = self.width_m / 2
             feet = [(x - s * math.sin(heading), y + s * math.cos(heading)) for s in (side, -side)]
             if min(ahead for ahead, _ in feet) > NEAR_M:
-                (a, b), (c, d) = (self._seen(ahead, left, aspect) for ahead, left in feet)
+                (a, b), (c, d) = (self._seen(ahead, rest, aspect) for ahead, rest in feet)
                 ribbon.append((a, b, c, d))
         return ribbon
 

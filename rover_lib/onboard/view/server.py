@@ -69,8 +69,8 @@ class Address:
             wire.listen(64)
         except OSError as error:
             wire.close()
-            what = f"no page can be served at port {self.port} {self.interface} ({error.strerror})"
-            raise RoverError(what, remedy="another --web-port, or an --interface of `ip -brief address`") from None
+            problem = f"no page can be served at port {self.port} {self.interface} ({error.strerror})"
+            raise RoverError(problem, remedy="another --web-port, or an --interface of `ip -brief address`") from None
         return wire
 
 
@@ -192,12 +192,12 @@ class View:
         if self._ask:
             self._ask("stop")
             return 1
-        asked = 0
+        count = 0
         for drive in tuple(self._drives):
             with contextlib.suppress(OSError):  # this drive no longer reads
                 drive.send(f"stop {who}".encode())
-                asked += 1
-        return asked
+                count += 1
+        return count
 
     # ---- drives
 
@@ -244,10 +244,10 @@ class View:
                     if drive is self._drives[-1]:
                         self.show(head, picture)
         finally:
-            shown = drive is self._drives[-1]
+            current = drive is self._drives[-1]
             self._drives.remove(drive)
             drive.close()
-            if shown and phase != "ended":
+            if current and phase != "ended":
                 text = "the drive has gone without a word; what the car does is not known"
                 gone = {"phase": GONE, "text": text, "tick": None, "pins": None, "who": ""}
                 self.show({**self._head, **gone}, self._picture)
@@ -301,10 +301,10 @@ class View:
                 if message.data == "stop":
                     count = self.stop(request.remote or "0.0.0.0")
                     await wire.send_str("asked for a stop" if count else "no drive is there to be stopped")
-                elif shown := SHOWN.fullmatch(message.data):
-                    page.was_shown(int(shown[1]))
-                elif self._ask and (asked := ASKED.fullmatch(message.data)):
-                    self._ask(asked[1])
+                elif match := SHOWN.fullmatch(message.data):
+                    page.was_shown(int(match[1]))
+                elif self._ask and (question := ASKED.fullmatch(message.data)):
+                    self._ask(question[1])
         finally:
             await _end(sending)
         return wire

@@ -18,8 +18,8 @@ from rover_lib.onboard.car.picture import is_squeezed
 from rover_lib.onboard.checked import broken_rule, is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.stage import sha256_of
-from rover_lib.workshop.act import ACT, ACTIVATIONS, BACKBONES, ActConfig, Affine, inputs_of, predictions
-from rover_lib.workshop.act_config import imagenet, lerobot_act
+from rover_lib.workshop.act import ACT, inputs_of, predictions
+from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine, imagenet, lerobot_act
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, Facts
 from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoint_error, save_torch
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
@@ -218,9 +218,7 @@ class Checkpoint:
         if sizes == c.image_sizes:
             return self
         config = replace(c, image_sizes=sizes)
-        own, other = (
-            planned_error(replace(self, config=candidate), tried) if tried else 1.0 for candidate in (c, config)
-        )
+        own, other = (planned_error(replace(self, config=option), tried) if tried else 1.0 for option in (c, config))
         # Nobody squeezes a copy, so then the recordings' size is likelier.
         best = config if other <= BETTER * own or (squeezed and BETTER * other < own) else c
         errors = f"they are {own:.3g} and {other:.3g} off"

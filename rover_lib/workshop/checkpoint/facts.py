@@ -91,7 +91,9 @@ class Facts:
         for key in starmap(_Key, _flatten(content, where)):
             if key.name in self.ignored or (not key.harmless and self._read_key(key)):
                 continue
-            why = "" if key.harmless else key.changes() or (key.unclear(self.value("chunk")) if noted else "")
+            why = "" if key.harmless else key.changes()
+            if noted and not (why or key.harmless):
+                why = key.unclear(self.value("chunk"))
             if why:
                 refused[key] = why
             elif noted:
@@ -99,7 +101,7 @@ class Facts:
         if refused:
             key, why = next(iter(refused.items()))
             value = f"{len(key.value)} values" if key.of_network or isinstance(key.value, Mapping) else key.value
-            raise self.refusal(key.name, value, why, ",".join(key_refused.name for key_refused in refused))
+            raise self.refusal(key.name, value, why, ",".join(other.name for other in refused))
 
     def refusal(self, key: str, value: Any, why: str, ignored: str = "") -> CheckpointError:
         """Return the error of a key that cannot be used, for the caller to raise. ignored: all such keys."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from rover_lib.onboard.errors import CheckpointError, printable
 from rover_lib.onboard.kinds import refuse_pointer
 from rover_lib.onboard.stage import atomic_path, read_plain
-from rover_lib.workshop.act import ActConfig
+from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.facts import Facts
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 

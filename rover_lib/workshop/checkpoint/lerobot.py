@@ -18,19 +18,9 @@ from torch import Tensor
 
 from rover_lib.onboard.checked import is_whole
 from rover_lib.onboard.errors import CheckpointError, printable
-from rover_lib.workshop.act import ActConfig, Affine
-from rover_lib.workshop.act_config import LEROBOTS, lerobot_act
+from rover_lib.workshop.act_config import LEROBOTS, ActConfig, Affine, lerobot_act
+from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import GUESS, USER, WORDS, Facts
-from rover_lib.workshop.checkpoint.files import (
-    CORRECT_IT,
-    JSON_BYTES,
-    MOST,
-    RATE_HZ,
-    Contents,
-    as_checkpoint_error,
-    check_beside,
-    name_numbers,
-)
 from rover_lib.workshop.checkpoint.weights import Weights, check_weights_are_whole, name_weights
 from rover_lib.workshop.recordings.names import CAMERA, camera_names
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
@@ -73,17 +63,14 @@ def lerobot_folder(path: Path) -> Path:
     raise CheckpointError(problem, found=quote_all(actual) or "none", remedy=remedy)
 
 
-def read_lerobot(folder: Path, facts: Facts) -> Contents:
+def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
     """facts: what its files say is added. Raises CheckpointError for missing, damaged or other policies' files."""
     if (folder / ADAPTER).exists():
         problem = f"{folder}: {ADAPTER} is beside the weights, so that an adapter changes what they compute"
         raise CheckpointError(problem, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     settings = _act_config(folder, raw, facts)
-    tensors, inside = (
-        name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored),
-        dict[str, Tensor](),
-    )
+    tensors, inside = (name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored), dict[str, Tensor]())
     # Statistics of before LeRobot had processors.
     for key in () if (folder / OUTER[0]).exists() else (*settings.input_features, *settings.output_features):
         for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
@@ -94,16 +81,14 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
     images = settings.image_features
     numbers = settings.robot_state_feature
     actions = settings.action_feature
-    with as_checkpoint_error(folder):
+    with files.as_checkpoint_error(folder):
         sizes = _trained_sizes(folder, raw, tuple((f.shape[1], f.shape[2]) for f in images.values()), facts)
         by = ORIGIN if origin else GUESS
         if origin:
-            facts.say("rate", float(origin.get("rate_hz", RATE_HZ)), ORIGIN)
+            facts.say("rate", float(origin.get("rate_hz", files.RATE_HZ)), ORIGIN)
         in_both = any(name.startswith("action.") for name in inner.step.state_dict())  # as in training
         steps = {INNER[0]: inner, OUTER[0]: outer} if in_both else {}
-        norms = {
-            file: steps_of.affine("action", "ACTION", actions.shape, inverse=True) for file, steps_of in steps.items()
-        }
+        norms = {file: step.affine("action", "ACTION", actions.shape, inverse=True) for file, step in steps.items()}
         facts.compare("normalisation of actions", {file: norm and astuple(norm) for file, norm in norms.items()})
         if (spread := outer.step.state_dict().get("action.std")) is not None:
             facts.say("action std", spread.flatten().tolist(), OUTER[0])
@@ -111,13 +96,13 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
         config = ActConfig(
             cameras=tuple(camera_names(images)),
             image_sizes=sizes,
-            state_names=name_numbers(numbers.shape[0] if numbers else 2, "state"),
-            action_names=facts.default("actions", name_numbers(actions.shape[0], "action"), by),
+            state_names=files.name_numbers(numbers.shape[0] if numbers else 2, "state"),
+            action_names=facts.default("actions", files.name_numbers(actions.shape[0], "action"), by),
             chunk=facts.default("chunk", settings.chunk_size, CONFIG),
             vae_layers=settings.n_vae_encoder_layers if settings.use_vae else 0,
             backbone=facts.default("backbone", settings.vision_backbone, CONFIG),
             dilation=bool(settings.replace_final_stride_with_dilation),
-            rate_hz=facts.default("rate", RATE_HZ, by),
+            rate_hz=facts.default("rate", files.RATE_HZ, by),
             image_norm=pictures,
             state_norm=inner.affine("observation.state", "STATE", numbers.shape) if numbers else None,
             sees_state=numbers is not None,
@@ -127,7 +112,7 @@ def read_lerobot(folder: Path, facts: Facts) -> Contents:
         if config.state_norm is not None:
             config, weights = _without_constants(config, weights, inner, facts)
         _compare_statistics(config, inner, outer, facts)
-    check_beside(folder, facts)
+    files.check_beside(folder, facts)
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
     return config, weights, report | {"license": settings.license, "base_model": settings.repo_id}  # on the Hub
 
@@ -181,11 +166,13 @@ def _of_today(folder: Path, raw: dict[str, Any]) -> dict[str, Any]:
         return raw
     raw = raw | {"type": "act"}
     mapping = dict[str, str]()
-    with as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
+    with files.as_checkpoint_error(folder / CONFIG, "train with one way of normalisation for each kind of feature"):
         for part in ("input", "output"):
             shapes = raw.pop(f"{part}_shapes")
             modes = raw.pop(f"{part}_normalization_modes", {})
-            kinds = {k: "ACTION" if k == "action" else "VISUAL" if "image" in k else "STATE" for k in shapes}
+            kinds = {k: "VISUAL" if "image" in k else "STATE" for k in shapes}
+            if "action" in shapes:
+                kinds["action"] = "ACTION"
             raw[f"{part}_features"] = {k: {"type": kinds[k], "shape": shape} for k, shape in shapes.items()}
             for key, kind in kinds.items():
                 mode = modes.get(key, "identity").upper()
@@ -211,7 +198,7 @@ def _trained_sizes(folder: Path, raw: Mapping[str, Any], sizes: Sizes, facts: Fa
     steps = [t for t in (transforms.get("tfs") or {}).values() if t.get("weight", 1) > 0]
     for step in (t for t in steps if t["type"] not in WORDS["random"] and transforms.get("enable")):
         to = step["kwargs"].get("size")
-        whole = all(is_whole(n, 1, MOST) for n in (to if isinstance(to, list) else [to]))
+        whole = all(is_whole(n, 1, files.MOST) for n in (to if isinstance(to, list) else [to]))
         if step["type"] != "Resize" or not whole or len(steps) > transforms.get("max_num_transforms", 3):
             problem = f"{path}: some or all of its pictures were changed by {quote(step['type'])}"
             raise CheckpointError(problem, remedy=f"train without it, or if it is another training's, remove {TRAINED}")
@@ -228,7 +215,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
     if raw.get("type") != "act":
         problem = f"{path}: policy type is {quote(raw.get('type'))}"
         raise CheckpointError(problem, remedy='only \'act\' is known: if it is one, write "type": "act" into it')
-    with as_checkpoint_error(path, CORRECT_IT):
+    with files.as_checkpoint_error(path, files.CORRECT_IT):
         import draccus  # LeRobot's reader of configs
         from lerobot.policies.act.configuration_act import ACTConfig
 
@@ -237,7 +224,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
         decoded = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in options} | {"device": "cpu"})
         cameras = [tuple(camera.shape) for camera in decoded.image_features.values()]
         rows = [tuple(row.shape) for row in (decoded.robot_state_feature, decoded.action_feature) if row]
-        whole = all(is_whole(n, 1, MOST) for shape in (*cameras, *rows) for n in shape)
+        whole = all(is_whole(n, 1, files.MOST) for shape in (*cameras, *rows) for n in shape)
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
     if not (cameras and decoded.action_feature and whole and right) or decoded.env_state_feature:
         features = {**decoded.input_features, **decoded.output_features}
@@ -248,7 +235,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
         coefficient = f"temporal_ensemble_coeff is {decoded.temporal_ensemble_coeff}"
         facts.notes.append(f"{coefficient}: LeRobot would average plans; here the car drives by the newest alone")
     facts.default("size", cameras[0][1:], SIZE_OF_BASE)
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         facts.read({k: v for k, v in raw.items() if k not in {*options, "type", "pretrained_revision"}}, "")
     return decoded
 
@@ -273,7 +260,7 @@ class Normaliser:
             return
         content = _read_json(self.where)
         read = []
-        with as_checkpoint_error(self.where):
+        with files.as_checkpoint_error(self.where):
             for step in content["steps"]:
                 name = step.get("registry_name") or step["class"]
                 config = step.get("config") or {}
@@ -304,15 +291,13 @@ class Normaliser:
         """
         if norm is None:
             return {}
-        indices = [
-            i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1
-        ]
+        fixed = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
         mode = self.step.norm_map[self.step.features[key].type].value
-        varied = [i for i in indices if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]
+        varied = [i for i in fixed if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]
         if varied and mode.startswith("QUANTILE"):
             problem = f"{self.where}: most values of '{key}' were equal: {mode} gives no range for the others"
             raise CheckpointError(problem, found=f"scale {norm.scale[varied[0]]:.3g}", remedy="train with MEAN_STD")
-        return dict.fromkeys(indices, 0.0 if mode == "MEAN_STD" else -1.0)
+        return dict.fromkeys(fixed, 0.0 if mode == "MEAN_STD" else -1.0)
 
     def affine(self, key: str, kind: str, shape: tuple[int, ...], inverse: bool = False) -> Affine | None:
         """Return what LeRobot's step computes as scale and shift; None if it leaves the feature as it is.
@@ -351,15 +336,15 @@ class Normaliser:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    with as_checkpoint_error(path):
-        return dict(read_json(path, JSON_BYTES))
+    with files.as_checkpoint_error(path):
+        return dict(read_json(path, files.JSON_BYTES))
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         problem = f"{printable(str(path))}: not found, or not a file"
         raise CheckpointError(problem, remedy="merge an adapter or pieces where it was trained, and save_pretrained")
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         return load_file(path)
 
 

@@ -16,21 +16,9 @@ from rover_lib.onboard.checked import is_number, is_whole
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.onboard.kinds import read_head, refuse_pointer
 from rover_lib.onboard.stage import plain, read_plain
-from rover_lib.workshop.act import ActConfig
-from rover_lib.workshop.act_config import imagenet
+from rover_lib.workshop.act_config import ActConfig, imagenet
+from rover_lib.workshop.checkpoint import files
 from rover_lib.workshop.checkpoint.facts import Facts
-from rover_lib.workshop.checkpoint.files import (
-    BESIDE,
-    COPY_AGAIN,
-    CORRECT_IT,
-    JSON_BYTES,
-    MOST,
-    RATE_HZ,
-    Contents,
-    as_checkpoint_error,
-    check_beside,
-    name_numbers,
-)
 from rover_lib.workshop.checkpoint.weights import (
     IS_IT_WHOLE,
     Weights,
@@ -45,7 +33,7 @@ KNOWN = {"epoch", "model_state_dict", "optimizer_state_dict", "scheduler_state_d
 OF_POLICY = {"image_height", "image_width", "rate_hz"}  # of them, what no other file may contradict
 
 
-def read_trainer(path: Path, facts: Facts) -> Contents:
+def read_trainer(path: Path, facts: Facts) -> files.Contents:
     """facts: what its keys and the files beside it say is added.
 
     Raises CheckpointError for a file that is damaged, would run code, or lacks something.
@@ -59,15 +47,15 @@ def read_trainer(path: Path, facts: Facts) -> Contents:
     raw = {k: v.item() if isinstance(v, np.generic) else v for k, v in content["config"].items()}
     weights = check_weights_are_whole(path, name_weights(path, content["model_state_dict"], facts.ignored))
     loss = content.get("best_val_loss")  # NaN if the training had diverged
-    with as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
+    with files.as_checkpoint_error(path, "save best_val_loss as a number, or leave it out"):
         loss = None if loss is None else float(loss)
     facts.default("size", (raw.get("image_height"), raw.get("image_width")), "config.image_height")
     facts.default("chunk", raw.get("chunk_size"), "config.chunk_size")
-    with as_checkpoint_error(path):
+    with files.as_checkpoint_error(path):
         facts.read({k: v for k, v in content.items() if k not in KNOWN}, "")
         facts.read({k: v for k, v in raw.items() if k not in KNOWN_CONFIG - OF_POLICY}, "config.")
-        for file in check_beside(path.parent, facts):
-            settings = yaml.safe_load(read_plain(file, JSON_BYTES)) if BESIDE.fullmatch(file.name) else None
+        for file in files.check_beside(path.parent, facts):
+            settings = yaml.safe_load(read_plain(file, files.JSON_BYTES)) if files.BESIDE.fullmatch(file.name) else None
             if isinstance(settings, dict) and "input_features" not in settings:  # that is LeRobot's, of another format
                 facts.read({k: v for k, v in settings.items() if k not in KNOWN_CONFIG - OF_POLICY}, f"{file.name}:")
     extra = {
@@ -86,12 +74,12 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
     def whole(key: str, default: int | None = None) -> int:
         if not is_whole(value := raw.get(key, default), 1, 1_000_000):
             problem = f"{path}: config '{key}' must be a whole number from 1 to a million"
-            raise CheckpointError(problem, found=quote(value), remedy=CORRECT_IT)
+            raise CheckpointError(problem, found=quote(value), remedy=files.CORRECT_IT)
         return value
 
     def last(name: str) -> int:
         shape = tuple(weights[name].shape) if name in weights else ()
-        if not shape or not 1 <= shape[-1] <= MOST:
+        if not shape or not 1 <= shape[-1] <= files.MOST:
             raise CheckpointError(f"{path}: no weight '{name}' of a known shape", found=shape, remedy=IS_IT_WHOLE)
         return shape[-1]
 
@@ -99,18 +87,19 @@ def _config(path: Path, raw: dict[str, Any], weights: Weights, facts: Facts) -> 
         problem = f"{path}: n_obs_steps is {quote(raw['n_obs_steps'])}"
         raise CheckpointError(problem, remedy="ACT acts on one observation, train with 1")
     size = whole("image_height"), whole("image_width")
-    if not is_number(rate_hz := raw.get("rate_hz", RATE_HZ)):
-        raise CheckpointError(f"{path}: config 'rate_hz' must be a number", found=quote(rate_hz), remedy=CORRECT_IT)
-    actions = facts.default("actions", name_numbers(last("action_head.bias"), "action"), OF_TRAINER)
+    if not is_number(rate_hz := raw.get("rate_hz", files.RATE_HZ)):
+        problem = f"{path}: config 'rate_hz' must be a number"
+        raise CheckpointError(problem, found=quote(rate_hz), remedy=files.CORRECT_IT)
+    actions = facts.default("actions", files.name_numbers(last("action_head.bias"), "action"), OF_TRAINER)
     if (states := facts.value("state")) not in (None, actions):
         raise facts.refusal(facts.source("state"), states, f"and its actions are {quote_all(actions)}")
     return ActConfig(
         cameras=(TRAINER_CAMERA,),
         image_sizes=(facts.default("size", size, "config.image_height"),),
         backbone=facts.default("backbone", raw.get("vision_encoder", ""), "config.vision_encoder"),
-        rate_hz=facts.default("rate", RATE_HZ, OF_TRAINER),
+        rate_hz=facts.default("rate", files.RATE_HZ, OF_TRAINER),
         image_norm=(imagenet(),),  # the trainer scales to [0, 1] and normalises with ImageNet's statistics
-        state_names=name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
+        state_names=files.name_numbers(last("encoder_robot_state_input_proj.weight"), "state"),
         action_names=actions,
         latent=last("encoder_latent_input_proj.weight"),
         vae_layers=len({m[1] for k in weights if (m := re.match(r"vae_encoder\.layers\.(\d+)\.", k))}),
@@ -129,12 +118,13 @@ NUMPY: list[Any] = [(SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("co
 NUMPY += [np.dtype, *(type(np.dtype(t)) for t in (np.float64, np.float32, np.int64, np.int32))]
 SAVE_AGAIN = """python -c "import torch; f = {path!r}; torch.save(torch.load(f, weights_only=False), f)\""""
 UNPACK = "unpack it, or give the file that the training saved"
+UNKNOWN = f"docs/data.md names those read here; or is it damaged? {files.COPY_AGAIN}"
 OTHERS = (  # how other files begin, what they are, and what to do
-    (rb"$", "an empty file", COPY_AGAIN),
+    (rb"$", "an empty file", files.COPY_AGAIN),
     (rb"\s*<", "a web page", "download the file itself"),
     (rb"\s*\{|.{6}\0\0\{", "JSON or safetensors", "give the whole folder, with config.json and model.safetensors"),
     (rb"\x1f\x8b|BZh|7z|Rar|.{257}ustar", "an archive", UNPACK),
-    (rb"[^P\x80]", "an unknown kind of file", f"docs/data.md names those read here; or is it damaged? {COPY_AGAIN}"),
+    (rb"[^P\x80]", "an unknown kind of file", UNKNOWN),
 )
 
 
@@ -153,7 +143,7 @@ def _read_pickle(path: Path) -> Any:
             stored = all(e.compress_type == zipfile.ZIP_STORED for e in z.infolist())
             damaged = z.testzip() if stored else "compressed entries"
         if damaged:
-            raise CheckpointError(f"{path}: damaged, the checksum of {damaged} does not match", remedy=COPY_AGAIN)
+            raise CheckpointError(f"{path}: damaged, the checksum of {damaged} does not match", remedy=files.COPY_AGAIN)
         with torch.serialization.safe_globals(NUMPY):
             # mmap: the optimizer's two thirds of the file are counted, never read
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -167,7 +157,7 @@ def _read_pickle(path: Path) -> Any:
         reason = (str(e).rpartition("WeightsUnpickler error: ")[2].splitlines() or [type(e).__name__])[0]
         problem = f"{path}: not a checkpoint as torch.save writes it since 1.6, or damaged ({reason[:160]})"
         older = f"; of an older torch: {SAVE_AGAIN.format(path=str(path))}" if head.startswith(b"\x80") else ""
-        raise CheckpointError(problem, remedy=COPY_AGAIN + older) from None
+        raise CheckpointError(problem, remedy=files.COPY_AGAIN + older) from None
 
 
 DROPOUT = 0.1  # LeRobot's default, as the user's trainer has it; its checkpoints name what follows, too
@@ -186,7 +176,7 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
     seed, and rate_hz, written if it is not the trainer's 30.
     """
     ((height, width),) = size.image_sizes
-    rate_hz = known.pop("rate_hz", RATE_HZ)
+    rate_hz = known.pop("rate_hz", files.RATE_HZ)
     shape = {
         "image_width": width, "image_height": height, "n_obs_steps": 1, "chunk_size": size.chunk,
         "n_action_steps": size.chunk, "hidden_size": size.dim, "n_encoder_layers": size.encoder_layers,
@@ -195,7 +185,7 @@ def trainer_config(size: ActConfig, **known: Any) -> dict[str, Any]:
         "pretrained_backbone": True,  # as the trainer writes it, whatever the weights came from
     }  # fmt: skip
     training = {"weight_decay": WEIGHT_DECAY, "betas": BETAS, "grad_clip": GRAD_CLIP} | OURS
-    return shape | training | known | ({} if rate_hz == RATE_HZ else {"rate_hz": rate_hz})
+    return shape | training | known | ({} if rate_hz == files.RATE_HZ else {"rate_hz": rate_hz})
 
 
 KNOWN_CONFIG = {*trainer_config(ActConfig()), "learning_rate", "batch_size", "data_dir", "output_dir", "device", "seed"}

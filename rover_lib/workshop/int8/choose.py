@@ -25,8 +25,7 @@ from rover_lib.workshop.int8.quantize import convert, forget_graphs
 from rover_lib.workshop.int8.scheme import OBSERVERS, Scheme
 from rover_lib.workshop.judge.recorded_range import Range, constant_actions, not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
 
 Errors = dict[str, float | None]  # <action>_mae_pct, None where it is not judged
 # A multiply-accumulate in float against one in INT8, in instructions: 6.08 to 1.44 G of the full policy, counted on an

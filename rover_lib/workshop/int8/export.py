@@ -23,7 +23,8 @@ from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.familiar import TOLERANCE
 from rover_lib.onboard.wheel_version import VERSION
-from rover_lib.workshop.act import ACT, ActConfig, example_inputs, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act import ACT, example_inputs, inputs_of, multiply_accumulates, predictions
+from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.familiar import Drives, fit
 from rover_lib.workshop.int8.observe import Calibration

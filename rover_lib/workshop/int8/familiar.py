@@ -69,10 +69,8 @@ class Drives:
     def warnings(self) -> list[str]:
         if len(self.unseen) >= FEWEST_DRIVES:
             return []
-        problem = (
-            f"{len(self.unseen)} {self.each} are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
-        )
-        return [f"{problem}: nothing stops this policy where it has seen nothing like it"]
+        text = f"{len(self.unseen)} {self.each} are held out, and {FEWEST_DRIVES} are needed to tell what is unfamiliar"
+        return [f"{text}: nothing stops this policy where it has seen nothing like it"]
 
 
 def _rate_hz(samples: list[Sample]) -> float:

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from rover_lib.workshop.act import block_of
-from rover_lib.workshop.recordings.episodes import Sample
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
 
 Extremes = Mapping[str, Tensor]
 Frame = tuple[str, int]  # episode, row

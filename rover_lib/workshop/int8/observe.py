@@ -25,14 +25,15 @@ from torch.fx import GraphModule, Node
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.stage import open_plain
-from rover_lib.workshop.act import ACT, ActConfig, Columns, blocks, example_inputs, inputs_of
+from rover_lib.workshop.act import ACT, Columns, blocks, example_inputs, inputs_of
+from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
 from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import Sample
 
 AGAIN = "calibrate again"
 BROKEN_INPUT = "check the checkpoint and the recordings"

@@ -29,13 +29,14 @@ from torch.fx import Graph, GraphModule, Node, Tracer
 
 from rover_lib.onboard.errors import ArtifactError
 from rover_lib.onboard.policy.load import give_back_freed
-from rover_lib.workshop.act import ACT, ActConfig, Columns, block_of, example_inputs, inputs_of
+from rover_lib.workshop.act import ACT, Columns, block_of, example_inputs, inputs_of
+from rover_lib.workshop.act_config import ActConfig
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8 import observe
 from rover_lib.workshop.int8.observe import AGAIN, Calibration, restore_observed, scale_model
 from rover_lib.workshop.int8.scales import projections
 from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, SMALLEST_SCALE, STAYS_FLOAT, Scheme
-from rover_lib.workshop.recordings.episodes import Sample
+from rover_lib.workshop.recordings.samples import Sample
 
 Int8Layer = int8.Conv2d | int8.Linear | fused_int8.ConvReLU2d | dynamic_int8.Linear
 INT8_MODULES = (int8.Conv2d, int8.Linear, fused_int8.ConvReLU2d, dynamic_int8.Linear)

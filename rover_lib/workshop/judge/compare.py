@@ -11,6 +11,7 @@ sample has fewer recorded actions than a chunk is long: `mae` counts all steps, 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from rover_lib.onboard.car.car import Car, this_car
 from rover_lib.onboard.errors import PolicyError
 from rover_lib.onboard.policy.load import Policy, action_limits, load_policy
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act import Affine
-from rover_lib.workshop.act_config import lerobot_act
+from rover_lib.workshop.act_config import Affine, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
@@ -146,7 +146,7 @@ class LerobotEager:
 
 
 def _affine(x: np.ndarray, affine: Affine | None) -> torch.Tensor:
-    """x * scale + shift over the last axis."""
+    """Return x * scale + shift over the last axis."""
     if affine is None:
         return torch.from_numpy(x)
     return torch.from_numpy(x * np.asarray(affine.scale, np.float32) + np.asarray(affine.shift, np.float32))
@@ -209,11 +209,7 @@ def fidelity(
     )
 
 
-def metrics(
-    report: Fidelity,
-    policies: Mapping[str, Any],
-    trials: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
+def metrics(report: Fidelity, policies: Mapping[str, Any], trials: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The metrics of compare.json: fp32, modes and what they were measured on.
 
     policies: "fp32" and the modes. trials: reports by mode; modes that were not driven have None, not 0.
@@ -233,7 +229,7 @@ def metrics(
         pairs = compare_pairs(trials["fp32"].hit, trials[mode].hit) if trials and mode in trials else None
         modes[mode] = row | report.summary(mode) | {"pairs": pairs}
     worst = []
-    for w in (w for mode in report.chunks for w in report.worst(mode)):
+    for w in chain.from_iterable(map(report.worst, report.chunks)):
         at = {"episode": w.sample.episode, "frame": w.sample.frame_name}
         row = {"mode": w.mode, "action": w.action, "error_pct": w.error_pct}
         worst.append(row | at | {"fp32": w.reference, "int8": w.other})
@@ -249,8 +245,9 @@ def metrics(
 
 def gate(name: str, found: float | None, relation: str, limit: Any) -> dict[str, Any]:
     """One row of the gates' table. passed is None where nothing was measured: no pass, no failure."""
-    found = None if isinstance(found, float) and math.isnan(found) else found
-    passed = None if found is None else bool(found <= limit if relation == "<=" else found >= limit)
+    if found is None or math.isnan(found):
+        return {"gate": name, "relation": relation, "limit": limit, "found": None, "passed": None}
+    passed = bool(found <= limit if relation == "<=" else found >= limit)
     return {"gate": name, "relation": relation, "limit": limit, "found": found, "passed": passed}
 
 
@@ -286,18 +283,16 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     The error is judged only where worlds do not decide, in ms of delay; where none tells, in % of the recorded range.
     """
     fp32 = compared["fp32"]
-    mode_metrics = compared["modes"][mode]
-    lost = worlds_lost(
-        f"{mode} {WORLDS_LOST}", mode_metrics.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"]
-    )
+    scores = compared["modes"][mode]
+    lost = worlds_lost(f"{mode} {WORLDS_LOST}", scores.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"])
     if (ms := error_ms(compared, mode)) is not None:
-        error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(mode_metrics, limits))
+        error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(scores, limits))
     else:
-        worst_pct = worst(mode_metrics[key] for key in mode_metrics if key.endswith("_mae_pct"))
+        worst_pct = worst(scores[key] for key in scores if key.endswith("_mae_pct"))
         error = gate(f"{mode} error, % of the recorded range", worst_pct, "<=", limits["error_pct"])
     return [
         *([error] if lost["passed"] is None else []),
         gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
         lost,
-        gate(f"{mode} size_mb", mode_metrics["size_mb"], "<=", limits["size_mb"][mode]),
+        gate(f"{mode} size_mb", scores["size_mb"], "<=", limits["size_mb"][mode]),
     ]

@@ -1,5 +1,6 @@
-"""Find pictures that show nothing, or not what the car saw: a camera that stood still, black or grey pictures, colours
-or sides that are not those of the other drives.
+"""Find pictures that show nothing, or not what the car saw.
+
+A camera that stood still, black or grey pictures, colours or sides that are not those of the other drives.
 
     recordings = with_faults(recordings)     # its faults name them; `rover inspect` and notebook 01 do so
 
@@ -127,7 +128,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
     flat = np.ptp(blocks, axis=(1, 2)).max(1) < FLAT
     if flat.mean() >= BLANK:
         mean = float(means[flat].mean())
-        word = "black" if mean < DARK else "white" if mean > BRIGHT else "of one colour"
+        word = "of one colour"
+        if mean < DARK:
+            word = "black"
+        elif mean > BRIGHT:
+            word = "white"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
         faults.add(place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
     elif drive.frozen:

@@ -80,12 +80,17 @@ class Sides:
         steered = [t for t in self.turnings if t.spread >= LEAST_SPREAD]
         signed = [math.copysign(t.sure, t.correlation) for t in steered if t.correlation]
         together = sum(signed) / math.sqrt(len(signed)) if signed else 0.0
-        return None if abs(together) < SURE else "right" if together < 0 else "left"
+        if abs(together) < SURE:
+            return None
+        return "right" if together < 0 else "left"
 
     @property
     def mirrored(self) -> list[str]:
         """The episodes whose pictures, or steering, are mirrored beside most of the others'."""
-        return [piece for t in self.turnings if self.side and t.side not in (None, self.side) for piece in t.pieces]
+        if not self.side:
+            return []
+        others = [t for t in self.turnings if t.side not in (None, self.side)]
+        return [piece for turning in others for piece in turning.pieces]
 
     @property
     def denied(self) -> bool:

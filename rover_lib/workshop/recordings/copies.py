@@ -9,6 +9,7 @@ agree with all others like them, and those of a standing car with each other.
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import chain
 from typing import Any
 
 import cv2
@@ -51,7 +52,7 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
             faults.add(episodes[i].path / episodes[i].id, "copy", note)
             continue
         unique.add(i)
-        for run, k in (item for step in STEPS for item in _runs(episodes[i], step).items()):
+        for run, k in chain.from_iterable(_runs(episodes[i], step).items() for step in STEPS):
             if len(having[run]) < MOST_ALIKE:
                 having[run].append((i, k))
     return tuple(episode for i, episode in enumerate(episodes) if i in unique)

@@ -58,10 +58,7 @@ from rover_lib.workshop.recordings.twins import leave_out_copies
 from rover_lib.workshop.untrusted import limited_memory, quote, quote_all, read_json
 
 # What the JSON file has under these names, and where it is again with which columns.
-TABLES = {
-    "control_samples": ("control_data.csv", CONTROL_FIELDS),
-    "frame_samples": ("frame_data.csv", FRAME_FIELDS),
-}
+TABLES = {"control_samples": ("control_data.csv", CONTROL_FIELDS), "frame_samples": ("frame_data.csv", FRAME_FIELDS)}
 FOLDER = "give the folder that holds episode_*, or a LeRobotDataset's"
 Samples = tuple[Sample, ...]
 
@@ -242,15 +239,13 @@ def _read_frames(folder: Path, path: Path, rows: list, faults: Faults) -> list[_
         frames.append(_Frame(number, time_s, picture, usable))
     went_on = [b.number > a.number for a, b in pairwise(frames)]
     frames = in_order([(f.time_s, f) for f in frames], went_on, path, "frame", faults)
-    accepted = frames[:1]
+    valid = frames[:1]
     for frame in frames[1:]:
-        if frame.time_s > accepted[-1].time_s:
-            accepted.append(frame)
+        if frame.time_s > valid[-1].time_s:
+            valid.append(frame)
         else:
-            faults.add(
-                path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {accepted[-1].number}"
-            )
-    return accepted
+            faults.add(path, "duplicate_frame_time", f"frame {frame.number} has the time of frame {valid[-1].number}")
+    return valid
 
 
 def _nearest(times_s: np.ndarray, controls: list[Control], within_s: float) -> list[Control | None]:

@@ -57,11 +57,9 @@ class Faults:
         kinds: Counter[str] = Counter()
         for fault in dropped:
             kinds[fault.kind] += fault.count
-        by_weight = sorted(
-            kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind)
-        )[:6]
-        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in by_weight)
-        note = next((f"{fault.note} ({fault.file})" for fault in dropped if fault.kind == by_weight[0]), "")
+        order = sorted(kinds, key=lambda kind: (kind not in DECISIVE, kind == "nothing_usable", -kinds[kind], kind))[:6]
+        worst = ", ".join(f"{kind} {kinds[kind]} times" for kind in order)
+        note = next((f"{fault.note} ({fault.file})" for fault in dropped if fault.kind == order[0]), "")
         what = f"{self.root}: {what} ({worst or 'empty'})"
         return EpisodeError(what, found=note or None, remedy="" if "; " in note else remedy)
 

@@ -284,11 +284,9 @@ class _Dataset:
         times_s = self.columns["timestamp"] = np.where(np.abs(begin_s) * self.fps > 1, times_s - begin_s, times_s)
         steps = np.diff(times_s, prepend=0)[~first] * self.fps
         if len(odd := steps[~(np.abs(steps - 1) <= UNEVEN)]):  # so that NaN counts as odd
-            problem = (
-                f"{self.root}: {INFO} says {self.fps:g} frames a second, but {len(odd)} frames come at another rate"
-            )
+            text = f"{self.root}: {INFO} says {self.fps:g} frames a second, but {len(odd)} frames come at another rate"
             actual = f"{odd[0] / self.fps:.4f} s after the one before"
-            raise EpisodeError(problem, found=actual, remedy="correct the rate, or record again")
+            raise EpisodeError(text, found=actual, remedy="correct the rate, or record again")
 
     def _check_numbers(self) -> None:
         """Raise EpisodeError for states and actions beyond what the car can do."""
@@ -298,11 +296,9 @@ class _Dataset:
             limits = action_limits(labels, self.car)
             for name, values, low, high in zip(labels, self.columns[key].T, *limits, strict=True):
                 if len(wrong := np.flatnonzero((values < low) | (values > high))):
-                    example = f"{name} of '{key}' is {values[wrong[0]]:g} in {len(wrong)} frames from {wrong[0]} on"
+                    text = f"{name} of '{key}' is {values[wrong[0]]:g} in {len(wrong)} frames from {wrong[0]} on"
                     remedy = "are names (--action-names) and units right? if it reverses, say reverse_us in car.yml"
-                    raise EpisodeError(
-                        f"{self.root}: {example}, a rover's lies from {low:g} to {high:g}", remedy=remedy
-                    )
+                    raise EpisodeError(f"{self.root}: {text}, a rover's lies from {low:g} to {high:g}", remedy=remedy)
 
     def _camera(self, key: str, size: tuple[int, int]) -> _Camera:
         """Find each row's picture of a camera."""
@@ -444,9 +440,9 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     names = source.cameras or (tuple(keys) if len(keys) == 1 else ())
     missing = [name for name in names if name not in keys]
     if missing or not names or len(set(names)) < len(names):
-        problem = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
+        text = f"has no camera {quote(missing[0])}" if missing else f"has {len(keys)} cameras"
         remedy = "name once each what the policy looks through: --camera NAME, with commas between several"
-        raise EpisodeError(f"{root}: {problem}", found=quote_all(keys), remedy=remedy)
+        raise EpisodeError(f"{root}: {text}", found=quote_all(keys), remedy=remedy)
     sizes = {name: _picture_size(root, keys[name], features[keys[name]]) for name in names}
     has_state = STATE in features
     names_passed = source.action_names  # without one it is the last action
@@ -456,10 +452,8 @@ def _layout(root: Path, info: Mapping[str, Any], source: Source) -> tuple[Layout
     for key in (STATE, ACTION) if has_state else (ACTION,):
         row = features.get(key, {})  # LeRobot makes 1 of 0.3 where it says bool
         if len(row.get("shape") or ()) != 1 or not str(row.get("dtype")).startswith(("float", "int", "uint")):
-            problem = f"{root}: its '{key}' is missing or not a row of numbers"
-            raise EpisodeError(
-                problem, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables"
-            )
+            text = f"{root}: its '{key}' is missing or not a row of numbers"
+            raise EpisodeError(text, found=quote_all(features), remedy=f"call it '{key}' in {INFO} and in the tables")
     actions, action_order = name_numbers(root, features, ACTION, names_passed)
     states, state_order = name_states(root, features, names_passed) if has_state else (actions, action_order)
     layout = Layout(names, states, actions, float(info["fps"]), state_order, action_order, sizes, has_state)

@@ -83,10 +83,8 @@ def name_numbers(root: Path, features: Mapping[str, Any], key: str, said: tuple[
         raise EpisodeError(f"{root}: '{key}' does not name its {size} numbers", found=actual, remedy=remedy)
     if len(names) != size or len(set(names)) != size:
         problem = f"{root}: '{key}' has {size} numbers in meta/info.json, their names are {quote_all(names)}"
-        overrides = said not in ((), own)
-        remedy = (
-            "name each once: --action-names with commas between" if overrides else "correct its shape and names there"
-        )
+        typed = said not in ((), own)
+        remedy = "name each once: --action-names with commas between" if typed else "correct its shape and names there"
         raise EpisodeError(problem, remedy=remedy)
     if set(names) == set(CHANNELS):
         return CHANNELS, tuple(names.index(name) for name in CHANNELS)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def check_pictures(
 
     listed = [(name, folder / inside / name.replace("\\", "/")) for name in names]
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:  # decoding releases the interpreter's lock
-        checked = [outcome for some in pool.map(check_some, range(0, len(listed), AT_ONCE)) for outcome in some]
+        checked = list(chain.from_iterable(pool.map(check_some, range(0, len(listed), AT_ONCE))))
     sizes = list(_sizes(listed, checked, listing, faults, whole))
     if whole.keys() - cached.keys():
         with suppress(OSError):

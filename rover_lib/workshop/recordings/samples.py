@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -185,7 +186,7 @@ class Recordings:
     @property
     def samples(self) -> tuple[Sample, ...]:
         """Every episode's samples, in order."""
-        return tuple(s for e in self.episodes for s in e.samples)
+        return tuple(chain.from_iterable(e.samples for e in self.episodes))
 
     def action_range(self) -> dict[str, tuple[float, float]]:
         """Smallest and largest recorded value of each action. Errors are given as a share of this range."""
@@ -219,7 +220,10 @@ class Recordings:
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""
-        files = dict.fromkeys(path for e in self.episodes for path in (*e.files, *(s.frame_path for s in e.samples)))
+        files: dict[Path, None] = {}  # in order
+        for episode in self.episodes:
+            files |= dict.fromkeys(episode.files)
+            files |= dict.fromkeys(sample.frame_path for sample in episode.samples)
         try:
             return {relative(path, self.root): sha256_of(path) for path in files}
         except OSError as e:

@@ -35,8 +35,10 @@ class Source:
     def typed(self) -> str:
         """What a user types for it."""
         by_option = {"--action-names": self.action_names, "--camera": self.cameras, "--throttle": (self.throttle,)}
-        options = [part for name, values in by_option.items() if any(values) for part in (name, ",".join(values))]
-        return shlex.join([str(self.path), *options])
+        words = [str(self.path)]
+        for option, values in by_option.items():
+            words += [option, ",".join(values)] if any(values) else []
+        return shlex.join(words)
 
     @classmethod
     def loaded(cls, given: Mapping[str, Any], elsewhere: Path | str | None = None) -> "Source":

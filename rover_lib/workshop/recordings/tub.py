@@ -119,8 +119,9 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
             all_faults.counted |= faults.counted
     if not parts:
         raise all_faults.nothing_usable(f"none of its {len(tubs)} tubs can be used", COPY)
-    note_one_sided([e for _, own in parts for e in own], all_faults)
-    unique = {id(e) for e in leave_out_copies([e for _, own in parts for e in own], all_faults)}
+    whole = [episode for _, own in parts for episode in own]
+    note_one_sided(whole, all_faults)
+    unique = set(map(id, leave_out_copies(whole, all_faults)))
     episodes = list[Episode]()
     blocks = list[tuple[str, ...]]()
     for place, own in parts:

@@ -80,7 +80,5 @@ def verdict_of(run_dir: Path) -> str:
             return str(stage["metrics"]["headline"])
     if (run_dir / "compare.json").is_file():
         return f"no verdict of its files: rover report {shlex.quote(str(run_dir))}"
-    checkpoint = next(
-        (p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT"
-    )
-    return f"no run yet: rover run {shlex.quote(str(checkpoint))} EPISODES --name {shlex.quote(run_dir.name)}"
+    policy = next((p for p in (run_dir / "best_model.pth", run_dir / "pretrained_model") if p.exists()), "CHECKPOINT")
+    return f"no run yet: rover run {shlex.quote(str(policy))} EPISODES --name {shlex.quote(run_dir.name)}"

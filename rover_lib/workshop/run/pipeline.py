@@ -33,8 +33,8 @@ from rover_lib.workshop.int8.quantize import QuantizedPolicy, forget_graphs, qua
 from rover_lib.workshop.int8.scheme import Scheme
 from rover_lib.workshop.judge.compare import ARTIFACTS
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Sample, choose_calibration
-from rover_lib.workshop.recordings.samples import pick_evenly
+from rover_lib.workshop.recordings.episodes import choose_calibration
+from rover_lib.workshop.recordings.samples import Sample, pick_evenly
 from rover_lib.workshop.run.session import Opened, open_run
 
 DRIVEN = ("fp32", "static", "mixed")  # the others are made to be compared
@@ -75,16 +75,12 @@ def make_artifact(
     """
     checkpoint, parts = loaded.checkpoint, loaded.parts
     samples = pick_evenly(parts.choosing or parts.calibration, EXPORT_FRAMES)
-    quantization = p["quantization"]
+    settings = p["quantization"]
     scheme = Scheme(smooth=p["quantization"]["smooth"])
-    calibration_samples, note = choose_calibration(
-        parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"]
-    )
-    calibration = calibrate(checkpoint, calibration_samples, smooth=scheme.smooth, progress=progress)
+    frames, note = choose_calibration(parts.calibration, p["calibration"]["samples"], p["calibration"]["seed"])
+    calibration = calibrate(checkpoint, frames, smooth=scheme.smooth, progress=progress)
     if odd_share(calibration.frames):
-        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(
-            scheme, quantization["observers"], progress
-        )
+        scheme, _ = prepare_chooser(checkpoint, loaded, calibration).observer(scheme, settings["observers"], progress)
     policy = quantize(checkpoint, scheme, calibration)
     drives = Drives.of(parts)
     digest, _ = Exporter(checkpoint, samples).export(policy, path, calibration, drives)

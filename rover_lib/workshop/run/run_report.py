@@ -44,10 +44,8 @@ def write(run_dir: Path | str) -> dict[str, Any]:
             raise RoverError(f"{folder}: no benchmark of its artifacts", remedy=AGAIN)
         files["benchmark"] = timed
         contents["benchmark"] = read_stage(files["benchmark"], "benchmark")
-        parameters = contents["load"]["params"]
-        names = Names(
-            *(relative(path) for path in (folder.resolve(), parameters["checkpoint"], parameters["episodes"]))
-        )
+        loaded = contents["load"]["params"]
+        names = Names(*(relative(path) for path in (folder.resolve(), loaded["checkpoint"], loaded["episodes"])))
         there = {mode: path for mode in modes if (path := folder / f"policy_{mode}.pt").is_file()}
         refusals = {mode: THIS_CAR.refusals(read_manifest(path)) for mode, path in there.items()}
         result = verdict({stage: content["metrics"] for stage, content in contents.items()}, p, names, refusals)
@@ -55,8 +53,8 @@ def write(run_dir: Path | str) -> dict[str, Any]:
     except KeyError as missing:
         raise RoverError(f"{folder}: its stages lack {missing}, as of another version", remedy=AGAIN) from missing
     inputs = {path.name: sha256_of(path) for path in files.values()}
-    parameters = {"verdict": p["verdict"], "gates": p["gates"]}
-    return write_stage(folder / "run.json", "run", params=parameters, metrics=result, inputs=inputs)
+    loaded = {"verdict": p["verdict"], "gates": p["gates"]}
+    return write_stage(folder / "run.json", "run", params=loaded, metrics=result, inputs=inputs)
 
 
 def _files(folder: Path) -> dict[str, Path]:

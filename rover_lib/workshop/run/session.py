@@ -14,7 +14,8 @@ from rover_lib.onboard.params import params
 from rover_lib.onboard.stage import read_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, check_limits, load_checkpoint
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Recordings, Split, load_recordings, split
+from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
+from rover_lib.workshop.recordings.samples import Recordings
 from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.units import in_todays_units
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rover_lib.onboard.car.car import Car
 from rover_lib.onboard.car.pwm import Channel
-from rover_lib.workshop.act import Affine
+from rover_lib.workshop.act_config import Affine
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, normalisation, planned_error
 from rover_lib.workshop.recordings.controls import OLD
 from rover_lib.workshop.recordings.samples import ACTION_NAMES, Recordings, Sample, car_of, pick_evenly
@@ -60,12 +60,8 @@ def _in_units_of(policy: Checkpoint, car: Car, formulas: Mapping[str, Channel]) 
         state_norm=_affine(np.array(state.scale) * gains, np.array(state.scale) * offsets + np.array(state.shift)),
         action_unnorm=_affine(scale / gains, (shift - offsets) / gains),
     )
-    formulas_in_words = ", ".join(
-        f"{name} = (duty % - {f.neutral_pct:g}) / {f.span_pct:g}" for name, f in formulas.items()
-    )
-    words = normalisation(config) | {
-        "units": f"trained on actions of older firmware ({formulas_in_words}), and converted"
-    }
+    formula_list = ", ".join(f"{name} = (duty % - {f.neutral_pct:g}) / {f.span_pct:g}" for name, f in formulas.items())
+    words = normalisation(config) | {"units": f"trained on actions of older firmware ({formula_list}), and converted"}
     return replace(policy, config=config, report=policy.report | {"normalisation": words})
 
 

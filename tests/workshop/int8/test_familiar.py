@@ -112,12 +112,7 @@ def test_plans_stay_and_each_engine_and_mode_tells_the_same(made):
         assert process.strange == UNTOLD  # stops, and JSON takes it
 
 
-WIDE = {
-    "wide": [1e30, 1e30],
-    "one": [1.0, 1e30],
-    "negative": [-1.0, -1.0],
-    "zero": [0.0, 1.0],
-}
+WIDE = {"wide": [1e30, 1e30], "one": [1.0, 1e30], "negative": [-1.0, -1.0], "zero": [0.0, 1.0]}
 
 
 @pytest.mark.parametrize("change", ["embedding", "mean", "limits", "shape", "sizes", "unclaimed", "spread", *WIDE])
