@@ -3,6 +3,7 @@
 import functools
 import re
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -146,20 +147,27 @@ def inspect(episodes: "Source", as_json: bool) -> None:
 @click.command(short_help="Write policies for ONNX Runtime, or a run's model card.")
 @click.argument("source", metavar="RUN_DIR|CHECKPOINT", type=FILE)
 @click.option("--onnx", is_flag=True, help="Of a run policy_fp32.onnx.zip and policy_static.onnx.zip.")
+@click.option("--hailo", is_flag=True, help="What Hailo's compiler needs, into RUN_DIR/hailo; see docs/hailo.md.")
 @click.option("-o", "--output", type=Output(), help="Of a checkpoint: the graph [default: its name, here, with .onnx].")
 @FACTS
 @click.option("--card", is_flag=True, help="README.md, a model card to publish the run's artifacts with.")
 @click.option("--license", help="For the card, such as apache-2.0 [default: the checkpoint's, if it names one].")
 @click.option("--base-model", metavar="USER/NAME", help="For the card: the FP32 policy on the Hub [default: likewise].")
-def export(source: Path, onnx: bool, output: Path | None, facts: str, card: bool, **about: str | None) -> None:
+def export(
+    source: Path, onnx: bool, hailo: bool, output: Path | None, facts: str, card: bool, **about: str | None
+) -> None:
     """Write the policies of a run for another engine, or for others to use; or one checkpoint as a graph in FP32.
 
     --onnx: artifacts for ONNX Runtime; a rover with that engine needs no torch. Of a CHECKPOINT, which needs neither
     recordings nor a run, the plain graph: docs/api.md has its contract. --card: see docs/lerobot.md.
     """
-    if not (onnx or card):
-        raise click.UsageError("for what? --onnx or --card")
-    if not card and not (source / "quantize.json").is_file() and {"checkpoint", "pretrained"} & {*kinds_of(source)}:
+    if not (onnx or card or hailo):
+        raise click.UsageError("for what? --onnx, --hailo or --card")
+    if (
+        not (card or hailo)
+        and not (source / "quantize.json").is_file()
+        and {"checkpoint", "pretrained"} & {*kinds_of(source)}
+    ):
         from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
         from rover_lib.workshop.run.pipeline import export_graph
 
@@ -178,6 +186,9 @@ def export(source: Path, onnx: bool, output: Path | None, facts: str, card: bool
         for name, digest in export_onnx(source, terminal_bar()).items():
             path = source / name
             click.echo(f"{path}: {path.stat().st_size / 1e6:.1f} MB, content {digest[:16]}")
+    if hailo:
+        (write_kit,) = entry_points(group="rover.graphs", name="hailo")
+        show({str(source / "hailo"): write_kit.load()(source, terminal_bar())}, False)
 
 
 @click.command(short_help="Collect the packages for a Pi without internet.")

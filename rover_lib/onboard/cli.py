@@ -319,6 +319,7 @@ def describe_artifact(file: Path) -> dict[str, Any]:
 @click.argument("artifacts", type=ARTIFACT, nargs=-1, required=True)
 @click.option("--warmup", type=FROM_0, default=10, show_default=True)
 @click.option("--iterations", type=FROM_1, default=100, show_default=True)
+@click.option("--minutes", type=POSITIVE, help="Instead of --iterations; heat and clock are kept for each 10 s.")
 @click.option("--threads", type=click.IntRange(0, MOST_THREADS), default=0, show_default=True, help="0: all cores.")
 @click.option("--output", type=Output("benchmark"), help="Write the benchmark to this JSON file, for notebook 05.")
 @AS_JSON
@@ -326,7 +327,7 @@ def benchmark(artifacts: tuple[Path, ...], threads: int, output: Path | None, as
     """Time ARTIFACTS on this machine, interleaved, on the frames of their own parity vectors."""
     from rover_lib.onboard.artifact.manifest import content_hash
     from rover_lib.onboard.car.host import usable_cores
-    from rover_lib.onboard.care.benchmark import benchmark_artifacts
+    from rover_lib.onboard.care.benchmark import benchmark_artifacts, describe_clock
     from rover_lib.onboard.stage import write_stage
 
     stems = [path.stem for path in artifacts]
@@ -340,6 +341,8 @@ def benchmark(artifacts: tuple[Path, ...], threads: int, output: Path | None, as
     click.echo("\n".join(align(benchmark_rows(metrics))))
     machine = {key: metrics[key] for key in ("threads", "cores", "temperature_c", "clock_mhz", "throttled")}
     show({k: v for k, v in machine.items() if v is not None}, False)
+    if metrics["over_time"]:
+        click.echo(describe_clock(metrics["over_time"]))
 
 
 @main.command("arm-car", short_help="Arm the car; its service then drives at once.")

@@ -235,6 +235,24 @@ def test_the_units_say_what_the_command_line_takes(units):
     assert drive[drive.index("--view") + 1] == view[view.index("--feed") + 1]
 
 
+def test_a_benchmark_takes_as_many_minutes_as_are_asked_for(tmp_path):
+    """`-e minutes=10`, through the role's default, as a benchmark of a rover gets it."""
+    assert command(render(BENCHMARK))[-2:] == ["--iterations", "1000"]
+    unit = {"src": str(ROLE / "templates" / "rover-benchmark.service.j2"), "dest": str(tmp_path / "unit")}
+    play = {"hosts": "localhost", "gather_facts": False, "vars_files": [str(ROLE / "defaults" / "main.yml")]}
+    (tmp_path / "play.yml").write_text(json.dumps([play | {"tasks": [{"ansible.builtin.template": unit}]}]))
+    done = run(
+        "ansible-playbook", "-i", "localhost,", "-c", "local", tmp_path / "play.yml", "-e", "minutes=10", tmp=tmp_path
+    )
+    assert done.returncode == 0, done.stdout
+    words = command((tmp_path / "unit").read_text())
+    assert words[-2:] == ["--minutes", "10.0"]
+    benchmark = main.commands["benchmark"].make_context(
+        "benchmark", [str(ROLE / "README.md"), *words[2:]], resilient_parsing=True
+    )
+    assert benchmark.params["minutes"] == 10
+
+
 def test_a_value_in_a_unit_is_one_word_of_its_command():
     words = command(render(DRIVE, rover_camera='/dev/video0 --hz 1\nUser="root"', rover_models="/%h $HOME"))
     assert words[words.index("--camera") + 1] == '/dev/video0 --hz 1\\nUser="root"'

@@ -34,6 +34,7 @@ def pi_host(tmp_path):
         "cpu  8 0 0 8 0 0 0 0 0 0\ncpu0 3 0 1 5 1 0 0 0 0 0\ncpu1 4 0 0 2 0 0 0 0 0 0\n"
     )
     command = tmp_path / "vcgencmd"
-    command.write_text("#!/bin/sh\n[ $1 = get_throttled ] && echo throttled=0x50000\n")
+    answers = "get_throttled) echo throttled=0x50000;; pmic_read_adc) echo '     EXT5V_V volt(24)=5.02000000V';;"
+    command.write_text(f"#!/bin/sh\ncase $1 in {answers} esac\n")
     command.chmod(command.stat().st_mode | stat.S_IXUSR)
     return Host(sys_root=tmp_path / "sys", proc_root=tmp_path / "proc", vcgencmd=str(command))

@@ -17,6 +17,7 @@ from typing import Any
 UNDER_VOLTAGE = "under-voltage"
 THROTTLED_BITS = {0: UNDER_VOLTAGE, 1: "frequency capped", 2: "throttled", 3: "soft temperature limit"}
 THROTTLED_VALUE = re.compile(r"0x[0-9a-fA-F]{1,8}")  # as get_throttled prints the bits
+SUPPLY_VALUE = re.compile(r"EXT5V_V volt\(\d+\)=(\d+\.?\d*)V")  # as a Pi 5's pmic_read_adc prints it
 
 
 def boottime() -> float:
@@ -49,12 +50,20 @@ class Host:
 
     def throttled(self) -> str | None:
         """Return what `vcgencmd get_throttled` reports, such as "0x0"; None if it fails, or is not there."""
-        try:
-            found = subprocess.run([self.vcgencmd, "get_throttled"], capture_output=True, text=True, timeout=5)
-        except (OSError, subprocess.SubprocessError):
-            return None
-        name, _, value = found.stdout.strip().partition("=")
+        name, _, value = self._ask_firmware("get_throttled").partition("=")
         return value if name == "throttled" and THROTTLED_VALUE.fullmatch(value) else None
+
+    def supply_v(self) -> float | None:
+        """Return the volts that a Raspberry Pi 5 measures at its 5 V input; None elsewhere."""
+        reported = SUPPLY_VALUE.search(self._ask_firmware("pmic_read_adc", "EXT5V_V"))
+        return float(reported[1]) if reported else None
+
+    def _ask_firmware(self, *question: str) -> str:
+        """Return what vcgencmd prints, nothing if it fails or is not there."""
+        try:
+            return subprocess.run([self.vcgencmd, *question], capture_output=True, text=True, timeout=5).stdout.strip()
+        except (OSError, subprocess.SubprocessError):
+            return ""
 
     def process_peak_memory_mb(self) -> float | None:
         """Return the largest resident memory that this process has ever had, in MB of 10**6 bytes."""

@@ -7,7 +7,11 @@ machine that heats up or is shared slows all of them alike. A value that the hos
 vcgencmd) is None, not 0. MB are 10**6 bytes.
 """
 
+import functools
+import itertools
 import math
+import operator
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +29,9 @@ Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, tot
 PERCENTILES = {"p50": 50, "p95": 95, "p99": 99}
 LEAST_ROUNDS = 20  # with fewer, the 95th percentile is just the slowest round
 READ_S = 1.0  # between two readings of the host
+FIRMWARE_S = 2.5  # between two questions to the firmware, each of which starts a process
+SPAN_S = 10.0  # a row of over_time
+FALLEN = 0.97  # of the highest clock: below it, a clock has fallen
 # Measured peaks of a Raspberry Pi 5, four cores at 2.4 GHz (public cpufp results), in 10**9 multiply-accumulates
 # per second: INT8 SDOT 614 GOPS, FP16 307 GFLOPS, FP32 153.5 GFLOPS, two operations to a multiply-accumulate.
 PI5_GMAC_PER_S = {"int8": 307.0, "fp16": 153.5, "fp32": 76.75}
@@ -52,10 +59,56 @@ def benchmark_artifacts(paths: Mapping[str, Path], threads: int, options: Mappin
 
     options: of Timing. Each artifact's memory is measured too. Raises PolicyError for one that does not load.
     """
-    metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
-    metrics["throttled"] = Host().throttled()  # a confined process starts no vcgencmd
+    host, ended, readings = Host(), threading.Event(), []  # a confined process starts no vcgencmd
+
+    def read_firmware() -> None:
+        while not ended.wait(FIRMWARE_S):
+            now_s = time.perf_counter()
+            readings.append({"s": now_s, "throttled": host.throttled(), "supply_v": host.supply_v()})
+
+    reader = threading.Thread(target=read_firmware, name="firmware", daemon=True)
+    if options.get("minutes"):
+        reader.start()
+    try:
+        metrics = run_confined(_time_artifacts, paths=dict(paths), threads=threads, options=options)
+    finally:
+        ended.set()
+    for row in metrics["over_time"]:  # perf_counter is one clock for all processes
+        row |= _of_firmware(_within(readings, metrics["began_s"] + row["from_s"]))
+    metrics["throttled"] = host.throttled()
     _add_memory(metrics, paths, threads)
     return metrics
+
+
+def _within(readings: Sequence[dict[str, Any]], from_s: float) -> list[dict[str, Any]]:
+    return [reading for reading in readings if from_s <= reading["s"] < from_s + SPAN_S]
+
+
+def _of_firmware(readings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return every bit of `throttled` that was set in one of the readings, and the lowest supply."""
+    bits = [int(r["throttled"], 16) for r in readings if r["throttled"] is not None]
+    supplies_v = [r["supply_v"] for r in readings if r["supply_v"] is not None]
+    throttled = hex(functools.reduce(operator.or_, bits)) if bits else None
+    return {"throttled": throttled, "supply_v": min(supplies_v, default=None)}
+
+
+def clock_fall(over_time: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """Return the first row whose clock is clearly below the highest; None if it never fell or was not reported."""
+    rows = [row for row in over_time if row["clock_mhz"] is not None]
+    highest_mhz = max((row["clock_mhz"] for row in rows), default=0.0)
+    return next((row for row in rows if row["clock_mhz"] < FALLEN * highest_mhz), None)
+
+
+def describe_clock(over_time: Sequence[Mapping[str, Any]]) -> str:
+    """Say from when the clock fell in a benchmark of minutes."""
+    clocks_mhz = [row["clock_mhz"] for row in over_time if row["clock_mhz"] is not None]
+    if not clocks_mhz:
+        return "clock not reported"
+    if (fall := clock_fall(over_time)) is None:
+        return f"clock did not fall: {min(clocks_mhz):.0f} MHz at least"
+    minutes, seconds = divmod(round(fall["from_s"]), 60)
+    heat = "" if fall["temperature_c"] is None else f" at {fall['temperature_c']:.0f} C"
+    return f"clock fell after {minutes}:{seconds:02} min{heat}, from {max(clocks_mhz):.0f} to {min(clocks_mhz):.0f} MHz"
 
 
 def _time_artifacts(paths: dict[str, str], threads: int, options: dict[str, Any]) -> dict[str, Any]:
@@ -83,8 +136,10 @@ class Timing:
 
     policies: name -> an object with predict_chunk(frame, state); its `.manifest` ("mode", "gmac"), `.path` and
     `.threads` are used if it has them. frames: used in turn. warmup: inferences of each policy that are not counted.
-    iterations: number of rounds. at_most_s: limits the time, but not to less than LEAST_ROUNDS. main: whose figures
-    are at the top level ("": the first's). reference: what the others' speed is compared with ("": nothing).
+    iterations: number of rounds. at_most_s: limits the time, but not to less than LEAST_ROUNDS. minutes: if given,
+    rounds begin for that long, whatever `iterations` and `at_most_s`, and over_time has a row for each ten seconds.
+    main: whose figures are at the top level ("": the first's). reference: what the others' speed is compared with
+    ("": nothing).
     """
 
     policies: Mapping[str, Any]
@@ -93,6 +148,7 @@ class Timing:
     warmup: int = 10
     iterations: int = 100
     at_most_s: float = math.inf
+    minutes: float | None = None
     main: str = ""
     reference: str = ""
 
@@ -119,14 +175,19 @@ def benchmark(
 
     cpu_pct is processor time as a share of all cores that this process may use. temperature_c is the highest and
     clock_mhz the lowest reading. peak_memory_mb is the artifact's alone if it was measured, else None, and this
-    process's at the top level.
+    process's at the top level. over_time, of `minutes`: {"from_s", "clock_mhz", "temperature_c", "throttled",
+    "supply_v", "artifacts": {name: {"p50_ms", "p95_ms", "n"}}} for each ten seconds, throttled with each bit that was
+    set in them. began_s: by `wall`.
     """
     policies, main = timing.policies, timing.main or next(iter(timing.policies))
     for policy in policies.values():
         for i in range(timing.warmup):
             policy.predict_chunk(timing.frames[i % len(timing.frames)], timing.state)
     run, cores = _Run(timing, host or Host(), wall, cpu), usable_cores()
-    run.measure(progress(range(timing.iterations), desc="timing", total=timing.iterations))
+    if timing.minutes:
+        run.measure(itertools.count())
+    else:
+        run.measure(progress(range(timing.iterations), desc="timing", total=timing.iterations))
     metrics = {
         **run.metrics_of(main),
         "peak_memory_mb": run.host.process_peak_memory_mb(),
@@ -139,6 +200,8 @@ def benchmark(
         "warmup": timing.warmup,
         "rounds": len(run.latencies_ms[main]),
         "wall_s": run.wall_s,
+        "began_s": run.start_s,
+        "over_time": run.over_time() if timing.minutes else [],
         "artifacts": {name: run.metrics_of(name) | run.speedup(name) for name in policies},
     }
     if memory_alone:
@@ -163,30 +226,33 @@ class _Run:
         self.timing, self.host, self.wall, self.cpu = timing, host, wall, cpu
         self.latencies_ms: dict[str, list[float]] = {name: [] for name in timing.policies}
         self.readings: list[dict[str, Any]] = []
-        self.wall_s = self.process_s = 0.0
+        self.begun_s: list[float] = []  # each round's start, since start_s
+        self.start_s = self.wall_s = self.process_s = 0.0
         self.per_core_pct: list[float] | None = None
 
     def measure(self, rounds: Iterable[int]) -> None:
         """Time the rounds, or as many as begin within at_most_s, and fill the lists."""
         timing, names = self.timing, list(self.timing.policies)
+        at_most_s = 60 * timing.minutes if timing.minutes else timing.at_most_s
         before = self.host.core_ticks()
-        cpu_start_s, start_s = self.cpu(), self.wall()
+        cpu_start_s, self.start_s = self.cpu(), self.wall()
         read_s = -math.inf
         for i in rounds:
-            passed_s = self.wall() - start_s
-            if i >= LEAST_ROUNDS and passed_s >= timing.at_most_s:
+            passed_s = self.wall() - self.start_s
+            if i >= LEAST_ROUNDS and passed_s >= at_most_s:
                 break
             if passed_s >= read_s + READ_S:
-                self.readings.append(self.host.reading())
+                self.readings.append(self.host.reading() | {"s": passed_s, "supply_v": self.host.supply_v()})
                 read_s = passed_s
+            self.begun_s.append(passed_s)
             frame = timing.frames[i % len(timing.frames)]
             for k in range(len(names)):
                 name = names[(i + k) % len(names)]
                 begin_s = self.wall()
                 timing.policies[name].predict_chunk(frame, timing.state)
                 self.latencies_ms[name].append((self.wall() - begin_s) * 1000)
-        self.wall_s, self.process_s = self.wall() - start_s, self.cpu() - cpu_start_s
-        self.readings.append(self.host.reading())
+        self.wall_s, self.process_s = self.wall() - self.start_s, self.cpu() - cpu_start_s
+        self.readings.append(self.host.reading() | {"s": self.wall_s, "supply_v": self.host.supply_v()})
         after = self.host.core_ticks()
         if before and after and len(before) == len(after):
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
@@ -228,11 +294,26 @@ class _Run:
 
     def host_metrics(self) -> dict[str, Any]:
         """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
-        temperatures_c = [r["temperature_c"] for r in self.readings if r["temperature_c"] is not None]
-        clocks_mhz = [r["clock_mhz"] for r in self.readings if r["clock_mhz"] is not None]
-        return {
-            "cpu_per_core_pct": self.per_core_pct,
-            "temperature_c": max(temperatures_c, default=None),
-            "clock_mhz": min(clocks_mhz, default=None),
-            "throttled": self.readings[-1]["throttled"],
-        }
+        state = {"cpu_per_core_pct": self.per_core_pct, **_heat_and_clock(self.readings)}
+        return state | {"throttled": self.readings[-1]["throttled"]}
+
+    def over_time(self) -> list[dict[str, Any]]:
+        """Return a row for each ten seconds in which a round began."""
+        spans = np.floor_divide(self.begun_s, SPAN_S).astype(int)
+        rows = []
+        for span in np.unique(spans).tolist():
+            artifacts = {}
+            for name, times_ms in self.latencies_ms.items():
+                p50_ms, p95_ms = np.percentile(np.asarray(times_ms)[spans == span], (50, 95)).tolist()
+                artifacts[name] = {"p50_ms": p50_ms, "p95_ms": p95_ms, "n": int(np.sum(spans == span))}
+            readings = _within(self.readings, span * SPAN_S)
+            state = _heat_and_clock(readings) | _of_firmware(readings)
+            rows.append({"from_s": span * SPAN_S, **state, "artifacts": artifacts})
+        return rows
+
+
+def _heat_and_clock(readings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the highest temperature and the lowest clock."""
+    temperatures_c = [r["temperature_c"] for r in readings if r["temperature_c"] is not None]
+    clocks_mhz = [r["clock_mhz"] for r in readings if r["clock_mhz"] is not None]
+    return {"temperature_c": max(temperatures_c, default=None), "clock_mhz": min(clocks_mhz, default=None)}

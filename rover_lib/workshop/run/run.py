@@ -131,7 +131,7 @@ def files_of_a_run(folder: Path) -> list[Path]:
     """List what a run left in its folder and what was later made from its artifacts. A new run replaces all of it."""
     stages = ("load", "calibrate", "quantize", "compare", "run", "arm", "parts", "drive", "students", "learn")
     names = [f"{stage}.json" for stage in (*stages, f"benchmark-{socket.gethostname()}")]
-    names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "report.html"]
+    names += [*(f"{n}.ipynb" for n in NAMES + AFTERWARDS), "figures", "hailo", "report.html"]
     own = [folder / n for n in names] + [p for pattern in OWN_FILES for p in folder.glob(pattern)]
     return [path for path in own if path.exists()]
 

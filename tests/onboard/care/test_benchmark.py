@@ -1,12 +1,14 @@
 """The benchmark: exact with fake clocks and hosts, and once with real ones."""
 
 import json
+import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from rover_lib.onboard.care.benchmark import Timing, benchmark
+from rover_lib.onboard.care import benchmark as module
+from rover_lib.onboard.care.benchmark import Timing, benchmark, clock_fall, describe_clock
 from rover_lib.onboard.columns import benchmark_rows
 from rover_lib.onboard.errors import ParamsError
 
@@ -76,6 +78,84 @@ def test_slow_policies_are_timed_less_often_but_often_enough(machine, bare_host)
     for took_ms, rounds in ((90, 56), (1000, 20)):
         policy = {"a": machine.policy("a", [took_ms])}
         assert machine.benchmark(policy, bare_host, warmup=0, iterations=100, at_most_s=5)["rounds"] == rounds
+
+
+class Hot:
+    """A host that gets 1 C warmer in 4 s, and from 80 C on lowers its clock, by which its plans take longer."""
+
+    def __init__(self, machine):
+        self.machine = machine
+
+    def __getattr__(self, name):
+        return lambda: None  # of memory and cores
+
+    def temperature_c(self):
+        return 50 + self.machine.now_s / 4
+
+    def clock_mhz(self):
+        return 1500.0 if self.temperature_c() >= 80 else 2400.0
+
+    def throttled(self):
+        return "0xe0008" if self.temperature_c() >= 80 else "0x0"
+
+    def supply_v(self):
+        return 5.1 - self.machine.now_s / 1000
+
+    def reading(self):
+        return {name: getattr(self, name)() for name in ("temperature_c", "clock_mhz", "throttled")}
+
+    def policy(self):
+        policy = self.machine.policy("a", [0])
+
+        def predict_chunk(frame, state):
+            self.machine.now_s += 60 / self.clock_mhz()
+
+        policy.predict_chunk = predict_chunk
+        return policy
+
+
+def test_minutes_show_from_when_a_hot_host_was_slow(machine):
+    host = Hot(machine)
+    found = machine.benchmark({"a": host.policy()}, host, warmup=0, iterations=1, minutes=3)
+    rows = found["over_time"]
+    assert [row["from_s"] for row in rows] == list(range(0, 180, 10))
+    assert sum(row["artifacts"]["a"]["n"] for row in rows) == found["rounds"] > 1000
+    expected = [(25, 2400, "0x0")] * 12 + [(40, 1500, "0xe0008")] * 6
+    for row, (ms, mhz, throttled) in zip(rows, expected, strict=True):
+        timed = row["artifacts"]["a"]
+        assert (timed["p50_ms"], timed["p95_ms"]) == pytest.approx((ms, ms)), row
+        assert (row["clock_mhz"], row["throttled"]) == (mhz, throttled)
+        assert row["temperature_c"] == pytest.approx(50 + (row["from_s"] + 10) / 4, abs=0.5)
+        assert row["supply_v"] == pytest.approx(5.1 - (row["from_s"] + 10) / 1000, abs=0.002)
+    assert clock_fall(rows) is rows[12]
+    assert describe_clock(rows) == "clock fell after 2:00 min at 82 C, from 2400 to 1500 MHz"
+    assert describe_clock(rows[:12]) == "clock did not fall: 2400 MHz at least"
+    assert machine.benchmark({"a": host.policy()}, host, iterations=30)["over_time"] == []
+
+
+def test_a_host_without_sensors_runs_for_minutes_too(machine, bare_host):
+    rows = machine.benchmark({"a": machine.policy("a", [1000])}, bare_host, warmup=0, minutes=0.5)["over_time"]
+    assert [row["artifacts"]["a"]["n"] for row in rows] == [10, 10, 10]
+    assert {row[key] for row in rows for key in ("clock_mhz", "throttled", "supply_v")} == {None}
+    assert describe_clock(rows) == "clock not reported"
+
+
+def test_the_firmware_is_asked_outside_the_confined_process(monkeypatch, pi_host):
+    """That process starts no program: each row gets what this one read in its ten seconds."""
+
+    def confined(function, **_):
+        began_s = time.perf_counter()
+        time.sleep(0.15)
+        row = {"throttled": None, "supply_v": None}
+        return {"began_s": began_s, "over_time": [row | {"from_s": 0.0}, row | {"from_s": 10.0}]}
+
+    monkeypatch.setattr(module, "run_confined", confined)
+    monkeypatch.setattr(module, "Host", lambda: pi_host)
+    monkeypatch.setattr(module, "FIRMWARE_S", 0.02)
+    monkeypatch.setattr(module, "_add_memory", lambda *_: None)
+    first, second = module.benchmark_artifacts({}, 1, {"minutes": 1})["over_time"]
+    assert (first["throttled"], first["supply_v"]) == ("0x50000", 5.02)
+    assert (second["throttled"], second["supply_v"]) == (None, None)
 
 
 def test_parameters_that_make_no_sense():
