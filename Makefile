@@ -12,6 +12,8 @@ LOOK := runs/look
 PROCESSES ?= $(shell echo $$(($$(nproc) + 1)))
 PYTEST := $(VENV)/bin/pytest --numprocesses $(PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 NAME ?= mine
+# Of the balloon worlds to look at: easy or hard. The page can change it.
+LEVEL ?= easy
 DEMO := runs/demo/.made
 # A container may have no user but root. Root may load artifacts here, as they were made here; see onboard/policy/confine.py.
 export ROVER_AS_ROOT := 1
@@ -21,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help look demo demo-more watch run notebooks-open docs test test-fast lint check-release mutants count notebooks
 
 help:
-	@echo "make look                                   in two minutes: a policy drives, in your browser"
+	@echo "make look [LEVEL=hard]                      in two minutes: a policy drives, in your browser"
 	@echo "make demo                                   in the balloon world: record, train, quantize, drive, and judge"
 	@echo "make watch                                  the demo's policy drives through that world, live in the browser"
 	@echo "make run CHECKPOINT=x.pth EPISODES=dir NAME=mine    the same five notebooks on your own policy"
@@ -54,7 +56,7 @@ $(READY): pyproject.toml lerobot_robot_rover/pyproject.toml
 # Without torch, in an environment of its own.
 look:
 	test -x $(LOOK)/bin/rover || { $(PYTHON) -m venv $(LOOK) && $(LOOK)/bin/pip install --quiet '.[look]'; }
-	$(LOOK)/bin/rover demo
+	$(LOOK)/bin/rover demo --level $(LEVEL)
 
 # As many steps as two minutes have, and no weights from the internet: the same policy on each machine of a kind.
 DEMO_TRAINING = --steps 880 --backbone none

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from balloon_world.level import EASY, LEVELS, level_named
 from rover_exchange.cli import open_browser
 from rover_lib.cli.prepare import Resumable
 from rover_lib.onboard.cli import FILE, open_view, view_options
@@ -18,6 +19,10 @@ from rover_lib.workshop.progress import terminal_bar
 # rover distill runs/demo/best_model.pth runs/demo/episodes --name tiny --backbone-channels 0.02 --feedforward 64
 # --steps 3000, with 3000 samples in params.yml; rover run; rover export --onnx
 DEMO = Path(__file__).with_name("demo.onnx.zip.gz")
+
+level_option = click.option(
+    "--level", type=click.Choice(list(LEVELS)), default=EASY.name, show_default=True, help="How hard the worlds are."
+)
 
 
 def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str, Any]:
@@ -31,7 +36,8 @@ def executed(notebook: str, run_dir: Path, stage: str, **given: Any) -> dict[str
 
 @click.command(short_help="Watch a learned policy drive, and push its car.")
 @view_options
-def demo(**options: Any) -> None:
+@level_option
+def demo(level: str, **options: Any) -> None:
     """Show a policy of 1 MB, part of this package, that drives through the balloon world, in your browser.
 
     Push its car off its way: with the arrow keys, or by a tap on a side of the picture.
@@ -43,7 +49,7 @@ def demo(**options: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         artifact = Path(folder, "policy_static.onnx.zip")
         artifact.write_bytes(gzip.decompress(DEMO.read_bytes()))
-        open_view(**options, opened=open_browser, shown=Simulation(artifact, title="rover demo"))
+        open_view(**options, opened=open_browser, shown=Simulation(artifact, "rover demo", level))
 
 
 @click.group(short_help="The balloon world: record, judge students, learn.")
@@ -55,11 +61,12 @@ def world() -> None:
 @click.argument("out_dir", type=FILE)
 @click.option("--count", type=click.IntRange(min=1), default=80, show_default=True, help="Number of episodes.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-def record(out_dir: Path, count: int, seed: int) -> None:
+@level_option
+def record(out_dir: Path, count: int, seed: int, level: str) -> None:
     """Record COUNT drives of the expert to OUT_DIR, in the format of the real car's recorder."""
     from balloon_world.record import record_episodes
 
-    click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar())}")
+    click.echo(f"recorded: {record_episodes(out_dir, count, seed, terminal_bar(), level_named(level))}")
 
 
 @world.command(short_help="Judge distilled policies beside their teacher.", cls=Resumable)
@@ -72,7 +79,8 @@ def record(out_dir: Path, count: int, seed: int) -> None:
     show_default=True,
     help="Worlds to drive in; 0 for a real car's policy.",
 )
-def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int) -> None:
+@level_option
+def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int, level: str) -> None:
     """Judge the students that `rover distill` left in STUDENT_RUNS beside the teacher in TEACHER_RUN.
 
     All policies drive through the same worlds: left alone, and pushed with plans that are as late as was computed for
@@ -81,7 +89,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int) -> 
     """
     from balloon_world.students import table
 
-    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": worlds}
+    given = {"students": [str(run.resolve()) for run in student_runs], "worlds": worlds, "level": level}
     click.echo(table(executed("08_distill", teacher_run, "students", **given)["metrics"]))
 
 
@@ -96,6 +104,7 @@ def students(teacher_run: Path, student_runs: tuple[Path, ...], worlds: int) -> 
     show_default=True,
     help="Worlds to judge in when pushed; half as many left alone.",
 )
+@level_option
 def learn(run_dir: Path, worlds: int, **options: Any) -> None:
     """Let the policy in RUN_DIR drive while an expert takes over where a human would, and train it further on that.
 

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from balloon_world.level import EASY, Level
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.car.camera import Frame
 from rover_lib.onboard.car.car import Car, this_car
@@ -44,7 +45,7 @@ Watch = Callable[[Order], bool]
 class Driven:
     """A drive through a world.
 
-    outcome: 'hit', 'left', 'timeout', 'stopped' if a plan became too old to drive by or a place was unfamiliar, or
+    outcome: a World's, 'stopped' if a plan became too old to drive by or a place was unfamiliar, or
     'taken over'. orders: what was commanded at each tick.
     """
 
@@ -293,8 +294,9 @@ def run_trials(
     seed: int = SEED,
     replan_every: int = 8,
     progress: Progress = silent,
+    level: Level = EASY,
 ) -> TrialReport:
-    """Drive through `worlds` worlds with the seeds from `seed` on, in closed loop at 30 Hz.
+    """Drive through `worlds` worlds of a level with the seeds from `seed` on, in closed loop at 30 Hz.
 
     policy: an artifact's Policy, or anything else with `chunk` and `predict_chunk`. replan_every: how many actions of
     each chunk are driven before the policy sees the next frame; its state is the action commanded before, neutral at
@@ -307,7 +309,7 @@ def run_trials(
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
-    hit = tuple(_hits_in(policy, World(world_seed, left=left), replan_every) for world_seed in seeds)
+    hit = tuple(_hits_in(policy, World(world_seed, left=left, level=level), replan_every) for world_seed in seeds)
     return TrialReport(sum(hit), worlds, hit)
 
 

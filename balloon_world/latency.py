@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere
+from balloon_world.level import level_named
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.plan import Settings
@@ -30,14 +31,16 @@ def measure_latencies(
     latencies_ms: Sequence[float],
     pushes: int = 0,
     pushed_latencies_ms: Sequence[float] = (),
+    level: str = "easy",
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
 
     It drives at each of latencies_ms with and without compensation, and at each of pushed_latencies_ms the same way,
-    with `pushes` pushes in each world.
-    Raises TrainingError if there is no policy, no world or no latency.
+    with `pushes` pushes in each world. level: of the worlds.
+    Raises TrainingError if there is no policy, no world, no latency or no such level.
     """
+    of_level = level_named(level)
     p, artifact = params(), Path(run_dir) / f"policy_{GATED}.pt"
     if not artifact.is_file():
         raise TrainingError(f"{artifact}: not there", remedy="rover run makes it")
@@ -45,7 +48,7 @@ def measure_latencies(
         raise TrainingError("drives need at least one latency and one world", found=f"{latencies_ms} and {worlds}")
     given = {"worlds": worlds, "seed": SEED, "latencies_ms": latencies_ms, "pushes": pushes, "drive": p["drive"]}
     limit_pct = p["gates"]["worlds_lost_pct"]
-    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct}
+    given |= {"pushed_latencies_ms": pushed_latencies_ms, "limit_pct": limit_pct, "level": level}
     inputs = {artifact.name: content_hash(artifact)}  # unchanged if the same policy is exported again
     settings, rows = Settings.of(p["drive"]), list[dict[str, Any]]()
     for ms, count in [(ms, 0) for ms in latencies_ms] + [(ms, pushes) for ms in pushed_latencies_ms]:
@@ -57,7 +60,7 @@ def measure_latencies(
     def one(policy: Any, asked: tuple[int, int]) -> Driven:
         how, seed = rows[asked[0]], asked[1]
         chosen = replace(settings, compensate=how["compensate"])
-        return drive_in(policy, World(seed, how["pushes"]), how["latency_ms"] / 1e3, chosen)
+        return drive_in(policy, World(seed, how["pushes"], level=of_level), how["latency_ms"] / 1e3, chosen)
 
     asked = list(product(range(len(rows)), range(SEED, SEED + worlds)))
     driven = dict(progress(everywhere(artifact, asked, one), desc="driving", total=len(asked)))
@@ -70,7 +73,9 @@ def measure_latencies(
 def _found(driven: Sequence[Driven]) -> dict[str, Any]:
     """Return what a row of drive.json says of its drives."""
     outcomes = [d.outcome for d in driven]
-    found = count_hits(outcomes) | {outcome: outcomes.count(outcome) for outcome in ("left", "timeout", "stopped")}
+    found = count_hits(outcomes) | {
+        outcome: outcomes.count(outcome) for outcome in ("left", "bumped", "timeout", "stopped")
+    }
     ages_ms = 1e3 * np.array([o.age_s for d in driven for o in d.orders])
     for name, q in (("min", 0), ("p50", 50), ("p95", 95), ("max", 100)):
         found[f"plan_age_{name}_ms"] = round(float(np.percentile(ages_ms, q)), 3) if len(ages_ms) else None

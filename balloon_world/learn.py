@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from balloon_world.drives import SEED, car_in_key, count_hits, drive_in, drive_missing, judge
+from balloon_world.level import EASY, level_named
 from balloon_world.record import BETWEEN_DRIVES, WorldEpisode, episode_name
 from balloon_world.world import RATE_HZ, World, expert
 from rover_learn.finetune import FinetuneRecipe, finetune
@@ -104,6 +105,7 @@ class Experiment:
 
     rounds, drives: the number of rounds, and of drives in each. worlds: how many judge a policy that is pushed;
     other_worlds: left alone, and with decoys. pushes, decoys: in a world; every second world to learn in has decoys.
+    level: of all worlds.
     samples: frames of each round, and of the first recordings, at most. steps: of learning; the recipe's if None.
     """
 
@@ -116,13 +118,17 @@ class Experiment:
     decoys: int = 1
     samples: int = 700
     steps: int | None = None
+    level: str = EASY.name
 
     def drive(self, policy: Policy, world: World, watch: Callable[[Order], bool] | None = None) -> str:
         return drive_in(policy, world, self.latency_ms / 1e3, Settings.of(params()["drive"]), watch).outcome
 
     def learned_in(self, number: int, seed: int) -> World:
         """Return the world of a round's drive by its number."""
-        return World(seed, self.pushes, self.decoys if number % 2 else 0)
+        return self.world(seed, self.pushes, self.decoys if number % 2 else 0)
+
+    def world(self, seed: int, pushes: int, decoys: int) -> World:
+        return World(seed, pushes, decoys, level=level_named(self.level))
 
     def recipe(self) -> FinetuneRecipe:
         """Return the recipe for both arms. It learns from all recordings of the rounds, as worlds judge here."""
@@ -146,6 +152,8 @@ def run_experiment(
     how = {"drive": params()["drive"], "recipe": asdict(experiment.recipe()), "seed": SEED, **car_in_key()}
     given = plain(asdict(experiment) | how)
     learned = {name: value for name, value in given.items() if name not in JUDGING}  # more worlds may judge later
+    if experiment.level == EASY.name:
+        del learned["level"]  # what was learned before there were levels stays valid
     lab = _Lab(experiment, run_dir, out_dir / key_of({"params": learned, "inputs": inputs}), progress)
     rounds = [lab.round(number) for number in range(1, experiment.rounds + 1)]
     rows = lab.judge(rounds)
@@ -219,7 +227,7 @@ class _Lab:
         experiment = self.experiment
 
         def one(policy: Policy, how: str, seed: int) -> str:
-            world = World(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
+            world = experiment.world(seed, experiment.pushes * (how == PUSHED), experiment.decoys * (how == DECOY))
             return experiment.drive(policy, world)
 
         counts = {how: experiment.worlds if how == PUSHED else experiment.other_worlds for how in HOW}

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from balloon_world import world as world_module
+from balloon_world.level import EASY, HARD, Level, level_in_key
 from balloon_world.world import FRAME_HEIGHT, FRAME_WIDTH, RATE_HZ, World, expert
 from rover_lib.onboard.car import pwm as pwm_module
 from rover_lib.onboard.car.car import this_car
@@ -26,7 +27,8 @@ from rover_lib.workshop.progress import Progress, silent
 LABEL = "hit red balloon"
 JPEG_QUALITY = 85
 PORT = "playground"  # of its Arduino
-SHOVES = 2  # without shoves the expert never shows how to come back on course, and the policy never learns it
+# Without shoves the expert never shows how to come back on course, and the policy never learns it.
+SHOVES = {EASY: 2, HARD: 4}
 MARKER = ".recorded.json"
 # An invented time, so that a seed's recording has the same bytes every time.
 FIRST_DRIVE = datetime(2025, 1, 1, 12, tzinfo=UTC)
@@ -35,17 +37,19 @@ FIRST_WORLD = 1_000_000  # far from the worlds that trials drive in
 CONTROL_LATENCY_S = 0.004  # how long after its frame a control arrives over the serial line
 
 
-def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progress: Progress = silent) -> Path:
+def record_episodes(
+    out_dir: Path | str, count: int = 80, seed: int = 0, progress: Progress = silent, level: Level = EASY
+) -> Path:
     """Let the expert drive through `count` worlds, with shoves that it corrects; record an episode folder per drive.
 
     out_dir: appears complete or not at all; if it already holds the same recording, it is left as it is. One that
-    another version recorded, and nobody has touched since, is replaced.
+    another version recorded, and nobody has touched since, is replaced. level: of the worlds.
     Returns out_dir. On one machine the same count and seed give the same bytes.
     Raises TrainingError for a negative seed, or an out_dir with something else in it.
     """
     out_dir, names = Path(out_dir), {episode_name(_start_of(index, seed)) for index in range(count)}
-    made_of = {"count": count, "seed": seed, "shoves": SHOVES, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
-    made_of["car"] = this_car().description()
+    made_of = {"count": count, "seed": seed, "jpeg_quality": JPEG_QUALITY, "cv2": cv2.__version__}
+    made_of |= {"shoves": SHOVES[level], "car": this_car().description(), **level_in_key(level)}
     key = key_of(made_of, world_module, recording, pwm_module, sys.modules[__name__])
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         if _marker_of(out_dir).get("key") == key:
@@ -54,7 +58,7 @@ def record_episodes(out_dir: Path | str, count: int = 80, seed: int = 0, progres
             raise TrainingError(f"{out_dir}: exists and is not this recording", remedy="name another folder")
     # OpenCV releases the interpreter's lock while it draws and compresses, so threads help.
     with build_folder(out_dir) as new, ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        drives = pool.map(lambda index: record_drive(new, index, seed), range(count))
+        drives = pool.map(lambda index: record_drive(new, index, seed, level), range(count))
         hits = sum(progress(drives, desc="recording", total=count))
         (new / MARKER).write_text(json.dumps({"key": key, "count": count, "seed": seed, "hits": hits}) + "\n")
         if out_dir.exists() and not any(out_dir.iterdir()):
@@ -77,9 +81,9 @@ def _is_untouched(folder: Path, names: set[str]) -> bool:
     return all(path.stat().st_mtime_ns <= marked_ns for path in folder.rglob("*") if path.is_file())
 
 
-def record_drive(folder: Path, index: int, seed: int) -> bool:
+def record_drive(folder: Path, index: int, seed: int, level: Level = EASY) -> bool:
     """Record drive number `index` of a seed into folder/episode_YYYYMMDD_HHMMSS; return whether it hit the balloon."""
-    world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES)
+    world = World(FIRST_WORLD * (seed + 1) + index, shoves=SHOVES[level], level=level)
     with WorldEpisode(folder, _start_of(index, seed), world) as episode:
         while not world.done:
             # The car drives by what the recording says: the action as the Arduino measures it.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 
 from balloon_world.drives import SEED, NoLog, TimedCar
+from balloon_world.level import EASY, LEVELS, level_named
 from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.artifact.manifest import ONNX_SUFFIX
 from rover_lib.onboard.drive.plan import Settings
@@ -35,7 +36,14 @@ THREADS = 1
 MODES = {"static": "INT8", "mixed": "mixed INT8", "fp32": "FP32"}  # that can be chosen on the page, as it calls them
 SIDES = {"push left": 1, "push right": -1}  # what the page of a simulation, and no other, can do to the car
 SCRIPT = Path(__file__).with_name("simulation.js").read_bytes()
-SAID = {"hit": "hit!", "left": "missed it", "timeout": "out of time", "stopped": "stopped", "taken over": "stopped"}
+SAID = {
+    "hit": "hit!",
+    "left": "missed it",
+    "bumped": "drove into it",
+    "timeout": "out of time",
+    "stopped": "stopped",
+    "taken over": "stopped",
+}
 
 Post = Callable[[dict[str, Any], bytes], object]  # a message as in feed.py, and a JPEG
 
@@ -46,12 +54,13 @@ class Simulation:
     Whoever watches can push the car off its way. A drive with pushes is counted apart from the undisturbed ones.
 
     artifact: as policy_<mode>; the run's other modes, which lie beside it, can be chosen on the page. title: the
-    page's; "": the name of the artifact's folder. Raises what load_policy() raises.
+    page's; "": the name of the artifact's folder. level: of the first worlds; the page can choose another.
+    Raises what load_policy() raises.
     """
 
     script = SCRIPT  # for the page
 
-    def __init__(self, artifact: Path | str, title: str = ""):
+    def __init__(self, artifact: Path | str, title: str = "", level: str = EASY.name):
         artifact = Path(artifact)
         self._title = title or artifact.parent.name
         suffix = ONNX_SUFFIX if artifact.name.endswith(ONNX_SUFFIX) else artifact.suffix
@@ -62,8 +71,10 @@ class Simulation:
         self._wanted = next(name for name, path in self._paths.items() if path == artifact)
         self._policies: dict[str, Policy] = {self._wanted: load_policy(artifact, threads=THREADS)}
         self.car = self._policies[self._wanted].car
-        self._results = {name: [0, 0] for name in self._paths}  # undisturbed drives: hits, all
-        self._pushed = [0, 0]  # drives in which somebody pushed the car: hits, all
+        self._level = level_named(level)
+        # of each level: hits and all of the undisturbed drives, and of those in which somebody pushed the car
+        self._results = {name: {policy: [0, 0] for policy in self._paths} for name in LEVELS}
+        self._pushed = {name: [0, 0] for name in LEVELS}
         self._seed = SEED
         cv2.setNumThreads(THREADS)
         self._closing, self._next, self._held = threading.Event(), threading.Event(), False
@@ -91,17 +102,23 @@ class Simulation:
             self.ask("stop")
 
     def ask(self, what: str) -> None:
-        """Do what the page asks for: "stop", "next", a push, or "drive <name>" of another mode. Ignore all else."""
+        """Do what the page asks for, and ignore all else.
+
+        That is "stop", "next", a push, "drive <name>" of another mode, or "level <name>".
+        """
         if what in SIDES:
             if self._driving:
                 self._driving.push(SIDES[what])
             return
         name = what.removeprefix("drive ")
-        if what != "stop" and what != "next" and name not in self._paths:
+        level = what.removeprefix("level ")
+        if what != "stop" and what != "next" and name not in self._paths and level not in LEVELS:
             return
         self._held = what == "stop"
         if name in self._paths:
             self._wanted = name
+        if level in LEVELS:
+            self._level = LEVELS[level]
         if self._driving:
             self._seed += what == "next" and not self._driving.world.done  # another policy gets the same world
             self._driving.stop.set()
@@ -112,16 +129,16 @@ class Simulation:
         """Drive through `worlds` worlds, None: until the view has ended. post: takes each picture."""
         settings, driven = Settings.of(params()["drive"]), 0
         while not self._closing.is_set() and driven != worlds:
-            name = self._wanted
+            name, level = self._wanted, self._level
             if name not in self._policies:
                 self._policies[name] = load_policy(self._paths[name], threads=THREADS)
-            world = World(self._seed, left=self.car.left)  # as in run_trials: older recordings turned left
+            world = World(self._seed, left=self.car.left, level=level)  # as in run_trials: older recordings turned left
             car = self._driving = PacedCar(world, self._policies[name], lambda car: post(*self._seen(car)))
             self._next.clear()
             outcome = car.drive(settings, car.log).outcome
             driven += 1
             if car.world.done or not car.stop.is_set():  # what somebody interrupted counts for nobody
-                counted = self._pushed if car.pushes else self._results[name]
+                counted = self._pushed[level.name] if car.pushes else self._results[level.name][name]
                 counted[0] += car.world.hit
                 counted[1] += 1
                 self._seed += 1
@@ -154,8 +171,10 @@ class Simulation:
             head["plan"] = {"captured_s": plan.captured_s, "rate_hz": rate_hz, "actions": plan.actions.tolist()}
         head["world"] = {
             "seed": world.seed,
-            "pushed": self._pushed,
-            "results": self._results,
+            "level": world.level.name,
+            "levels": list(LEVELS),
+            "pushed": self._pushed[world.level.name],
+            "results": self._results[world.level.name],
             "drives": self._wanted,
             "path": [[round(s.x_m, 2), round(s.y_m, 2)] for s in (*world.trajectory[::3], world.state)],
             "balloon": [world.balloon.x_m, world.balloon.y_m],

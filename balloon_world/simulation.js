@@ -27,11 +27,10 @@ function ask(what) {
 simulated = m => {
   const w = m.world;
   if (!w) return;
-  const names = [...Object.keys(w.results), ""];
-  if (choices.childElementCount !== names.length) {
+  const ids = [...Object.keys(w.results).map(name => "drive " + name), ...w.levels.map(name => "level " + name), "next"];
+  if (choices.childElementCount !== ids.length) {
     choices.replaceChildren();
-    for (const name of names) {
-      const id = name ? "drive " + name : "next";
+    for (const id of ids) {
       element("button", id, choices).addEventListener("click", () => ask(id));
     }
   }
@@ -39,6 +38,10 @@ simulated = m => {
     const b = $("drive " + name), [hits, worlds] = w.results[name];
     b.textContent = name + (worlds ? ", undisturbed: hit " + hits + " of " + worlds : ": drive it");
     b.className = name === w.drives ? "on" : "";
+  }
+  for (const name of w.levels) {
+    $("level " + name).textContent = name + " worlds";
+    $("level " + name).className = name === w.level ? "on" : "";
   }
   put("next", "next world");
   const [pushedHits, pushed] = w.pushed;

@@ -17,6 +17,7 @@ import torch
 
 from balloon_world import drives, world
 from balloon_world.drives import SEED, car_in_key, count_hits, drive_in, everywhere, judge, run_trials
+from balloon_world.level import EASY, Level, level_in_key, level_named
 from balloon_world.world import World
 from rover_learn.distill import errors_of, shape_of
 from rover_lib.onboard.artifact.manifest import content_hash, read_manifest
@@ -79,6 +80,7 @@ def judge_students(
     *,
     episodes: Path | str | None = None,
     worlds: int = 200,
+    level: str = "easy",
     held_out_frames: int = 300,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -87,8 +89,10 @@ def judge_students(
     students: folders that `rover distill` left, each with a policy_static.pt. episodes: the recordings to judge with,
     those of the teacher's run if None. worlds: how many each policy drives through twice, left alone as in
     `run_trials`, and pushed at the latency computed for it; 0 for a real car's policy, which has no world.
+    level: of the worlds.
     Raises TrainingError for runs that do not belong together, RoverError and ArtifactError for a missing file.
     """
+    of_level = level_named(level)
     folder, p = Path(run_dir).resolve(), params()
     runs = _runs(folder, [Path(student).resolve() for student in students])
     source = Source.loaded(read_stage(folder / "load.json", "load")["params"], episodes)
@@ -102,7 +106,7 @@ def judge_students(
         plans = _plans(run.artifact, run.name, samples, progress)
         pushed_ms = (run.row["computed_ms"] or (None, None))[1] if counted else 1e3 * run.manifest["gmac"] / GMAC_PER_S
         row = run.row | errors_of(plans, taught, samples, recordings.action_range())
-        rows.append(row | _drives(run, worlds, pushed_ms, progress))
+        rows.append(row | _drives(run, worlds, pushed_ms, of_level, progress))
     metrics = {
         "students": rows,
         "recommendation": recommendation(rows, p["students"]),
@@ -112,7 +116,7 @@ def judge_students(
         "warnings": not_judged(recordings.action_range()),
         "notes": [COUNTED if counted else ESTIMATED] if worlds else [NOBODY_DROVE],
     }
-    how = {"worlds": worlds, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
+    how = {"worlds": worlds, "level": level, "seed": SEED, "pushes": PUSHES, "drive": p["drive"]}
     how["students"] = [run.name for run in runs[1:]]
     inputs = {f"{run.name}/{ARTIFACT}": sha256_of(run.artifact) for run in runs}
     return write_stage(folder / "students.json", "students", params=how, metrics=metrics, inputs=inputs)
@@ -150,15 +154,15 @@ def _plans(artifact: Path, name: str, samples: Sequence[Sample], progress: Progr
 # --- in worlds --------------------------------------------------------------------------------------------------------
 
 
-def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress) -> dict[str, Any]:
+def _drives(run: _Run, worlds: int, pushed_ms: float | None, level: Level, progress: Progress) -> dict[str, Any]:
     """Return a row's hits, left alone and pushed; all None if nobody drove. pushed_ms: None if it is not known."""
     how = params()["drive"]
 
     def one(policy: Policy, kind: str, seed: int) -> str:
-        return drive_once(policy, seed, pushed_ms if kind else None, Settings.of(how))
+        return drive_once(policy, seed, pushed_ms if kind else None, Settings.of(how), level)
 
     driven_by = {"artifact": content_hash(run.artifact), "torch": torch.__version__, **car_in_key()}
-    driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms}
+    driven_by |= {"drive": how, "pushes": PUSHES, "late": pushed_ms, **level_in_key(level)}
     path = cache_root() / f"drives-{key_of(driven_by, world, drives, loop, pilot, plan)}.jsonl"
     counts = {kind: worlds for kind in HOW if worlds and not (kind and pushed_ms is None)}
     found = judge(run.artifact, counts, one, path, progress, run.name)
@@ -169,11 +173,11 @@ def _drives(run: _Run, worlds: int, pushed_ms: float | None, progress: Progress)
     return row
 
 
-def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Settings) -> str:
+def drive_once(policy: Policy, seed: int, late_ms: float | None, settings: Settings, level: Level = EASY) -> str:
     """Drive through the world of a seed and return the outcome: left alone, or pushed if plans are late_ms late."""
     if late_ms is None:
-        return "hit" if run_trials(policy, worlds=1, seed=seed).hits else "missed"
-    return drive_in(policy, World(seed, PUSHES), late_ms / 1e3, settings).outcome
+        return "hit" if run_trials(policy, worlds=1, seed=seed, level=level).hits else "missed"
+    return drive_in(policy, World(seed, PUSHES, level=level), late_ms / 1e3, settings).outcome
 
 
 # --- the rule ---------------------------------------------------------------------------------------------------------

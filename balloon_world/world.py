@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from balloon_world.level import EASY, Level
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.errors import TrainingError
 
@@ -21,7 +22,7 @@ _CAR = this_car()  # its wheelbase, focal length and limits of the throttle are 
 
 RATE_HZ = 30.0
 FRAME_HEIGHT, FRAME_WIDTH = 360, 640
-TIMEOUT_S = 8.0
+TIMEOUT_S = EASY.timeout_s
 
 # The car. Full steering turns the wheels by 34 degrees. A throttle of 0.09, the highest in real recordings of drives,
 # gives 1.1 m/s.
@@ -32,7 +33,7 @@ SPEED_PER_THROTTLE_MPS = 12.0
 SPEED_LAG_S = 0.2
 
 # The expert.
-STEERING_MOST = 0.65
+STEERING_MOST, STEERING_MOST_AROUND = 0.65, 0.9  # to the balloon, and where something may be in the way
 THROTTLE_MOST = 0.09
 THROTTLE_RISE_PER_S = 0.20  # from a stand to full in half a second
 THROTTLE_FALL_PER_S = 0.30
@@ -47,12 +48,19 @@ BALLOON_RADIUS_M = 0.16
 BALLOON_HEIGHT_M = 0.24  # of its centre above the floor
 HIT_DISTANCE_M = 0.30  # from the camera to the balloon's centre; at this distance the bumper touches the balloon
 ARENA_RADIUS_M = 7.0
+CAR_HALF_M = 0.06  # of the bumper's width: what is solid ends the drive when the bumper's middle is so near to it
+CLEARANCE_M = 0.28  # that the expert keeps between the bumper's middle and what is solid
 
 PUSH_S, PUSH_RAD, PUSH_M = 0.15, 0.4, 0.1  # of somebody's push: its duration, the turn and the shift
 DECOY_ASIDE_RAD = 0.25  # the least angle between a decoy and the balloon, as seen from the start
 
+DRAG = 4.0  # how many times longer a push takes that drags the car
+GAP_M = 0.75  # between what hides the balloon and other things
+SEEN_RAD = 0.8  # what is solid farther aside than this is beside the car
+
 FLOOR_PX_PER_M = 160
 FLOOR_TILE_PX = 640
+GLARE_PX = 110
 FAR_ROWS = 24  # rows below the horizon that show a blurred floor, as a sharp one would flicker so far away
 
 # fmt: off
@@ -60,6 +68,7 @@ _DISTRACTOR_BGR = (
     (190, 90, 30), (70, 150, 40), (40, 190, 215), (150, 60, 120),
     (205, 200, 195), (45, 45, 45), (170, 170, 40), (90, 115, 140),
 )
+_NEARLY_RED_BGR = ((25, 105, 225), (140, 75, 215), (120, 25, 190), (35, 35, 110), (40, 160, 235))
 # fmt: on
 
 
@@ -104,31 +113,49 @@ class World:
 
     seed: determines everything that is random. shoves: how many pushes the car gets on its way. decoys: how many red
     things stand about that are not balloons; else only the balloon is red. left: 1 if positive steering turns left, -1
-    if right; None: as this machine's car.
+    if right; None: as this machine's car. level: what else is in the way, and how the car drives.
     """
 
-    def __init__(self, seed: int, shoves: int = 0, decoys: int = 0, left: int | None = None):
+    def __init__(self, seed: int, shoves: int = 0, decoys: int = 0, left: int | None = None, level: Level = EASY):
         if seed < 0:
             raise TrainingError("a world's seed must not be negative", found=seed)
         self.seed = seed
         self.left = left or _CAR.left
+        self.level = level
         rng = np.random.default_rng([seed, 20_251])
         self.state = CarState()
-        distance, bearing = rng.uniform(1.8, 4.0), rng.uniform(-0.5, 0.5)
+        distance, bearing = rng.uniform(*level.distance_m), rng.uniform(-level.bearing_rad, level.bearing_rad)
         red = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(190, 240)))
         x, y = distance * math.cos(bearing), distance * math.sin(bearing)
         self.balloon = Thing("balloon", x, y, BALLOON_RADIUS_M, BALLOON_HEIGHT_M, red)
         self.distractors = tuple(_distractors(rng, self.balloon))
+        more = np.random.default_rng([seed, 20_254])
+        decoys = max(decoys, int(more.integers(level.decoys + 1)))
         self.distractors += tuple(_decoys(np.random.default_rng([seed, 20_253]), self.balloon, decoys))
+        alike = more.random() < level.alike
+        if alike:
+            self.distractors = tuple(_nearly_red(more, thing) for thing in self.distractors)
+        if more.random() < level.hidden:
+            hider = _hider(more, self.balloon, more.uniform(*level.hidden_share))
+            apart = [t for t in self.distractors if math.hypot(t.x_m - hider.x_m, t.y_m - hider.y_m) > GAP_M]
+            self.distractors = (*apart, hider)
+        self.solid = self.distractors if level.solid else ()
         self.trajectory = [self.state]
-        # 'hit', 'left' (the car passed the balloon or left the arena) or 'timeout'
+        # 'hit', 'left' (the car passed the balloon or left the arena), 'bumped' (into what is solid) or 'timeout'
         self.outcome: str | None = None
-        self._shoves = tuple(_shoves(np.random.default_rng([seed, 20_252]), shoves))
+        self._shoves = tuple(_shoves(np.random.default_rng([seed, 20_252]), max(shoves, level.shoves), level.drags))
         self._floor, self._far_floor = _floor(rng)
         self._wall = _wall(rng)
-        self._light = _light(rng)
-        self._gain = rng.uniform(0.75, 1.15)
-        self._flicker = rng.uniform(0.0, 0.12), rng.uniform(0.5, 2.0), rng.uniform(0, 2 * math.pi)
+        self._light = _light(rng, level.tint)
+        self._gain = rng.uniform(*level.gain)
+        self._flicker = rng.uniform(0.0, level.flicker), rng.uniform(*level.flicker_hz), rng.uniform(0, 2 * math.pi)
+        self._speed, self._steering, self._slip_s = (
+            more.uniform(*each) for each in (level.speed, level.steering, level.slip_s)
+        )
+        if alike:
+            _paint_red(more, self._floor, self._far_floor, self._wall)
+        self._glare = _glare(more, level.glare) if level.glare else None
+        self._glare_at = more.uniform(-0.8, 0.8), int(more.integers(-40, 260))  # its bearing and its row
 
     @property
     def hit(self) -> bool:
@@ -155,10 +182,10 @@ class World:
             raise TrainingError(f"world {self.seed} has ended ({self.outcome})", remedy="make a new one")
         s = self.state
         wheels = s.steering + (steering - s.steering) * (1 - math.exp(-dt / STEERING_LAG_S))
-        wanted = throttle * SPEED_PER_THROTTLE_MPS
+        wanted = throttle * SPEED_PER_THROTTLE_MPS * self._speed
         speed = s.speed_mps + (wanted - s.speed_mps) * (1 - math.exp(-dt / SPEED_LAG_S))
-        yaw_rps = speed / WHEELBASE_M * math.tan(self.left * wheels * WHEEL_ANGLE_RAD)
-        sideways_mps = 0.0
+        yaw_rps = speed / WHEELBASE_M * math.tan(self.left * wheels * WHEEL_ANGLE_RAD) * self._steering
+        sideways_mps = -self._slip_s * speed * yaw_rps  # outwards, as the tyres slip
         for shove in self._shoves:
             if shove.start_s <= s.time_s < shove.end_s:
                 yaw_rps += shove.yaw_rps
@@ -179,14 +206,20 @@ class World:
         distance, bearing = self.balloon_seen()
         if distance < HIT_DISTANCE_M:
             self.outcome = "hit"
+        elif any(self.seen(thing)[0] < thing.radius_m + CAR_HALF_M for thing in self.solid):
+            self.outcome = "bumped"
         elif (distance < 1.5 and abs(bearing) > 1.4) or math.hypot(self.state.x_m, self.state.y_m) > ARENA_RADIUS_M:
             self.outcome = "left"
-        elif self.state.time_s >= TIMEOUT_S:
+        elif self.state.time_s >= self.level.timeout_s:
             self.outcome = "timeout"
 
     def balloon_seen(self) -> tuple[float, float]:
         """Return the balloon's distance in metres and its bearing in radians from the camera."""
-        ahead, left = self._local(self.balloon.x_m, self.balloon.y_m)
+        return self.seen(self.balloon)
+
+    def seen(self, thing: Thing) -> tuple[float, float]:
+        """Return a thing's distance in metres and its bearing in radians from the camera."""
+        ahead, left = self._local(thing.x_m, thing.y_m)
         return math.hypot(ahead, left), math.atan2(left, ahead)
 
     def _local(self, x_m: float, y_m: float) -> tuple[float, float]:
@@ -209,7 +242,12 @@ class World:
             _draw_thing(frame, ahead, left, thing)
         depth, rate, phase = self._flicker
         gain = self._gain * (1 + depth * math.sin(rate * self.state.time_s + phase))
-        return cv2.multiply(frame, self._light, scale=gain / 128)
+        lit: np.ndarray = cv2.multiply(frame, self._light, scale=gain / 128)
+        if self._glare is not None:
+            bearing, row = self._glare_at
+            column = CENTRE_COLUMN - (bearing - self.state.heading_rad) * FOCAL_PX
+            _add_light(lit, self._glare, round(column), row)
+        return lit
 
     def _draw_floor(self, frame: np.ndarray) -> None:
         s = self.state
@@ -230,13 +268,27 @@ class World:
 def expert(world: World) -> tuple[float, float]:
     """Return what a good driver does now: (steering, throttle)."""
     distance, bearing = world.balloon_seen()
-    steering = world.left * float(np.clip(1.1 * bearing, -STEERING_MOST, STEERING_MOST))
+    bearing = _around(world, distance, bearing)
+    most = STEERING_MOST_AROUND if world.solid else STEERING_MOST
+    steering = world.left * float(np.clip(1.1 * bearing, -most, most))
     in_turn = 1 - 0.55 * min(1.0, abs(bearing) / 0.5)
     near = float(np.clip(0.35 + 0.65 * (distance - 0.5) / 1.2, 0.35, 1.0))
     wanted = THROTTLE_MOST * in_turn * near
     before = world.state.throttle_command
     throttle = min(max(wanted, before - THROTTLE_FALL_PER_S / RATE_HZ), before + THROTTLE_RISE_PER_S / RATE_HZ)
     return steering, throttle
+
+
+def _around(world: World, distance: float, bearing: float) -> float:
+    """Return where to drive instead of straight to the balloon: past what is solid, on the balloon's side of it."""
+    for thing in sorted(world.solid, key=lambda thing: world.seen(thing)[0]):
+        away, at = world.seen(thing)
+        if away > distance or abs(at) > SEEN_RAD:
+            continue
+        least = math.asin(min(1.0, (thing.radius_m + CLEARANCE_M) / away))
+        if abs(bearing - at) < least:
+            return at + math.copysign(least, bearing - at)
+    return bearing
 
 
 def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
@@ -256,6 +308,23 @@ def _distractors(rng: np.random.Generator, balloon: Thing) -> Iterator[Thing]:
         yield Thing(kind, x, y, radius, height, (blue, green, red))
 
 
+def _nearly_red(rng: np.random.Generator, thing: Thing) -> Thing:
+    blue, green, red = _NEARLY_RED_BGR[int(rng.integers(len(_NEARLY_RED_BGR)))]
+    return replace(thing, colour=(blue, green, red)) if rng.random() < 0.5 else thing
+
+
+def _hider(rng: np.random.Generator, balloon: Thing, hidden_share: float) -> Thing:
+    """Return what stands on the way to the balloon and hides this share of its width from the start."""
+    to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
+    kind = str(rng.choice(["balloon", "box", "cone"]))
+    colour = (*_DISTRACTOR_BGR, *_NEARLY_RED_BGR)[int(rng.integers(len(_DISTRACTOR_BGR) + len(_NEARLY_RED_BGR)))]
+    radius, distance = rng.uniform(0.10, 0.16), to_balloon * rng.uniform(0.5, 0.65)
+    widths = balloon.radius_m / to_balloon, radius / distance
+    aside = rng.choice([-1.0, 1.0]) * (sum(widths) - 2 * hidden_share * widths[0])
+    x, y = distance * math.cos(bearing + aside), distance * math.sin(bearing + aside)
+    return Thing(kind, x, y, radius, rng.uniform(0.24, 0.45), colour)
+
+
 def _decoys(rng: np.random.Generator, balloon: Thing, count: int) -> Iterator[Thing]:
     """Yield boxes and cones in a balloon's red, about as far away as the balloon and well beside the way to it."""
     to_balloon, bearing = math.hypot(balloon.x_m, balloon.y_m), math.atan2(balloon.y_m, balloon.x_m)
@@ -268,11 +337,13 @@ def _decoys(rng: np.random.Generator, balloon: Thing, count: int) -> Iterator[Th
         yield Thing(kind, x, y, rng.uniform(0.10, 0.18), rng.uniform(0.2, 0.45), red)
 
 
-def _shoves(rng: np.random.Generator, count: int) -> Iterator[Shove]:
+def _shoves(rng: np.random.Generator, count: int, drags: float) -> Iterator[Shove]:
     for i in range(count):
         start = 0.3 + 1.1 * i + rng.uniform(0.0, 0.8)
         length = rng.uniform(0.10, 0.20)
         turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.12, 0.45)
+        if drags and rng.random() < drags:
+            length *= DRAG
         yield Shove(start, start + length, turn / length, rng.uniform(-0.12, 0.12) / length)
 
 
@@ -327,12 +398,41 @@ def _wall(rng: np.random.Generator) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate([wall, wall[:, :FRAME_WIDTH]], axis=1))
 
 
-def _light(rng: np.random.Generator) -> np.ndarray:
+def _paint_red(rng: np.random.Generator, floor: np.ndarray, far_floor: np.ndarray, wall: np.ndarray) -> None:
+    """Paint round spots in a balloon's red on the floor, and on the wall above the horizon."""
+    blurred, turn = FLOOR_TILE_PX // far_floor.shape[0], wall.shape[1] - FRAME_WIDTH
+    for _ in range(int(rng.integers(1, 7))):
+        colour = (int(rng.integers(20, 50)), int(rng.integers(15, 45)), int(rng.integers(170, 240)))
+        centre, radius = rng.integers(30, FLOOR_TILE_PX - 30, 2), int(rng.integers(12, 28))
+        cv2.circle(floor, centre.tolist(), radius, colour, cv2.FILLED, cv2.LINE_AA)
+        cv2.circle(far_floor, (centre // blurred).tolist(), radius // blurred, colour, cv2.FILLED)
+        place = int(rng.integers(20, turn - 20)), int(rng.integers(20, HORIZON_ROW - 25))
+        cv2.ellipse(wall, place, (radius // 2, round(0.56 * radius)), 0, 0, 360, colour, cv2.FILLED, cv2.LINE_AA)
+    wall[:, turn:] = wall[:, :FRAME_WIDTH]
+
+
+def _glare(rng: np.random.Generator, brightest: float) -> np.ndarray:
+    """Return the light that a lamp or a window throws into the camera, (n, n, 3) uint8, brightest in its middle."""
+    half = round(GLARE_PX * rng.uniform(0.5, 1.5))
+    away = np.linspace(-1, 1, 2 * half) ** 2
+    light = brightest * rng.uniform(0.2, 1.0) * np.clip(1 - away[:, None] - away, 0, 1) ** 2
+    return np.repeat(light[..., None], 3, axis=2).astype(np.uint8)
+
+
+def _add_light(frame: np.ndarray, light: np.ndarray, column: int, row: int) -> None:
+    x, y = column - light.shape[1] // 2, row - light.shape[0] // 2
+    x0, x1 = max(0, x), min(frame.shape[1], x + light.shape[1])
+    y0, y1 = max(0, y), min(frame.shape[0], y + light.shape[0])
+    if x0 < x1 and y0 < y1:
+        frame[y0:y1, x0:x1] = cv2.add(frame[y0:y1, x0:x1], light[y0 - y : y1 - y, x0 - x : x1 - x])
+
+
+def _light(rng: np.random.Generator, most_tint: float) -> np.ndarray:
     """Return how each pixel is lit, (360, 640, 3) uint8, where 128 changes nothing: a slope, a tint, dark corners."""
     x = np.linspace(-1, 1, FRAME_WIDTH)[None]
     y = np.linspace(-1, 1, FRAME_HEIGHT)[:, None]
     slope = 1 + rng.uniform(-0.2, 0.2) * x + rng.uniform(-0.15, 0.15) * y - rng.uniform(0, 0.12) * (x**2 + y**2)
-    tint = 1 + rng.uniform(-0.07, 0.07, 3)
+    tint = 1 + rng.uniform(-most_tint, most_tint, 3)
     return np.clip(128 * slope[..., None] * tint, 0, 255).astype(np.uint8)
 
 

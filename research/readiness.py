@@ -18,7 +18,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,12 +27,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from balloon_world.record import episode_name, record_drive
+from balloon_world.record import FIRST_DRIVE, episode_name, record_drive
 from balloon_world.world import World, expert
-from rover_lib.onboard.car.car import this_car
-from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.onboard.recording.episode import About, EpisodeWriter
 from rover_lib.onboard.stage import atomic_path, plain, write_stage
 from rover_lib.workshop.act_config import lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
@@ -44,7 +41,6 @@ from rover_lib.workshop.recordings.episodes import load_recordings
 WORLDS, SEED, JUDGE_SEED, REPLAN = 40, 10_000, 1, 12
 HEIGHT, WIDTH, CHUNK = 72, 128, 32
 SHORT_S = 5.0  # of a judged drive in CarRacing: by then who does not see has left the road
-FIRST = datetime(2025, 1, 1, 12, tzinfo=UTC)
 
 
 # --- two worlds -------------------------------------------------------------------------------------------------------
@@ -79,22 +75,9 @@ class Racing:
     name, drives, judged = "racing", 100, 24
 
     def record(self, folder: Path, index: int, seed: int) -> None:
-        from research.car_racing import HEIGHT, RATE_HZ, WIDTH, Track
+        from research.car_racing import record_drive
 
-        car = this_car()
-        start = FIRST + timedelta(days=seed, seconds=30 * index)
-        periods = [round(c.period_us / ARDUINO_STEP_US) * ARDUINO_STEP_US for c in (car.pwm.steering, car.pwm.throttle)]
-        about = About("follow the road", fps=RATE_HZ, start_time_s=start.timestamp(), car=car)
-        track = Track(1_000_000 * (seed + 1) + index, shoves=4)
-        with EpisodeWriter(folder / episode_name(start), about, resolution=(WIDTH, HEIGHT)) as episode:
-            while not track.done:
-                at_s, ms = start.timestamp() + track.ticks / RATE_HZ, round(1000 * track.ticks / RATE_HZ)
-                pulses = car.pwm.pulses(*track.expert())
-                us = [round(p / ARDUINO_STEP_US) * ARDUINO_STEP_US for p in (pulses.steering_us, pulses.throttle_us)]
-                episode.frame(at_s, track.render())
-                episode.control(at_s + 0.004, ms, *us, *periods)
-                steering, throttle = car.pwm.actions(*us, *periods)
-                track.step(float(steering or 0), float(throttle or 0))
+        record_drive(folder, index, seed)
 
     def worlds(self) -> list[Any]:
         from research.car_racing import Track
@@ -126,7 +109,7 @@ def recorded(kind: Any, folder: Path, part: str, count: int, seed: int, every: i
     if not path.exists():
         (folder / part).mkdir(parents=True, exist_ok=True)
         for index in range(count):
-            start = FIRST + timedelta(days=seed, seconds=30 * index)
+            start = FIRST_DRIVE + timedelta(days=seed, seconds=30 * index)
             if not (folder / part / episode_name(start)).exists():
                 kind.record(folder / part, index, seed)
         episodes = load_recordings(folder / part, CHUNK, 0.05).episodes

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from balloon_world.drives import NoLog, TimedCar, drive_missing, wilson_interval
+from balloon_world.level import EASY
 from balloon_world.record import SHOVES
 from balloon_world.world import HORIZON_ROW as WALL
 from balloon_world.world import RATE_HZ, World, expert
@@ -114,7 +115,7 @@ def judge_strangeness(
         return (_watch if asked[0] == "recorded" else _drive)(policy, world(*asked))
 
     def world(how: str, seed: int) -> World:
-        return StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES * (how != "driven"))
+        return StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES[EASY] * (how != "driven"))
 
     strange = [how for how in HOW if rooms or how != ROOM]
     counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)

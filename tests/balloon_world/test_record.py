@@ -2,6 +2,7 @@ import shutil
 
 import pytest
 
+from balloon_world.level import HARD
 from balloon_world.record import record_episodes
 from rover_lib.onboard.errors import TrainingError
 
@@ -33,3 +34,12 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     with pytest.raises(TrainingError, match="is not this recording"):
         record_episodes(tmp_path, count=1)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_hard_is_another_recording(tmp_path):
+    record_episodes(tmp_path / "easy", count=1)
+    record_episodes(tmp_path / "hard", count=1, level=HARD)
+    assert bytes_of(tmp_path / "easy").keys() != bytes_of(tmp_path / "hard").keys()
+    with pytest.raises(TrainingError, match="is not this recording"):
+        (tmp_path / "hard" / "note.txt").write_text("mine")
+        record_episodes(tmp_path / "hard", count=1)

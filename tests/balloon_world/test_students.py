@@ -65,7 +65,7 @@ def made(tmp_path, monkeypatch):
     monkeypatch.setattr(students, "read_manifest", lambda path: json.loads(path.read_text()))
     driven = []
 
-    def drive_once(policy, seed, late_ms, settings):
+    def drive_once(policy, seed, late_ms, settings, level):
         driven.append((policy.given["off"], seed, late_ms))
         return "hit" if seed >= SEED + policy.given["misses"] else "left"
 
@@ -107,6 +107,9 @@ def test_what_was_driven_once_is_kept(made):
     artifact(made.student / "policy_static.pt", "student's", off=0.004)
     judge_students(made.teacher, [made.student], worlds=3)  # one more world for each, and all for another artifact
     assert len(made.driven) == 2 + 6 and {seed for off, seed, _ in made.driven if off != 0.004} == {SEED + 2}
+    made.driven.clear()
+    judge_students(made.teacher, [made.student], worlds=1, level="hard")  # nor does a level answer for another
+    assert len(made.driven) == 4
 
 
 def test_where_there_is_no_world_nobody_drives(made):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from balloon_world.world import DECOY_ASIDE_RAD, TIMEOUT_S, World, expert
+from balloon_world.level import EASY, HARD, level_named
+from balloon_world.world import CAR_HALF_M, DECOY_ASIDE_RAD, FRAME_WIDTH, World, expert
 from rover_lib.onboard.errors import TrainingError
 
 
@@ -33,14 +34,61 @@ def test_the_balloon_is_red_where_it_should_be():
         assert red > 1.5 * max(blue, green), f"seed {seed}: {(blue, green, red)}"
 
 
-@pytest.mark.parametrize("shoves", [0, 2])
+@pytest.mark.parametrize(("level", "shoves", "least"), [(EASY, 0, 57), (EASY, 2, 57), (HARD, 0, 58)])
 @pytest.mark.slow
-def test_the_expert_hits_almost_always(shoves):
-    worlds = [World(50_000 + seed, shoves) for seed in range(60)]
+def test_the_expert_hits_almost_always(level, shoves, least):
+    worlds = [World(50_000 + seed, shoves, level=level) for seed in range(60)]
     for world in worlds:
         drive(world)
-    assert sum(w.hit for w in worlds) >= 57
-    assert all(1.5 < w.state.time_s <= TIMEOUT_S for w in worlds)
+    assert sum(w.hit for w in worlds) >= least
+    assert all(1 < w.state.time_s <= level.timeout_s for w in worlds)
+
+
+# --- hard ---
+
+
+def test_hard_hides_balloons_at_the_edge_and_pushes_a_slow_car_that_slips():
+    """What hard has, some of its worlds have; what easy lacks, no world of it has."""
+    hard = [World(seed, level=HARD) for seed in range(40)]
+    easy = [World(seed) for seed in range(40)]
+    for worlds, some in ((hard, True), (easy, False)):
+        assert any(abs(w.balloon_seen()[1]) > EASY.bearing_rad for w in worlds) is some
+        assert any(_is_partly_hidden(w) for w in worlds) is some
+        assert any(w._glare is not None for w in worlds) is some
+        assert any(w._slip_s > 0 and w._speed < 1 and w._steering != 1 for w in worlds) is some
+        assert any(w._shoves for w in worlds) is some
+        assert any(_is_red(t.colour) for w in worlds for t in w.distractors) is some
+        assert any(w.solid for w in worlds) is some
+    for w in hard:
+        assert (w._wall[:, :FRAME_WIDTH] == w._wall[:, -FRAME_WIDTH:]).all()  # no spot appears as the car turns
+
+
+def _is_partly_hidden(world):
+    away, at = world.balloon_seen()
+    for thing in world.distractors:
+        near, aside = world.seen(thing)
+        if near < away - 0.4 and abs(aside - at) < thing.radius_m / near + 0.5 * world.balloon.radius_m / away:
+            return True
+    return False
+
+
+def _is_red(colour):
+    blue, green, red = colour
+    return red > 150 and blue < 60 and green < 50
+
+
+def test_a_car_that_touches_what_is_solid_has_bumped():
+    world = next(w for w in (World(seed, level=HARD) for seed in range(99)) if _is_partly_hidden(w))
+    thing = min(world.solid, key=lambda t: world.seen(t)[0])
+    while not world.done:
+        world.step(world.left * float(np.clip(2 * world.seen(thing)[1], -1, 1)), 0.09)
+    assert world.outcome == "bumped" and world.seen(thing)[0] < thing.radius_m + CAR_HALF_M
+
+
+def test_another_level_is_refused():
+    assert level_named("hard") is HARD
+    with pytest.raises(TrainingError, match="easy, hard"):
+        level_named("medium")
 
 
 def test_steering_lags_and_a_car_that_stands_hits_nothing():

@@ -40,6 +40,7 @@ RULES = {
     "held_out_frames": whole(2, MOST),  # whose pictures are swapped
     **dict.fromkeys(("seed", "worlds", "pushes"), whole(0, MOST)),
     "threads": whole(0, usable_cores()),
+    "level": Rule(lambda v: v in ("easy", "hard"), "easy or hard"),
     "smooth": number(0, 1),
     "observers": OBSERVED._replace(holds=lambda v: OBSERVED.holds(v) and any(name != "frames" for name in v)),
     "modes": _list_of(f"any of {', '.join(MODES)}", lambda v: v in MODES),
