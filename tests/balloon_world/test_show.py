@@ -41,3 +41,8 @@ def test_a_slow_machine_slows_time_and_changes_nothing_else(tmp_path, monkeypatc
         results.append(simulation._results["easy"])
     assert paths[0] == paths[1] and len(paths[0]) > 10
     assert results[0] == results[1] and results[0]["INT8"][1] == 1
+    simulation.ask("level hard")  # a choice on the page
+    simulation.run(lambda head, picture: seen.append((head, picture)), 1)
+    world = seen[-1][0]["world"]
+    assert (world["level"], world["results"]["INT8"][1]) == ("hard", 1)
+    assert simulation._results["easy"] == results[1]
