@@ -103,7 +103,7 @@ def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any
     blocks = multiply_accumulates(policy)
     on_chip = sum(n for block, n in blocks.items() if block.startswith(("backbone", "image_project"))) / 1e9
     on_cpu = sum(blocks.values()) / 1e9 - on_chip
-    computed_ms = {chip: on_chip / rate * 1000 for chip, rate in CHIP_GMAC_PER_S.items()}
+    computed_ms: dict[str, float | None] = {chip: on_chip / rate * 1000 for chip, rate in CHIP_GMAC_PER_S.items()}
     computed_ms["cpu, FP32, at least"] = floor_ms(on_cpu, "fp32")
     facts = {"gmac": {"chip": on_chip, "cpu": on_cpu}, "computed_ms": computed_ms, "gap": gap, "frames": len(chosen)}
     with build_folder(Path(run_dir) / "hailo", lambda old: old.glob("features.npy")) as folder:
