@@ -29,7 +29,7 @@ from rover_lib.workshop.act import ACT, ActConfig, inputs_of, multiply_accumulat
 from rover_lib.workshop.int8.quantize import graph_of
 from rover_lib.workshop.judge.compare import Fidelity, fidelity
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.episodes import Samples, choose_calibration
+from rover_lib.workshop.recordings.episodes import choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import Opened, open_run
 
@@ -86,7 +86,7 @@ def halves(policy: ACT) -> tuple[bytes, bytes]:
     return front.SerializeToString(deterministic=True), rest.SerializeToString(deterministic=True)
 
 
-def write_kit(run_dir: Path | str, progress: Progress = silent, samples: int = SAMPLES) -> dict[str, Any]:
+def write_kit(run_dir: Path | str, progress: Progress = silent) -> dict[str, Any]:
     """Write the folder `hailo` of a run, and return its facts, which are in its kit.json too.
 
     Raises ArtifactError, and writes nothing, if in ONNX Runtime both halves together differ from the policy by more
@@ -95,22 +95,17 @@ def write_kit(run_dir: Path | str, progress: Progress = silent, samples: int = S
     loaded = open_run(run_dir, progress)
     policy = ACT(loaded.checkpoint.config, loaded.checkpoint.weights)
     config, (front, rest) = policy.config, halves(policy)
-    chosen, note = choose_calibration(loaded.parts.calibration, samples, params()["calibration"]["seed"])
-    judged = judged_frames(loaded)
+    chosen, _ = choose_calibration(loaded.parts.calibration, SAMPLES, params()["calibration"]["seed"])
+    judged = pick_evenly(loaded.parts.held_out, JUDGED)
     gap = _gap(policy, front, rest, [inputs_of(sample, config) for sample in judged[:: max(len(judged) // 4, 1)]])
     if not gap <= 1e-4:  # written so that NaN fails
         raise ArtifactError(f"backbone and rest together differ from the policy by {gap:.3g}; nothing was written")
     blocks = multiply_accumulates(policy)
     on_chip = sum(n for block, n in blocks.items() if block.startswith(("backbone", "image_project"))) / 1e9
     on_cpu = sum(blocks.values()) / 1e9 - on_chip
-    facts: dict[str, Any] = {
-        "gmac": {"chip": on_chip, "cpu": on_cpu},
-        "gap": gap,
-        "calibration": len(chosen),
-        "note": note,
-    }
-    facts["computed_ms"] = {chip: on_chip / rate * 1000 for chip, rate in CHIP_GMAC_PER_S.items()}
-    facts["computed_ms"] |= {"cpu, FP32, at least": floor_ms(on_cpu, "fp32")}
+    computed_ms: dict[str, float | None] = {chip: on_chip / rate * 1000 for chip, rate in CHIP_GMAC_PER_S.items()}
+    computed_ms["cpu, FP32, at least"] = floor_ms(on_cpu, "fp32")
+    facts = {"gmac": {"chip": on_chip, "cpu": on_cpu}, "computed_ms": computed_ms, "gap": gap, "frames": len(chosen)}
     with build_folder(Path(run_dir) / "hailo", lambda old: old.glob("features.npy")) as folder:
         (folder / "backbone.onnx").write_bytes(front)
         (folder / "rest.onnx").write_bytes(rest)
@@ -180,10 +175,5 @@ def judge(run_dir: Path | str, fp32: Any, loaded: Opened) -> Fidelity | None:
     folder = Path(run_dir) / "hailo"
     if not (folder / "features.npy").is_file():
         return None
-    frames = judged_frames(loaded)
+    frames = pick_evenly(loaded.parts.held_out, JUDGED)
     return fidelity(fp32, {"hailo": Returned(folder, fp32)}, frames, loaded.recordings.action_range())
-
-
-def judged_frames(loaded: Opened) -> Samples:
-    """Return the held-out frames whose features are wanted."""
-    return pick_evenly(loaded.parts.held_out, JUDGED)

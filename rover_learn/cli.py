@@ -31,6 +31,7 @@ def _by_recipe(value_of: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
 
 STEPS = _by_recipe(lambda recipe: sum(count for name, count in recipe.items() if name.endswith("_steps")))
 BATCH = _by_recipe(lambda recipe: recipe["batch"])
+MINUTES = _by_recipe(lambda recipe: recipe["minutes"])
 
 
 def of_a_training(command: Callable[..., None]) -> Callable[..., None]:
@@ -135,7 +136,9 @@ def finetune(checkpoint: Path, episodes: tuple[Path, ...], facts: str, throttle:
     help="full is the size of the real car's policy.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--minutes", type=Number(min=0.1), help="Budget: of the processor, or of a GPU [default: params.yml].")
+@click.option(
+    "--minutes", type=Number(min=0.1), help="Budget: of the processor, or of a GPU [default: params.yml].", **MINUTES
+)
 @click.option(
     "--backbone",
     default="imagenet",

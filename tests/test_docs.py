@@ -85,7 +85,7 @@ def refusal_of_make(words: list[str]) -> str:
 
 def refusal_of_playbook(words: list[str]) -> str:
     specs = (ROOT / "ansible/roles/rover/meta/argument_specs.yml").read_text()
-    ansibles = {"ansible_user", "ansible_host", "ansible_ssh_private_key_file"}
+    ansibles = {"ansible_user", "ansible_host", "ansible_ssh_private_key_file", "minutes"}
     variables = {*re.findall(r"^ +(\w+):", specs, re.M), *ansibles, "X"}
     plays = [word for word in words if word.endswith(".yml") and "X" not in word]
     wrong = [play for play in plays if not (ROOT / play).is_file()]

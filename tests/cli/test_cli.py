@@ -44,6 +44,8 @@ def test_help_shows_what_params_yml_presets(set_params):
     recipes = params()["train"].values()
     small, full = (sum(v for key, v in recipe.items() if key.endswith("_steps")) for recipe in list(recipes)[:2])
     assert f"{small} (small), {full}" in " ".join(rover("train", "--help").output.split())
+    for command in main.commands:
+        assert "default: params.yml]" not in " ".join(rover(command, "--help").output.split()), command
     set_params("calibration: [")
     assert "[default: params.yml]" in " ".join(rover("run", "--help").output.split())
     set_params("")

@@ -111,6 +111,6 @@ def test_in_an_environment_of_its_own_from_recordings_on(tmp_path):
     assert "rover_policy-" in shell.type("rover release wheelhouse 'my wheels' --only-rover")
     few = "--runs-dir 'my runs' --steps 4 --batch 2 --device cpu"
     shell.type(f"rover distill 'my policy.pth' 'my drives' --name fast --size 64x36 {few}")
-    shell.type(f"rover finetune 'my policy.pth' 'my drives' 'my drives' --name better {few}")
+    shell.type(f"rover finetune 'my policy.pth' 'my drives' 'my dataset' --name better {few}")
     assert "recorded: my world" in shell.type("rover world record 'my world' --count 1")
     shell.starts("rover demo --web-port 0", r"http://127\.0\.0\.1:\d+/")

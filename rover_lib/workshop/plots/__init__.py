@@ -10,5 +10,5 @@
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.plots.figures import action_error, episode_overview, familiarity, sensitivity, worst_frames
 from rover_lib.workshop.plots.minutes import minutes
-from rover_lib.workshop.plots.style import save
+from rover_lib.workshop.plots.style import Note, save
 from rover_lib.workshop.plots.tables import check_gates, gates

@@ -9,7 +9,7 @@ from rover_lib.onboard.car.host import throttled_means
 from rover_lib.onboard.care.benchmark import clock_fall, describe_clock
 from rover_lib.workshop.plots.style import RED, SLATE, Note, line_of, new_figure
 
-NONE_YET = "nobody has timed for minutes: rover benchmark --minutes 10, or rover playbook benchmark -e minutes=10"
+NONE_YET = "nobody has timed for minutes: `rover benchmark --minutes 10`, or `rover playbook benchmark -e minutes=10`"
 
 
 def minutes(by_host: Mapping[str, Mapping[str, Any]], modes: Mapping[str, str]) -> Figure | Note:
