@@ -272,11 +272,17 @@ def judge(
 
 @dataclass(frozen=True)
 class TrialReport:
-    """How a policy drove. hit: in each world, by its seed."""
+    """How a policy drove. hit: in each world, by its seed.
+
+    paths: in each world where the car was at each tick, (ticks, 2) metres ahead and to the left of its start.
+    balloons: where each world's balloon is, the same way.
+    """
 
     hits: int
     trials: int
     hit: tuple[bool, ...]
+    paths: tuple[np.ndarray, ...] = ()
+    balloons: tuple[tuple[float, float], ...] = ()
 
 
 def wilson_interval(hits: int, trials: int, z: float = Z) -> tuple[float, float]:
@@ -309,8 +315,20 @@ def run_trials(
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
-    hit = tuple(_hits_in(policy, World(world_seed, left=left, level=level), replan_every) for world_seed in seeds)
-    return TrialReport(sum(hit), worlds, hit)
+    driven = []
+    for world_seed in seeds:
+        world = World(world_seed, left=left, level=level)
+        _drive_to_end(policy, world, replan_every)
+        driven.append(world)
+    hit = tuple(world.hit for world in driven)
+    paths = tuple(path_of(world) for world in driven)
+    balloons = tuple((world.balloon.x_m, world.balloon.y_m) for world in driven)
+    return TrialReport(sum(hit), worlds, hit, paths, balloons)
+
+
+def path_of(world: World) -> np.ndarray:
+    """Where the car was at each tick, (ticks, 2) metres ahead and to the left of its start."""
+    return np.array([(state.x_m, state.y_m) for state in world.trajectory])
 
 
 def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any) -> dict[str, TrialReport]:
@@ -320,7 +338,7 @@ def run_trials_of(policies: Mapping[str, Any], worlds: int = 40, **options: Any)
         return {name: trial.result() for name, trial in running.items()}
 
 
-def _hits_in(policy: Any, world: World, replan_every: int) -> bool:
+def _drive_to_end(policy: Any, world: World, replan_every: int) -> None:
     state: np.ndarray = np.zeros(2, np.float32)
     while not world.done:
         chunk = np.asarray(policy.predict_chunk(world.render(), state))
@@ -332,7 +350,6 @@ def _hits_in(policy: Any, world: World, replan_every: int) -> bool:
             state = np.array([steering, throttle], np.float32)
             if world.done:
                 break
-    return world.hit
 
 
 def car_in_key() -> dict[str, Any]:

@@ -1,20 +1,21 @@
 """Notebook 07: how late may a plan be? Drive a run's static policy with inferences as slow as they are told to be."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere
+from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere, path_of
 from balloon_world.level import level_named
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.plan import Settings
 from rover_lib.onboard.errors import TrainingError
 from rover_lib.onboard.params import params
+from rover_lib.onboard.policy.load import load_policy
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.judge.compare import GATED, WORLDS_LOST, worlds_lost
 from rover_lib.workshop.judge.pairs import compare_pairs
@@ -22,6 +23,7 @@ from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.progress import Progress, silent
 
 JUDGED_MS = 150.0
+ON_A_MAP = 8  # worlds
 
 
 def measure_latencies(
@@ -68,6 +70,30 @@ def measure_latencies(
         row |= _found([driven[i, seed] for seed in range(SEED, SEED + worlds)])
     metrics = {"rows": rows, "gates": gates(rows, limit_pct)}
     return write_stage(artifact.with_name("drive.json"), "drive", params=given, metrics=metrics, inputs=inputs)
+
+
+@dataclass(frozen=True)
+class OnMap:
+    """A drive as a map shows it. path: (ticks, 2) metres ahead and to the left of the start; balloon: (2,) m."""
+
+    outcome: str
+    path: np.ndarray
+    balloon: tuple[float, float]
+
+
+def pushed_on_map(
+    run_dir: Path | str, *, latencies_ms: Sequence[float], pushes: int, worlds: int
+) -> dict[str, list[OnMap]]:
+    """Drive some of the pushed drives of `measure_latencies` once more, compensated, for a map of each latency."""
+    policy, settings = load_policy(Path(run_dir) / f"policy_{GATED}.pt"), Settings.of(params()["drive"])
+    maps: dict[str, list[OnMap]] = {}
+    for ms in latencies_ms:
+        for seed in range(SEED, SEED + min(worlds, ON_A_MAP)):
+            world = World(seed, pushes)
+            driven = drive_in(policy, world, ms / 1e3, settings)
+            found = OnMap(driven.outcome, path_of(world), (world.balloon.x_m, world.balloon.y_m))
+            maps.setdefault(f"{ms:g} ms late", []).append(found)
+    return maps
 
 
 def _found(driven: Sequence[Driven]) -> dict[str, Any]:

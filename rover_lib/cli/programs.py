@@ -56,7 +56,7 @@ def notebooks(run_dir: Path, name: str | None) -> None:
     Cells that are run again there change no run. `rover report` judges the copy.
     """
     from rover_lib.workshop.run import run_folder
-    from rover_lib.workshop.run.run import KERNEL_ENVIRONMENT
+    from rover_lib.workshop.run.run import JUPYTER, KERNEL_ENVIRONMENT
 
     run_dir = run_dir.absolute()  # beside a link, not beside what it leads to
     copy = run_folder(run_dir.parent, name or f"{run_dir.name}-copy", RoverError)
@@ -69,7 +69,9 @@ def notebooks(run_dir: Path, name: str | None) -> None:
         copy_run(run_dir, copy)
     own = ["--allow-root"] if os.geteuid() == 0 else []  # a container may have no user but root
     words = [sys.executable, "-m", "jupyterlab", *own, f"--LabApp.default_url=/lab/tree/{first}", str(copy)]
-    os.execve(sys.executable, words, {**os.environ, **KERNEL_ENVIRONMENT})
+    # JupyterLab then saves widgets' state, without which a notebook that is opened again shows errors in their place.
+    settings = os.pathsep.join(filter(None, (str(JUPYTER), os.environ.get("JUPYTER_CONFIG_PATH"))))
+    os.execve(sys.executable, words, {**os.environ, **KERNEL_ENVIRONMENT, "JUPYTER_CONFIG_PATH": settings})
 
 
 def copy_run(run_dir: Path, copy: Path) -> None:

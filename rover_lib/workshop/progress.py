@@ -2,11 +2,15 @@
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
 from functools import partial
+from html import escape
 from typing import Any
 
 RARELY: dict[str, Any] = {"delay": 20.0, "mininterval": 20.0}  # seconds: how a bar moves in a log
+
+EVERY_S = 0.2  # between two changes of a notebook's bar
 
 Progress = Callable[..., Iterable]  # called like tqdm.tqdm(iterable, desc=, total=)
 
@@ -23,10 +27,34 @@ def terminal_bar() -> Progress:
     return partial(tqdm, leave=False) if sys.stderr.isatty() else partial(tqdm, leave=False, **RARELY)
 
 
+def in_jupyterlab() -> bool:
+    """Whether a kernel of JupyterLab runs this. `rover run`, papermill and nbval show none of a cell's widgets."""
+    return "JPY_SESSION_NAME" in os.environ
+
+
 def notebook_bar() -> Progress:
     """A bar in JupyterLab; else none, as `rover run` shows one of the cells."""
-    from tqdm.auto import tqdm as widget
+    return _shown_bar if in_jupyterlab() else silent
 
-    if "JPY_SESSION_NAME" in os.environ:
-        return partial(widget, leave=False)  # else each step leaves red text below the cell
-    return silent
+
+def _shown_bar(items: Iterable, desc: str = "", total: int | None = None) -> Iterator:
+    """Show a bar while somebody takes the items, and nothing afterwards.
+
+    Not tqdm's: a widget stays in a saved notebook, which cannot show it once its kernel has ended.
+    """
+    from IPython.display import HTML, display
+
+    every = total if total is not None else len(items) if isinstance(items, Sized) else None
+    most = "" if every is None else f' max="{every}"'
+    shown = display(HTML(escape(desc)), display_id=True)
+    last_s = 0.0
+    try:
+        for done, item in enumerate(items):
+            if (now_s := time.monotonic()) - last_s > EVERY_S:
+                last_s = now_s
+                value = "" if every is None else f' value="{done}"'
+                count = f"{done}" if every is None else f"{done} of {every}"
+                shown.update(HTML(f"<progress{value}{most}></progress> {escape(desc)} {count}"))
+            yield item
+    finally:
+        shown.update(HTML(""))

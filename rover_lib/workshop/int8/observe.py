@@ -31,7 +31,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.int8.frames import Frame, range_over, usual
 from rover_lib.workshop.int8.scales import Maxima, apply_channel_scales, channel_maxima
-from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, SMALLEST_SCALE, Scheme
+from rover_lib.workshop.int8.scheme import ENGINE, HIGH, LOW, OBSERVERS, SMALLEST_SCALE, Scheme
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Sample
 
@@ -228,6 +228,27 @@ def set_ranges(prepared: GraphModule, scheme: Scheme, calibration: Calibration) 
     for place, observer in _places(prepared).items():
         observer.choice = scheme.observer
         observer.of_frames = range_over(calibration.frames[place], usual_frames, wider.get(place, 0.0))
+
+
+def ranges_of(
+    checkpoint: Checkpoint, calibration: Calibration, usual_pct: float = 95.0
+) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """What each observer would keep of each tensor: {place: {observer: (low, high, values clipped in %)}}.
+
+    usual_pct: the share of frames whose extremes the observer `frames` takes here. Raises as `restore_observed`.
+    """
+    found: dict[str, dict[str, tuple[float, float, float]]] = {}
+    scheme = Scheme(smooth=calibration.smooth)
+    prepared = restore_observed(checkpoint, scheme, calibration)
+    for choice in OBSERVERS:
+        set_ranges(prepared, replace(scheme, observer=choice, usual_pct=usual_pct), calibration)
+        for place, observer in _places(prepared).items():
+            low, high = observer.range()
+            centres, counts = observer._centres(), observer.histogram
+            outside = counts[(centres < low) | (centres > high)].sum() / counts.sum().clamp(min=1)
+            exact = choice == "minmax"  # whose ends lie within the histogram's last bins
+            found.setdefault(place, {})[choice] = (low, high, 0.0 if exact else 100 * float(outside))
+    return found
 
 
 def _observer(prepared: nn.Module, node: Node) -> RangeObserver | None:

@@ -10,7 +10,7 @@ from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.judge.recorded_range import worst
 from rover_lib.workshop.plots import style
 from rover_lib.workshop.plots.style import GREY, MOST_ACTIONS, Note, legend_below, line_of, new_figure
-from rover_lib.workshop.recordings.episodes import Episode
+from rover_lib.workshop.recordings.episodes import Episode, Recordings, Split
 from rover_lib.workshop.recordings.samples import ACTION_NAMES
 
 AHEAD = "step of the plan (s ahead)"
@@ -35,13 +35,52 @@ def episode_overview(episode: Episode, actions: Sequence[str] = ACTION_NAMES, pi
             ax.remove()
         ax = fig.add_subplot(grid[row, :])
         ax.plot([s.time_s for s in samples], values, color=style.action_colour(name.split("\n")[0], row - 1), lw=1.5)
-        ax.set_ylabel(name, fontsize=8, rotation=0, ha="right")
-        ax.tick_params(labelsize=8, labelbottom=row == len(lines))
-        ax.spines[["top", "right"]].set_visible(False)
+        ax.set_ylabel(name, fontsize=9, rotation=0, ha="right")
+        ax.tick_params(labelsize=9, labelbottom=row == len(lines))
     ax.set_xlabel("time in the episode (s)")
     label = episode.label or "no label"
     fig.suptitle(f"{episode.id}: {label}, {len(samples)} samples of {episode.frames} frames", fontsize=11)
     return fig
+
+
+def used_frames(recordings: Recordings, parts: Split, most: int = 12) -> Figure:
+    """Draw for each episode when its pictures could be used, and when not, with the share that was left out.
+
+    Those episodes are drawn of which most was left out, `most` at most. Colours tell what each part is for.
+    """
+    rows = []
+    for episode in recordings.episodes:
+        spans, step_s = _spans(episode)
+        left_out_s = max(episode.duration_s + step_s - sum(width for _, width in spans), 0.0)
+        rows.append((left_out_s / (episode.duration_s + step_s), episode, spans, step_s))
+    rows.sort(key=lambda row: (-round(row[0], 3), row[1].id))
+    part_of = {episode: part for part, ids in parts.episodes.items() for episode in ids}
+    colours = dict(zip(parts.episodes, (style.MIST, style.OTHERS[1], style.SLATE), strict=False))
+    shown = rows[:most]
+    fig, axes = new_figure(1, height_in=1.6 + 0.26 * len(shown))
+    ax = axes[0, 0]
+    for y, (share, episode, spans, step_s) in enumerate(shown):
+        ax.barh(y, episode.duration_s + step_s, 0.7, color=style.RED)
+        ax.broken_barh(spans, (y - 0.35, 0.7), color=colours.get(part_of.get(episode.id, ""), style.GREY))
+        said = f" {100 * share:.1f} % left out" if round(share, 3) else " all used"
+        ax.text(episode.duration_s + step_s, y, said, va="center", fontsize=9)
+    for part, colour in (*colours.items(), ("left out", style.RED)):
+        ax.bar(0, 0, color=colour, label=part.replace("_", " "))
+    ax.set_yticks(range(len(shown)), [episode.id for _, episode, *_ in shown])
+    ax.invert_yaxis()
+    ax.set_xlabel("time in the episode (s)")
+    ax.set_xlim(0, 1.18 * max(episode.duration_s for _, episode, *_ in shown))
+    ax.set_title(f"{len(shown)} of {len(rows)} episodes, those with most left out first")
+    legend_below(fig, ax, 4)
+    return fig
+
+
+def _spans(episode: Episode) -> tuple[list[tuple[float, float]], float]:
+    """When an episode's samples follow each other without a gap, (begin, width) in s, and the step between two."""
+    times_s = np.array([s.time_s for s in episode.samples])
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 1 / 30
+    pieces = np.split(times_s, np.flatnonzero(np.diff(times_s) > 1.5 * step_s) + 1)
+    return [(float(piece[0]), float(piece[-1] - piece[0] + step_s)) for piece in pieces], step_s
 
 
 def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
@@ -66,7 +105,7 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
     ax.set_yticks(range(len(table)), list(table))
     ax.invert_yaxis()
     ax.set_xlabel("mean error with this block alone in INT8 (% of the recorded range)")
-    ax.legend(frameon=False, fontsize=9)
+    ax.legend()
     return fig
 
 
@@ -88,6 +127,23 @@ def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
             ax.plot(times_s, report.in_pct(report.errors(mode)[..., i].mean(0), action), **line_of(mode))
         ax.set(xlabel=AHEAD, ylabel="mean error (% of the recorded range)", ylim=(0, None))
     legend_below(fig, next(ax for ax in fields if ax.get_lines()), 5)
+    return fig
+
+
+def action_against(report: Fidelity, mode: str = "static") -> Figure | Note:
+    """Draw a mode's actions against FP32's on the same frames, whole plans, for each action that is judged."""
+    actions = [action for action in report.action_names if report.pct(action) is not None][:MOST_ACTIONS]
+    if not actions:
+        return Note("no action changes in these recordings: nothing is compared")
+    fig, fields = style.figure_of(len(actions), MOST_ACTIONS, 3.8)
+    for ax, action in zip(fields, actions, strict=True):
+        i = report.action_names.index(action)
+        exact, rounded = report.reference[..., i].ravel(), report.chunks[mode][..., i].ravel()
+        ends = [min(exact.min(), rounded.min()), max(exact.max(), rounded.max())]
+        ax.plot(ends, ends, color=GREY, lw=1)
+        ax.plot(exact, rounded, ".", ms=3, color=style.COLOURS[mode], alpha=0.4, rasterized=True)
+        ax.set(xlabel=f"{action} of FP32", ylabel=f"{action} of {mode}", aspect="equal")
+        ax.set_title(f"r = {np.corrcoef(exact, rounded)[0, 1]:.5f}")
     return fig
 
 

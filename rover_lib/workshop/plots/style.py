@@ -5,6 +5,7 @@ slate or grey, and differs by marker or line; categories that only one figure ha
 colours are Okabe and Ito's and Paul Tol's, which colour-blind people can tell apart.
 
 Figures are drawn for a notebook's width at 100 dots per inch, and shown and saved with twice as many pixels each way.
+rover.mplstyle has their sizes and lines.
 """
 
 import io
@@ -21,11 +22,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 WIDTH_IN, DPI, SHARPER = 9.0, 100, 2
+STYLE = Path(__file__).with_name("rover.mplstyle")
 BLACK = "#333333"
 RED = "#D55E00"  # a limit, a floor, a fault, a stopped car; and the balloon
 SLATE = "#4A5A6A"  # a figure that belongs to no mode, action or part
 MIST = "#AAB7C4"  # what is compared with a slate figure: before, without, the rest
 GREY = "#B0B0B0"
+BALLOON = RED
 OTHERS = (SLATE, "#8C6D31", "#AA4499", "#117733", "#6699CC", "#994455", "#997700")  # hosts, students, more actions
 COLOURS = {
     "fp32": BLACK,
@@ -61,13 +64,10 @@ class Note:
 
 def new_figure(rows: int, columns: int = 1, height_in: float = 3.2, **options: Any) -> tuple[Figure, np.ndarray]:
     """Make a figure and its (rows, columns) axes. pyplot is told to forget it, so only the caller shows it."""
+    plt.style.use(STYLE)
     size: dict[str, Any] = {"figsize": (WIDTH_IN, height_in), "dpi": DPI, "layout": "constrained", "FigureClass": Drawn}
     fig, axes = plt.subplots(rows, columns, squeeze=False, **size, **options)
     plt.close(fig)
-    for ax in axes.flat:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.tick_params(labelsize=9)
-        ax.title.set_fontsize(11)
     return fig, axes
 
 
@@ -100,7 +100,7 @@ def line_of(mode: str) -> dict[str, Any]:
 def legend_below(fig: Figure, ax: Axes, columns: int) -> None:
     """Put one legend, with what `ax` has, below all of a figure's axes."""
     handles, labels = ax.get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    fig.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 def save(shown: Figure | Note, run_dir: Path | str, name: str) -> Figure | Note:

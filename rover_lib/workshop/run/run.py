@@ -35,6 +35,7 @@ from rover_lib.workshop.run import run_folder
 from rover_lib.workshop.run.parameters import check_parameters
 
 NOTEBOOKS = SHIPPED / "notebooks"
+JUPYTER = Path(__file__).parents[1] / "jupyter"  # what JupyterLab is told beside its own settings
 NAMES = ("01_load", "02_calibrate", "03_quantize", "04_compare", "05_benchmark")
 # Notebooks for a finished run, which `make count`, `rover run --only 07`, `rover world students` and `learn` execute.
 AFTERWARDS = ("06_arm", "07_drive", "08_distill", "09_learn")
