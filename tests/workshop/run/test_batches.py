@@ -27,7 +27,7 @@ def test_two_workers_make_a_run_each(tmp_path, tiny_file):
     environment = os.environ | {"OMP_NUM_THREADS": "1", "ROVER_AS_ROOT": "1"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert sorted(done.stdout.split()) == [str(Path("runs", name)) for name in ("n6", "n8")], done.stderr
+    assert sorted(done.stdout.split()) == [str(tmp_path / "runs" / name) for name in ("n6", "n8")], done.stderr
     for samples in (6, 8):
         calibrated = json.loads((tmp_path / "runs" / f"n{samples}" / "calibrate.json").read_text())
         assert calibrated["params"]["samples"] == samples
