@@ -65,7 +65,7 @@ class FrameView:
             for who, line in lines.items():
                 line.set_ydata(planned[who][:, i])
         self._picture.clear()
-        said = f"\nof the familiar's limit: {', '.join(scores)}" if scores else ""
+        said = f"\nunfamiliar (1: stop): {', '.join(scores)}" if scores else ""
         style.show_picture(self._picture, sample, f"{sample.episode}, {sample.time_s:.1f} s{said}")
         return self.figure
 

@@ -131,6 +131,7 @@ def weights_rounded(before: nn.Module, after: nn.Module) -> Figure:
     left.plot(exact[order], exact[order], color=BLACK, lw=1, label="before")
     left.plot(exact[order], rounded[order], color=COLOURS["static"], lw=1.2, label="after")
     left.set(xlabel="weight before", ylabel="weight after", xlim=(-near, near), ylim=(-near, near))
+    left.locator_params(nbins=5)
     left.set_title(f"{name}:\n{pct:.1f} % lost; the steps around 0", fontsize=10)
     left.legend()
     right.barh(list(by_block), list(by_block.values()), color=COLOURS["static"])
