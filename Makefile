@@ -59,7 +59,7 @@ look:
 	$(LOOK)/bin/rover demo --level $(LEVEL)
 
 # As many steps as two minutes have, and no weights from the internet: the same policy on each machine of a kind.
-DEMO_TRAINING = --steps 880 --backbone none
+DEMO_TRAINING = --steps 640 --backbone none
 
 # Recordings that another version of the world made are recorded again. It ends with the verdict, and what to do next stands last on the screen.
 demo: $(READY)

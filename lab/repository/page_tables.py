@@ -112,13 +112,6 @@ def _drives(root: Path) -> list[Row]:
     ]
 
 
-def _recorded(root: Path) -> list[Row]:
-    """How far policies' plans are off the driver's, by the number of drives that they learned from."""
-    rows = _metrics(root / "results" / "lab", "drives")["rows"]
-    errors = (" / ".join(f"{error:.1f}" for error in row["errors_pct"].values()) for row in rows)
-    return [("drives recorded", *(str(row["drives"]) for row in rows)), ("off the driver, %", *errors)]
-
-
 def _cars(root: Path) -> list[Row]:
     """What became of the recordings of each real car."""
     rows: list[Row] = [
@@ -183,7 +176,6 @@ TABLES: dict[str, Callable[[Path], list[Row]]] = {
     "demo": _demo,
     "faults": _faults,
     "drives": _drives,
-    "recorded": _recorded,
     "cars": _cars,
     "learning": _learning,
     "judging": _judging,
