@@ -167,7 +167,7 @@ TURNED = {
         "quantize",
         {"observers": ["minmax"], "float_blocks": ["backbone.stem"], "modes": ["mixed"], "choosing_frames": 2},
     ),
-    "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1}),
+    "04_compare": ("compare", {"held_out_frames": 4, "worlds": 1, "level": "hard"}),
     "05_benchmark": (f"benchmark-{runs.socket.gethostname()}", {"iterations": 3, "threads": 1}),
 }
 

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import onnx
 import pytest
-from policies import memory_samples
 
 from rover_exchange import hailo
 from rover_lib.onboard.errors import ArtifactError, PolicyError
@@ -16,6 +15,7 @@ from rover_lib.onboard.policy.onnx_engine import session_of
 from rover_lib.workshop.act import ACT, Affine
 from rover_lib.workshop.recordings.episodes import Split
 from rover_lib.workshop.run.session import Opened
+from tests.helpers.policies import memory_samples
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from recorded import record_drives
+
+from tests.helpers.recorded import record_drives
 
 ROOT = Path(__file__).resolve().parents[3]
 FEW = "samples=samples, iterations=2, choosing_frames=2, held_out_frames=4, modes=['static'], worlds=0"
