@@ -11,7 +11,6 @@ evenly chosen, each beside the next one; so 14,000 take seconds.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -51,12 +50,6 @@ class _Drive:
     compared: int
     equal: int
     longest: int
-
-    @property
-    def place(self) -> Path:
-        """The folder of its recording, or its name in the files of several."""
-        whole = self.episode.path.name == self.episode.id
-        return self.episode.path if whole else self.episode.path / self.episode.id
 
     @property
     def frozen(self) -> bool:
@@ -140,11 +133,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
         elif mean > BRIGHT:
             word = "white"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
-        faults.add(drive.place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
+        faults.add(drive.episode.place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
     elif drive.frozen:
         count = max(round(drive.equal / drive.compared * frames), drive.longest)
         note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
-        faults.add(drive.place, "frozen_camera", note, count)
+        faults.add(drive.episode.place, "frozen_camera", note, count)
 
 
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -184,7 +177,7 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         note = f"its pictures{of_camera} {words}, {reference}: turn them or leave them out"
         for pieces, is_odd in zip(long, odd, strict=True):
             for drive in pieces if is_odd else ():
-                faults.add(drive.place, kind, note, drive.episode.frames)
+                faults.add(drive.episode.place, kind, note, drive.episode.frames)
 
 
 def _scaled(sample: Sample, camera: str) -> np.ndarray:
