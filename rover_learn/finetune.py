@@ -38,6 +38,7 @@ from rover_lib.onboard.recording.episode import HUMAN
 from rover_lib.onboard.stage import write_stage
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint, load_checkpoint
 from rover_lib.workshop.judge.recorded_range import format_pct, not_judged, pct_of_range
+from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.episodes import load_recordings, split
 from rover_lib.workshop.recordings.samples import (
@@ -147,7 +148,9 @@ def _open(
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     sync_s = params()["calibration"]["sync_s"]
-    read = tuple(load_recordings(source, parent.config.chunk, sync_s, progress) for source in sources)
+    read = tuple(
+        with_faults(load_recordings(source, parent.config.chunk, sync_s, progress), progress) for source in sources
+    )
     policies = [parent.recorded_as(recordings.layout, recordings.samples) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise TrainingError("the recordings name, order or time states and actions differently", found=places)
@@ -293,8 +296,9 @@ class Finetuning(Work):
         counts = dict.fromkeys(TAUGHT, 0) | {"not_imitated": material.left_out}
         for kind, samples in material.taught:
             counts[kind] += len(samples)
+        cautions = chain.from_iterable(r.cautions() for r in material.recordings)
         metrics = {"learned_from": counts, "losses": learned.losses, "files_sha256": hashes}
-        metrics |= {"held_out": rows, "verdict": verdict(rows), "warnings": not_judged(self.action_range)}
+        metrics |= {"held_out": rows, "verdict": verdict(rows), "warnings": [*not_judged(self.action_range), *cautions]}
         inputs = {self.origin.path.name: self.origin.sha256}
         for r in material.recordings:
             inputs |= {f"{r.root.name}/{file}": digest for file, digest in r.hashes().items()}

@@ -37,6 +37,7 @@ from rover_lib.workshop.cache import cache_folder, cache_root, key_of
 from rover_lib.workshop.checkpoint.files import save_torch
 from rover_lib.workshop.checkpoint.lerobot import write_lerobot
 from rover_lib.workshop.checkpoint.trainer import trainer_config
+from rover_lib.workshop.pictures.shown import with_faults
 from rover_lib.workshop.pictures.turning import measure_sides
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings import controls
@@ -104,6 +105,8 @@ def train(
     p = params()["calibration"]
     recordings = load_recordings(episodes, SIZES[size].chunk, p["sync_s"], progress)
     rate_hz = _rate_hz(recordings)
+    for caution in with_faults(recordings, progress).cautions():
+        say(caution)
     made_of = {"size": asdict(SIZES[size]), "seed": seed, "split": p}
     made_of |= {"versions": [version(name) for name in VERSIONS], "version": FULL_VERSION}
     made_of |= {"episodes": recordings.hashes(), "rate_hz": rate_hz} | ({"amp": True} if machine.amp else {})

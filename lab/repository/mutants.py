@@ -2,8 +2,8 @@
 
 A program draws lines of the judging, quantizing, recording, learning and driving code, each file in proportion to its
 lines, and plants a slip in each: a `<` becomes a `<=`, a 3 a 4, an `and` an `or`. cosmic-ray finds and makes the slips.
-The tests that run are those of the file's name, of its room, and those that import it; a slip is caught if one fails,
-or hangs. What survives needs a test, or a reason in survivors.yml.
+The tests that run are those of the file's name, then those that import it, then its room's, up to the first that
+fails, or hangs; what failed must pass without slips. What survives needs a test, or a reason in survivors.yml.
 
 What cosmic-ray cannot do stands in planted.yml: lines of the firmware, and lines that random drives must notice. A row
 has a `name`, a `file`, the `good` text that stands in it once, the `bad` text that takes its place, and the `test` file
@@ -40,6 +40,7 @@ raise SystemExit({NOTICED} * any(random_drives(range(i, i + 100))["broken"] for 
 """
 PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:nbval", "-p", "no:cacheprovider", "-o", "addopts=--strict-markers")
 FAST, SLOW = "not slow and not release and not emulated", "slow and not release"
+ENDLESS = ("-o", "faulthandler_timeout=200", "-o", "faulthandler_exit_on_timeout=true")  # for a fast test; then caught
 HANGS_S = 900.0  # a slip may make a loop endless; then it is caught
 HERE = Path(__file__).parent
 ROOMS = (
@@ -116,16 +117,23 @@ def _compiles(text: str) -> bool:
     return True
 
 
-def tests_of(file: str) -> list[str]:
-    """Return the tests that may notice a slip in a file: of its name, of its room, and those that import it."""
+def tests_of(file: str) -> list[list[str]]:
+    """Return the tests that may notice a slip in a file, the likely first: of its name, that import it, of its room."""
     path = Path(file)
     tests, module = REPOSITORY / "tests", file.removesuffix(".py").replace("/", ".")
     room = tests / path.parent.as_posix().removeprefix("rover_lib/")
     package, _, stem = module.rpartition(".")
     imported = re.compile(rf"(from|import) {re.escape(module)}\b|from {re.escape(package)} import .*\b{stem}\b")
-    named = sorted(tests.rglob(f"test_{path.stem}.py"))
-    others = [t for t in sorted(tests.rglob("test_*.py")) if t.parent == room or imported.search(t.read_text())]
-    return [test.relative_to(REPOSITORY).as_posix() for test in dict.fromkeys((*named, *others))]
+    stages: list[list[str]] = [[], [], []]
+    for test in sorted(tests.rglob("test_*.py")):
+        name = test.relative_to(REPOSITORY).as_posix()
+        if test.name == f"test_{path.stem}.py":
+            stages[0].append(name)
+        elif imported.search(test.read_text()):
+            stages[1].append(name)
+        elif test.parent == room:
+            stages[2].append(name)
+    return [stage for stage in stages if stage]
 
 
 @dataclass(frozen=True)
@@ -156,15 +164,20 @@ def make_copy(folder: Path) -> None:
 
 def exit_code(folder: Path, *arguments: str) -> int:
     """Run Python in a copy; return its exit code, 1 if it hangs. Raises RoverError if C cannot be compiled."""
+    return _outcome(folder, *arguments)[0]
+
+
+def _outcome(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Run Python in a copy; return its exit code and what it printed."""
     env = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": str(folder / ".cache")}
     options: dict[str, Any] = {"cwd": folder, "env": os.environ | env, "capture_output": True, "timeout": HANGS_S}
     try:
         done = subprocess.run([sys.executable, *arguments], text=True, errors="replace", **options)
     except subprocess.TimeoutExpired:
-        return 1
-    if "gcc failed" in (said := done.stdout + done.stderr):
-        raise RoverError("what was planted cannot be compiled", found=said[-2000:])
-    return done.returncode
+        return 1, ""
+    if "gcc failed" in (printed := done.stdout + done.stderr):
+        raise RoverError("what was planted cannot be compiled", found=printed[-2000:])
+    return done.returncode, printed
 
 
 class Copies:
@@ -193,33 +206,47 @@ class Copies:
 def try_slips(slips: Sequence[Slip], jobs: int, slow: bool, say: Callable[[str], None]) -> dict[str, Any]:
     """Plant each slip and see whether a test fails. Returns how many were caught, and what survived.
 
-    slow: run the room's slow tests too, on what the others did not notice. Raises RoverError if the tests fail without
-    slips. A survivor that survivors.yml gives a reason is not counted.
+    slow: run the room's slow tests too, on what the others did not notice. Raises RoverError if a test that failed
+    fails without slips too. A survivor that survivors.yml gives a reason is not counted.
     """
     reasons = {row["slip"]: row["why"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
     with tempfile.TemporaryDirectory(prefix="rover-slips-") as scratch, ThreadPoolExecutor(jobs) as pool:
         copies = Copies(Path(scratch), jobs)
 
-        def attempt(slip: Slip) -> bool:
-            begin_s, tests = time.monotonic(), tests_of(slip.file)
+        def attempt(slip: Slip) -> str | None:
+            begin_s, stages = time.monotonic(), tests_of(slip.file)
+            runs = [(FAST, tests) for tests in stages]
+            if slow:
+                runs += [(SLOW, tests) for tests in stages]
             with copies.broken(slip.file, slip.plant) as copy:
-                caught = bool(tests) and exit_code(copy, *PYTEST, "-m", FAST, *tests) not in (0, 5)
-                if not caught and slow:
-                    caught = exit_code(copy, *PYTEST, "-m", SLOW, *tests) not in (0, 5)
+                failed = next(filter(None, (_failed(copy, marks, tests) for marks, tests in runs)), None)
             told = slip.told((REPOSITORY / slip.file).read_text())
-            outcome = "caught" if caught else "has a reason" if _key(told) in reasons else "SURVIVED"
+            outcome = f"caught by {failed}" if failed else "has a reason" if _key(told) in reasons else "SURVIVED"
             say(f"{outcome}: {told} ({time.monotonic() - begin_s:.0f} s)")
-            return caught
+            return failed
 
-        whole = sorted({test for slip in slips for test in tests_of(slip.file)})
+        failed = list(pool.map(attempt, slips))
         with copies.broken(slips[0].file, str) as copy:
-            if exit_code(copy, *PYTEST, "-m", FAST, *whole):
-                raise RoverError("tests fail without slips", remedy="run make test-fast")
-        caught = list(pool.map(attempt, slips))
-    told = [slip.told((REPOSITORY / slip.file).read_text()) for slip, c in zip(slips, caught, strict=True) if not c]
+            named = sorted({name for name in failed if name})
+            for options, tests in (
+                ((), [name for name in named if "::" in name]),
+                (("--collect-only",), [name for name in named if "::" not in name]),  # could not be imported, or hung
+            ):
+                if tests and exit_code(copy, *PYTEST, *options, *tests):
+                    raise RoverError("tests fail without slips too", found=" ".join(tests), remedy="run make test-fast")
+    told = [slip.told((REPOSITORY / slip.file).read_text()) for slip, f in zip(slips, failed, strict=True) if not f]
     survived = [text for text in told if _key(text) not in reasons]
-    counted = sum(caught) + len(survived)
-    return {"slips": len(slips), "caught_pct": 100 * sum(caught) / max(counted, 1), "survived": survived}
+    caught = len(slips) - len(told)
+    return {"slips": len(slips), "caught_pct": 100 * caught / max(caught + len(survived), 1), "survived": survived}
+
+
+def _failed(copy: Path, marks: str, tests: Sequence[str]) -> str | None:
+    """Return the first of these tests that fails in a copy, their first file if it names none, or None."""
+    code, printed = _outcome(copy, *PYTEST, *(ENDLESS if marks == FAST else ()), "-m", marks, *tests)
+    if code in (0, 5):
+        return None
+    found = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", printed, re.MULTILINE)
+    return found[1] if found else tests[0]
 
 
 def _key(told: str) -> str:

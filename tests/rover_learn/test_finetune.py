@@ -2,9 +2,11 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from itertools import product
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -109,11 +111,16 @@ def test_a_lerobot_folder_learns_on_and_recordings_of_one_folder_do(taught, old,
     (both := tmp_path / "both").mkdir()
     for path in (*old.iterdir(), *new.iterdir()):
         (both / path.name).symlink_to(path)
+    (both / "episode_0").unlink()
+    shutil.copytree(old / "episode_0", both / "episode_0")
+    for picture in (both / "episode_0").rglob("*.jpg"):
+        cv2.imwrite(str(picture), smooth_frame(np.random.default_rng(0), 54, 96) * 0)
     short = replace(recipe, transformer_steps=1, together_steps=0)
     how = {"runs_dir": tmp_path, "recipe": short, "machine": Machine.of("cpu")}
     folder = finetune(taught / "pretrained_model", [both], "again", **how)
     metrics = read_stage(folder / "finetune.json", "finetune")["metrics"]
     assert [row["kind"] for row in metrics["held_out"]] == ["old", "old", "new"]
+    assert "episode_0: 100% of its pictures are black, and show nothing: leave them out" in metrics["warnings"]
     weights = load_checkpoint(folder / "pretrained_model").weights
     assert set(weights) == set(load_checkpoint(taught / "pretrained_model").weights)
 

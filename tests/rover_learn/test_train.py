@@ -3,6 +3,7 @@
 import json
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -235,6 +236,18 @@ def test_a_command_to_go_on_is_printed_only_for_what_was_learned(drives, tmp_pat
     result = rover("train", drives, "my policy.pth", "--backbone", "none")
     assert result.exit_code == 0 and says in result.output, result.output
     assert ("next:" in result.output) == (steering < 15)
+
+
+def test_pictures_that_show_nothing_are_named_before_a_training(tmp_path, monkeypatch):
+    drives = record_drives(tmp_path / "episodes")
+    for picture in (drives / "episode_1").rglob("*.jpg"):
+        cv2.imwrite(str(picture), np.zeros((54, 96, 3), np.uint8))
+    monkeypatch.setenv("ROVER_CACHE", str(tmp_path))
+    monkeypatch.setattr(train_module, "cache_folder", lambda *_: pytest.fail("as it is to train"))
+    said = []
+    with pytest.raises(pytest.fail.Exception, match="as it is"):
+        train(drives, tmp_path / "policy.pth", machine=CPU, say=said.append)
+    assert said[-1] == "episode_1: 100% of its pictures are black, and show nothing: leave them out"
 
 
 @pytest.mark.parametrize(

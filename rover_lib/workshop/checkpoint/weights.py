@@ -73,7 +73,7 @@ def check_weights_are_whole(path: Path, weights: Mapping[str, Any]) -> Weights:
         dense = isinstance(weight, Tensor) and weight.layout == torch.strided and weight.device.type == "cpu"
         if not dense or not weight.is_floating_point():  # as a quantized tensor is not
             odd.append(name)
-        elif weight.dim() > 1 and "state_input" not in name and _is_torn(weight, ".backbone." in name):
+        elif weight.dim() > 1 and "state_input" not in name and _is_torn(name, weight):
             torn.append(name)
     if odd:
         problem = f"{path}: these weights are not dense tensors of floats: {quote_all(odd)}"
@@ -86,15 +86,19 @@ def check_weights_are_whole(path: Path, weights: Mapping[str, Any]) -> Weights:
     return {name.removeprefix("model."): weight for name, weight in weights.items()}
 
 
-def _is_torn(weight: Tensor, backbone: bool) -> bool:
+def _is_torn(name: str, weight: Tensor) -> bool:
     """Whether a matrix has TORN zeros in a row, or only zeros.
 
-    In the backbone, channels may be left out: rows of zeros, and the same columns of all others.
+    In the backbone, channels may be left out: rows of zeros, and the same columns of all others. An action that is
+    held has a row of zeros in the head, and all may be held.
     """
     zero = (weight.detach().flatten(1) == 0).numpy()
-    if backbone or zero.size < TORN:
+    head = name.endswith(OF_ACT)
+    if head or ".backbone." in name or zero.size < TORN:
         rows = zero[~zero.all(1)]
-        return not len(rows) or int((rows & ~rows.all(0)).sum(1).max()) >= TORN_ROW
+        if not len(rows):
+            return not head
+        return int((rows if head else rows & ~rows.all(0)).sum(1).max()) >= TORN_ROW
     whole = zero.ravel()
     blocks = whole[: whole.size // TORN * TORN].reshape(-1, TORN).all(1)
     return bool(blocks.any() or whole[-TORN:].all())

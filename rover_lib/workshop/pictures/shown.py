@@ -121,7 +121,6 @@ def _count_equal(samples: Sequence[Sample], k: int, small: Any, moving: np.ndarr
 
 def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
     """Add a fault for a camera that stood still, and for pictures of a single colour."""
-    place = drive.episode.path / drive.episode.id
     frames = drive.episode.frames
     means = drive.pictures.mean((1, 2, 3))
     blocks = drive.pictures.reshape(len(drive.pictures), 8, SEEN[1] // 8, 12, SEEN[0] // 12, 3).mean((2, 4))
@@ -134,11 +133,11 @@ def _note_nothing(drive: _Drive, of_camera: str, faults: Faults) -> None:
         elif mean > BRIGHT:
             word = "white"
         note = f"{flat.mean():.0%} of its pictures{of_camera} are {word}, and show nothing: leave them out"
-        faults.add(place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
+        faults.add(drive.episode.place, "blank_pictures", note, max(round(flat.mean() * frames), 1))
     elif drive.frozen:
         count = max(round(drive.equal / drive.compared * frames), drive.longest)
         note = f"the picture{of_camera} stood still for {drive.longest} frames while actions changed: leave it out"
-        faults.add(place, "frozen_camera", note, count)
+        faults.add(drive.episode.place, "frozen_camera", note, count)
 
 
 def _note_repeated(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> None:
@@ -178,7 +177,7 @@ def _note_others(drives: Sequence[_Drive], of_camera: str, faults: Faults) -> No
         note = f"its pictures{of_camera} {words}, {reference}: turn them or leave them out"
         for pieces, is_odd in zip(long, odd, strict=True):
             for drive in pieces if is_odd else ():
-                faults.add(drive.episode.path / drive.episode.id, kind, note, drive.episode.frames)
+                faults.add(drive.episode.place, kind, note, drive.episode.frames)
 
 
 def _scaled(sample: Sample, camera: str) -> np.ndarray:

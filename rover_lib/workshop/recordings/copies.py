@@ -49,7 +49,7 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         same = next((other for other, pairs in suspects if look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
             note = f"the same drive as {same.id}, as its actions and pictures show"
-            faults.add(episodes[i].path / episodes[i].id, "copy", note)
+            faults.add(episodes[i].place, "copy", note)
             continue
         unique.add(i)
         for run, k in chain.from_iterable(_runs(episodes[i], step).items() for step in STEPS):

@@ -161,6 +161,11 @@ class Episode:
     session: str = ""
     begin_s: float = 0.0
 
+    @property
+    def place(self) -> Path:
+        """Where faults find it: its folder, or its name in the files of several."""
+        return self.path if self.path.name == self.id else self.path / self.id
+
     @cached_property
     def by_policy(self) -> bool:
         """Whether a policy drove in it, so that what a human did in it was a correction."""

@@ -30,7 +30,7 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         second = pair[-1]
         if first is not second and not twin_names & {first.id, second.id} and not _is_symmetric(first):
             twin_names.add(second.id)
-            faults.add(second.path / second.id, "copy", f"{OF}{first.id}, mirrored, as its actions and pictures show")
+            faults.add(second.place, "copy", f"{OF}{first.id}, mirrored, as its actions and pictures show")
     return tuple(episode for episode in unique if episode.id not in twin_names)
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from rover_lib.onboard.errors import CheckpointError
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
+from rover_lib.workshop.checkpoint.weights import check_weights_are_whole
 from rover_lib.workshop.recordings.samples import Layout
 from rover_lib.workshop.recordings.source import Source
 from rover_lib.workshop.run.session import load
@@ -272,6 +274,18 @@ def test_weights_that_were_not_copied_to_their_end_are_called_damaged(lerobots):
         file.write_bytes(whole[:first] + bytes(last - first) + whole[last:])
         with pytest.raises(CheckpointError, match=r"damaged, its weights are zeros .* copied to its end\?"):
             load_checkpoint(lerobots)
+
+
+@pytest.mark.parametrize(("held", "torn", "damaged"), [([1], 0, False), ([0, 1], 0, False), ([1], 64, True)])
+def test_actions_that_are_held_have_rows_of_zeros(held, torn, damaged):
+    whole = {"model.action_head.weight": torch.ones(2, 128)}
+    whole["model.action_head.weight"][held] = 0
+    whole["model.action_head.weight"][0, :torn] = 0
+    if damaged:
+        with pytest.raises(CheckpointError, match="damaged"):
+            check_weights_are_whole(Path("p"), whole)
+    else:
+        assert set(check_weights_are_whole(Path("p"), whole)) == {"action_head.weight"}
 
 
 def test_a_state_that_never_varied_is_given_to_the_network_as_it_was(lerobots):
