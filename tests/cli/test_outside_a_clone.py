@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,9 @@ class Shell:
             assert any(re.search(sign, text) for text in process.stdout), line
         finally:
             process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.communicate(timeout=30)
+            process.kill()  # JupyterLab forgets a signal that comes before its loop runs
             process.communicate()
 
 
