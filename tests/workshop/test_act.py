@@ -141,7 +141,14 @@ def test_counts_the_full_policys_arithmetic():
 
 def test_every_module_belongs_to_a_block(tiny):
     model = ACT(tiny.config, tiny.weights)
-    counted = set(multiply_accumulates(model))
-    assert counted == {*blocks(tiny.config), "head", "state_project"}
+    counts = multiply_accumulates(model)
+    assert set(counts) == {*blocks(tiny.config), "head", "state_project"}
+    # By hand: width 64, 128 within; 32 steps; a picture of 72x128 is 3x4 tokens, beside a latent and a state.
+    assert counts["backbone.stem"] == 36 * 64 * 64 * 3 * 7 * 7
+    assert counts["encoder.0.feed_forward"] == 14 * 2 * 64 * 128
+    assert counts["decoder.1.feed_forward"] == 32 * 2 * 64 * 128
+    projections, products = (32 + 14 + 14 + 32) * 64 * 64, 2 * 32 * 14 * 64
+    assert counts["decoder.1.cross_attention"] == projections + products
+    assert (counts["head"], counts["state_project"]) == (32 * 64 * 2, 2 * 64)
     assert block_of("decoder.1.feed_forward.up") == "decoder.1.feed_forward"
     assert [tuple(x.shape) for x in example_inputs(tiny.config)] == [(1, 2), (72, 128, 3)]
