@@ -315,15 +315,14 @@ def run_trials(
     car = getattr(policy, "car", None)
     left = car.left if isinstance(car, Car) else None  # of older recordings, whose car turned left
     seeds = progress(range(seed, seed + worlds), desc="driving", total=worlds)
-    driven = []
+    hit, paths, balloons = list[bool](), list[np.ndarray](), list[tuple[float, float]]()
     for world_seed in seeds:
         world = World(world_seed, left=left, level=level)
         _drive_to_end(policy, world, replan_every)
-        driven.append(world)
-    hit = tuple(world.hit for world in driven)
-    paths = tuple(path_of(world) for world in driven)
-    balloons = tuple((world.balloon.x_m, world.balloon.y_m) for world in driven)
-    return TrialReport(sum(hit), worlds, hit, paths, balloons)
+        hit.append(world.hit)
+        paths.append(path_of(world))
+        balloons.append((world.balloon.x_m, world.balloon.y_m))
+    return TrialReport(sum(hit), worlds, tuple(hit), tuple(paths), tuple(balloons))
 
 
 def path_of(world: World) -> np.ndarray:

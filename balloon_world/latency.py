@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from balloon_world.drives import SEED, Driven, count_hits, drive_in, everywhere, path_of
-from balloon_world.level import level_named
+from balloon_world.level import EASY, level_named
 from balloon_world.world import World
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.plan import Settings
@@ -33,7 +33,7 @@ def measure_latencies(
     latencies_ms: Sequence[float],
     pushes: int = 0,
     pushed_latencies_ms: Sequence[float] = (),
-    level: str = "easy",
+    level: str = EASY.name,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure how a run's static policy drives when its plans are late; write and return drive.json, stage 'drive'.
@@ -82,14 +82,15 @@ class OnMap:
 
 
 def pushed_on_map(
-    run_dir: Path | str, *, latencies_ms: Sequence[float], pushes: int, worlds: int
+    run_dir: Path | str, *, latencies_ms: Sequence[float], pushes: int, worlds: int, level: str = EASY.name
 ) -> dict[str, list[OnMap]]:
     """Drive some of the pushed drives of `measure_latencies` once more, compensated, for a map of each latency."""
+    of_level = level_named(level)
     policy, settings = load_policy(Path(run_dir) / f"policy_{GATED}.pt"), Settings.of(params()["drive"])
     maps: dict[str, list[OnMap]] = {}
     for ms in latencies_ms:
         for seed in range(SEED, SEED + min(worlds, ON_A_MAP)):
-            world = World(seed, pushes)
+            world = World(seed, pushes, level=of_level)
             driven = drive_in(policy, world, ms / 1e3, settings)
             found = OnMap(driven.outcome, path_of(world), (world.balloon.x_m, world.balloon.y_m))
             maps.setdefault(f"{ms:g} ms late", []).append(found)

@@ -19,7 +19,7 @@ class Level:
     `flicker` at most, at flicker_hz times 2 pi. tint: at most, of each colour. glare: 0 to 255, at its middle.
     hidden: share of worlds in which something stands before the balloon, and hidden_share: of the balloon's width
     behind it. alike: share of worlds with balloons, a floor and a wall that have the balloon's colour. decoys: red
-    things that are no balloons, at most. solid: whether a car that touches a thing has ended its drive.
+    things that are no balloons, at most. solid: whether touching a thing ends the drive.
     shoves: at least, in each drive; drags: share of them that last long, as on a slope. speed, steering: what the car
     makes of a command, as a factor. slip_s: how long the car's direction lags behind its heading.
     """

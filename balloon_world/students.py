@@ -80,7 +80,7 @@ def judge_students(
     *,
     episodes: Path | str | None = None,
     worlds: int = 200,
-    level: str = "easy",
+    level: str = EASY.name,
     held_out_frames: int = 300,
     progress: Progress = silent,
 ) -> dict[str, Any]:

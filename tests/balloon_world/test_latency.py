@@ -42,6 +42,20 @@ def test_what_cannot_be_measured_is_refused(run_dir):
             latency.measure_latencies(folder, worlds=worlds, latencies_ms=[0])
 
 
+def test_the_map_is_of_the_level_that_was_driven(run_dir, monkeypatch):
+    monkeypatch.setattr(latency, "load_policy", lambda path: Foresees())
+    levels = []
+
+    def drive(policy, world, latency_s, settings):
+        levels.append(world.level.name)
+        return drives.Driven("hit", [])
+
+    monkeypatch.setattr(latency, "drive_in", drive)
+    monkeypatch.setattr(latency, "path_of", lambda world: world.seed)
+    maps = latency.pushed_on_map(run_dir, latencies_ms=[150], pushes=2, worlds=1, level="hard")
+    assert list(maps) == ["150 ms late"] and levels == ["hard"]
+
+
 @pytest.mark.parametrize(
     ("missed_at", "passed"),
     [({0: 0, 150: 0}, True), ({0: 3, 150: 3}, True), ({0: 0, 150: 4}, None), ({0: 0, 150: 6}, False), ({30: 0}, None)],
