@@ -242,7 +242,7 @@ class _Run:
             if i >= LEAST_ROUNDS and passed_s >= at_most_s:
                 break
             if passed_s >= read_s + READ_S:
-                self.readings.append(self.host.reading() | {"s": passed_s, "supply_v": self.host.supply_v()})
+                self._read_host(passed_s)
                 read_s = passed_s
             self.begun_s.append(passed_s)
             frame = timing.frames[i % len(timing.frames)]
@@ -252,7 +252,7 @@ class _Run:
                 timing.policies[name].predict_chunk(frame, timing.state)
                 self.latencies_ms[name].append((self.wall() - begin_s) * 1000)
         self.wall_s, self.process_s = self.wall() - self.start_s, self.cpu() - cpu_start_s
-        self.readings.append(self.host.reading() | {"s": self.wall_s, "supply_v": self.host.supply_v()})
+        self._read_host(self.wall_s)
         after = self.host.core_ticks()
         if before and after and len(before) == len(after):
             spans = [(b1 - b0, a1 - a0) for (b0, a0), (b1, a1) in zip(before, after, strict=True)]
@@ -296,6 +296,11 @@ class _Run:
         """Return the machine's state in the run: load of its cores, highest temperature, lowest clock, throttling."""
         state = {"cpu_per_core_pct": self.per_core_pct, **_heat_and_clock(self.readings)}
         return state | {"throttled": self.readings[-1]["throttled"]}
+
+    def _read_host(self, passed_s: float) -> None:
+        """Keep the host's state. Only a benchmark of minutes asks for the supply, by a process beside what is timed."""
+        supply_v = self.host.supply_v() if self.timing.minutes else None
+        self.readings.append(self.host.reading() | {"s": passed_s, "supply_v": supply_v})
 
     def over_time(self) -> list[dict[str, Any]]:
         """Return a row for each ten seconds in which a round began."""
