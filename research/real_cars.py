@@ -14,22 +14,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
-from research import donkey_cnn
+from research.donkey_cnn import AHEAD_S, r2
+from rover_learn.judges import Judges
 from rover_lib.onboard.drive.plan import Smoother, is_unfamiliar
 from rover_lib.onboard.params import params
 from rover_lib.onboard.policy.load import Policy, load_policy
 from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
-from rover_lib.workshop.judge.guesses import frame_errors, least_blind_errors
+from rover_lib.workshop.int8.familiar import EVERY_S
 from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz
+from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz, pick_evenly
 from rover_lib.workshop.recordings.source import Source
 
-AHEAD_S = donkey_cnn.AHEAD_S
-EVERY_S, WINDOW = 0.1, 15  # between a Pi's plans; pictures that follow one another
+WINDOW = 15  # pictures that follow one another
 WINDOWS = 12  # of each car
 ARTIFACT = "policy_static.pt"
 
@@ -54,12 +55,14 @@ def steering(car: dict[str, Any], parts: Split) -> dict[str, Any]:
     for ahead_s in AHEAD_S:
         step = min(round(ahead_s * config.rate_hz), config.chunk - 1)
         driven = ~is_pad[:, step]
-        missed = np.square(plans[driven, step, 0] - chunks[driven, step, 0]).mean()
-        shares[f"{ahead_s:g}"] = round(float(1 - missed / chunks[driven, step, 0].var()), 3)
-    ranges = np.ptp(learned[~learned_pad], axis=0)
-    errors = 100 * np.nanmean(frame_errors(plans, chunks, is_pad), axis=0) / ranges
-    blind = 100 * least_blind_errors(learned, learned_pad, chunks, is_pad) / ranges
-    return {"r2": shares, "off_pct": errors.round(2).tolist(), "blind_pct": blind.round(2).tolist()}
+        planned, recorded = (torch.from_numpy(each[driven, step, 0]).double() for each in (plans, chunks))
+        shares[f"{ahead_s:g}"] = round(r2(planned, recorded), 3)
+    judges = Judges.of(config.action_names, learned, learned_pad, chunks, is_pad)
+    return {
+        "r2": shares,
+        "off_pct": judges.errors_pct(plans).round(2).tolist(),
+        "blind_pct": judges.blind_pct.round(2).tolist(),
+    }
 
 
 def of_int8(run: Path) -> dict[str, Any]:
@@ -81,8 +84,7 @@ def windows(samples: Sequence[Sample]) -> list[list[Sample]]:
     for block in blocks.values():
         pictures = block[:: max(1, round((frame_rate_hz(block) or 1) * EVERY_S))]
         stretches += [pictures[i : i + WINDOW] for i in range(0, len(pictures) - WINDOW + 1, WINDOW)]
-    chosen = np.linspace(0, len(stretches) - 1, min(WINDOWS, len(stretches))).round().astype(int)
-    return [stretches[i] for i in chosen]
+    return list(pick_evenly(stretches, WINDOWS))
 
 
 def stopped(policy: Policy, window: Sequence[Sample]) -> bool:

@@ -33,7 +33,7 @@ from rover_lib.workshop.recordings.episodes import choose_calibration
 from rover_lib.workshop.recordings.samples import pick_evenly
 from rover_lib.workshop.run.session import Opened, open_run
 
-SAMPLES = 1024  # the model zoo's scripts calibrate transformers with so many
+SAMPLES = 1024  # as many as the model zoo's scripts take to calibrate transformers
 JUDGED = 120  # held-out frames whose features are wanted back
 # 10**9 multiply-accumulates per second: the model zoo's DETR-ResNet18 has 31 * 10**9, and these pictures a second.
 CHIP_GMAC_PER_S = {"hailo8": 31 * 30, "hailo8l": 31 * 19, "hailo10h": 31 * 41}

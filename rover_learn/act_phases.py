@@ -371,9 +371,8 @@ def _features(
         if varied is None or flipped is None:
             return loop.on_device({IMAGE: images}, training.weights.device)
         images[flipped[rows]] = images[flipped[rows], :, ::-1]
-        shifted = recipe.augmentation.shifted(images, rng)
+        images[varied[rows]] = recipe.augmentation.shifted(images[varied[rows]], rng)
         variation = recipe.augmentation.draw(len(images), rng, of=varied[rows])
-        images[varied[rows]] = shifted[varied[rows]]
         return loop.on_device({IMAGE: images, **variation}, training.weights.device)
 
     for _, batch in training.saved.steps(f"features, {name}", -(-len(chosen) // count), rng, read, maps=maps):

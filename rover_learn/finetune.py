@@ -214,10 +214,8 @@ def _refuse_unlike(read: Sequence[Recordings], plans_hz: float) -> None:
                 problem = "another car"
                 actual = f"{episode.id}: {unlike}"
             elif is_another_rate(rate_hz, plans_hz):
-                problem, actual = (
-                    "another rate",
-                    f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan",
-                )
+                problem = "another rate"
+                actual = f"{rate_hz:.1f} frames a second in {episode.id}, {plans_hz:g} in a plan"
         if problem:
             remedy = f"give recordings of one car, one camera and {plans_hz:g} Hz; in the dark, a camera is slower"
             raise TrainingError(f"{recordings.root}: was recorded with {problem}", found=actual, remedy=remedy)
@@ -362,17 +360,17 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _judge(kinds: Mapping[str, Any]) -> tuple[bool | None, str]:
     scarce = {k: f"{kinds[k]['episodes']} {k}" for k in KINDS if kinds[k]["episodes"] < LEAST_EPISODES}
-    improved = {k: kinds[k]["change_points"] for k in KINDS if k not in scarce and kinds[k]["chance"] < CHANCE}
-    if improved.get(OLD, 0) > 0:
-        return False, f"not better: on the old episodes it is {improved[OLD]:.2f} points further from the human"
-    if improved.get(NEW, 0) > 0:
-        return False, f"worse: on the new episodes it is {improved[NEW]:.2f} points further from the human"
+    sure_changes = {k: kinds[k]["change_points"] for k in KINDS if k not in scarce and kinds[k]["chance"] < CHANCE}
+    if sure_changes.get(OLD, 0) > 0:
+        return False, f"not better: on the old episodes it is {sure_changes[OLD]:.2f} points further from the human"
+    if sure_changes.get(NEW, 0) > 0:
+        return False, f"worse: on the new episodes it is {sure_changes[NEW]:.2f} points further from the human"
     if scarce:
         return None, f"undecided: {' and '.join(scarce.values())} held-out episodes, of at least {LEAST_EPISODES} each"
-    if NEW not in improved:
+    if NEW not in sure_changes:
         return None, "undecided: on the new episodes the difference may be chance"
-    why = f"better: on the new episodes it is {-improved[NEW]:.2f} points nearer to the human, and no worse on the old"
-    return True, why
+    nearer = -sure_changes[NEW]
+    return True, f"better: on the new episodes it is {nearer:.2f} points nearer to the human, and no worse on the old"
 
 
 def summary(content: Mapping[str, Any]) -> str:

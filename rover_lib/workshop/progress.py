@@ -44,7 +44,9 @@ def _shown_bar(items: Iterable, desc: str = "", total: int | None = None) -> Ite
     """
     from IPython.display import HTML, display
 
-    every = total if total is not None else len(items) if isinstance(items, Sized) else None
+    every = total
+    if every is None and isinstance(items, Sized):
+        every = len(items)
     most = "" if every is None else f' max="{every}"'
     shown = display(HTML(escape(desc)), display_id=True)
     last_s = 0.0
