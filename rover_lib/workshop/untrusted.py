@@ -97,7 +97,8 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
 def scan_video(path: Path) -> tuple[list[float], set[float]]:
     """Return when the pictures of a video are shown, in seconds, in order; and when those that are torn are.
 
-    A picture needs those before it, up to one that is whole by itself. All packets are read: an encoder writes no row
+    A picture needs those before it, up to one that is whole by itself, and LeRobot 0.6 looks for that one from a tick
+    before the picture, so that the first after a torn one is lost too. All packets are read: an encoder writes no row
     of zeros, as a copy does that was not finished. Some are decoded, as other damage shows there only.
     """
     import av
@@ -114,9 +115,9 @@ def scan_video(path: Path) -> tuple[list[float], set[float]]:
             if bad == len(group) and number % stride == 0:
                 bad = _decoded(stream.codec_context, group)
             if bad < len(group):
-                torn |= {*range(max(0, first + bad - AHEAD), first + len(group))}
+                torn |= {*range(max(0, first + bad - AHEAD), first + len(group) + 1)}
         times_s = [float(packet.pts * packet.time_base) for packet in packets]
-    return sorted(times_s), {times_s[k] for k in torn}
+    return sorted(times_s), {time_s for k, time_s in enumerate(times_s) if k in torn}
 
 
 def _decoded(decoder: Any, packets: list[Any]) -> int:
