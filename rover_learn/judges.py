@@ -40,7 +40,8 @@ class Judges:
         actions, acted = learned[~learned_pad], chunks[~is_pad]
         ranges = np.maximum(np.ptp(actions, axis=0), SMALLEST_RANGE)
         blind_pct = 100 * least_blind_errors(learned, learned_pad, chunks, is_pad) / ranges
-        varies = [np.ptp(acted[:, i]) > 0 and not hardly_varies(name, acted[:, i]) for i, name in enumerate(names)]
+        # By what is learned from: the verdict holds each action that hardly varies there, so what was held here is held.
+        varies = [np.ptp(acted[:, i]) > 0 and not hardly_varies(name, actions[:, i]) for i, name in enumerate(names)]
         return cls(names, chunks, is_pad, ranges, blind_pct, np.array(varies))
 
     def errors_pct(self, plans: np.ndarray) -> np.ndarray:

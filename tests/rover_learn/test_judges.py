@@ -52,3 +52,10 @@ def test_a_throttle_that_is_held_need_not_be_learned(throttle):
     judges = judged_by(throttle)
     assert judges.varies.tolist() == [True, False] and judges.ranges[1] == pytest.approx(0.02)
     assert not not_learned(judges.summary(np.array([1.0, 60.0])))
+
+
+def test_a_throttle_is_held_by_what_is_learned_from():
+    """What chooses the best weights is a small part: a throttle may hardly vary there by chance."""
+    varied, still = chunks([-1, 1, -1, 1], [0.1, 0.3, 0.1, 0.3]), chunks([-1, 1, -1, 1], [0.3, 0.31, 0.3, 0.3])
+    assert Judges.of(NAMES, *varied, *still).varies.tolist() == [True, True]
+    assert Judges.of(NAMES, *still, *varied).varies.tolist() == [True, False]

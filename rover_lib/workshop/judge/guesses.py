@@ -7,7 +7,8 @@ Each action is asked by itself. The guesses are a constant (the better of mean a
 step, of the recordings that the policy could learn from, and the last action again and again. That one is handed the
 driver's own action at each picture, which no car has: it is asked for the later half of a plan only. A guess is beaten
 if the policy is surely nearer to the driver: as few drives say little, that is asked of many draws of the held-out
-drives, or of the blocks of long ones (a bootstrap). A throttle that hardly varies is held, and not judged.
+drives, or of the blocks of long ones (a bootstrap). A throttle that hardly varies, there or in what the policy could
+learn from, is held, and not judged.
 """
 
 from collections.abc import Sequence
@@ -174,6 +175,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
     if states.shape[1] == len(report.action_names):
         later = recorded[:, half:], is_pad[:, half:]
         compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
+    learned_actions = np.concatenate([s.chunk[~s.is_pad] for s in learned])
     drawn, pieces = _pieces(report)
     draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
     actions = {}
@@ -187,7 +189,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
                 guesses[name] = _guess(pct * of_guess[:, i], pct * of_policy[:, i], pieces, draws)
         acted = recorded[~is_pad][:, i]
         error = own[:, i].mean()
-        is_constant = hardly_varies(action, acted)
+        is_constant = hardly_varies(action, acted) or hardly_varies(action, learned_actions[:, i])
         size = usual_size(acted)
         actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)

@@ -120,6 +120,19 @@ def test_a_throttle_that_hardly_varies_is_held(throttle, says):
         assert "throttle hardly varies" in line and "100 % off" in line
 
 
+@pytest.mark.parametrize(("learned", "held"), [([0.4, 0.42], True), ([0.2, 0.6], False)])
+def test_what_is_held_is_decided_by_what_was_learned_from_too(learned, held):
+    """So that a training, which holds such a throttle, and the verdict agree, whatever was held out."""
+    samples = [s for e in range(6) for s in drive(e)]
+    for s in samples:
+        s.chunk[:, 1] = 0.4 + 0.2 * np.sin(s.row)
+    others = [s for e in range(10, 14) for s in drive(e)]
+    for s in others:
+        s.chunk[:, 1] = learned[s.row % 2]
+    report = report_of(samples, np.stack([s.chunk for s in samples]), RANGE | {"throttle": (0.0, 0.6)})
+    assert against_guesses(report, others).actions["throttle"].held == held
+
+
 @pytest.mark.parametrize("moves", [0.0, 0.001])
 def test_where_no_action_varies_nothing_is_shown(moves):
     straight = drive(0)
