@@ -4,8 +4,8 @@
 #     research/gpu_proof.sh OUT [policy] [student] [drives]      # all three if none is named
 #
 # policy: one of the real car's size, and its INT8 (OUT/policy/run.json). student: distilled from it. drives: how well
-# policies of 5 to 320 drives plan in 40 others, and drive (OUT/drives.json); an hour without a GPU. STEPS of the
-# policy's training: ten minutes by default. LEVEL of the worlds: easy by default. What is ended goes on where it was when
+# policies of 5 to 320 drives (COUNTS) plan in 40 others, and drive (OUT/drives.json); an hour without a GPU. STEPS of
+# the policy's training: ten minutes by default. LEVEL of the worlds: easy by default. What is ended goes on where it was when
 # it is run again. Needs `rover` with what [workshop] of pyproject.toml names, and its python3 in the PATH.
 set -euo pipefail
 out=$1
@@ -31,7 +31,7 @@ student() {
 
 drives() {
   [ -d "$out/judges" ] || rover world record "$out/judges" --count 40 --seed 1 --level "$level" > "$out/judges.log"
-  counts="5 10 20 40 80 160 320"
+  counts=${COUNTS:-5 10 20 40 80 160 320}
   for count in $counts; do
     record "$count"
     [ -f "$out/of-$count.pth" ] || rover train "$out/drives-$count" "$out/of-$count.pth" ${DEVICE:+--device "$DEVICE"}
