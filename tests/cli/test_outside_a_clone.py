@@ -21,7 +21,7 @@ from tests.helpers.installed import ELSEWHERE, ROOT, Installed, with_needs
 from tests.helpers.recorded import record_drives
 
 pytestmark = pytest.mark.slow
-FEW = "--samples 6 --iterations 2 -p choosing_frames 2 -p held_out_frames 4 -p modes '[static]'"
+FEW = "--worlds 2 --samples 6 --iterations 2 -p choosing_frames 2 -p held_out_frames 4 -p modes '[static]'"
 
 
 class Shell:
