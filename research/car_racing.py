@@ -1,34 +1,41 @@
 """gymnasium's CarRacing-v3 as a world to record and to drive in, with the physics and the tracks as they are.
 
-    python -m research.car_racing EPISODES  # needs: pip install gymnasium box2d pygame
+    python -m research.car_racing WORK OUTPUT.json [TRACKS]  # needs: pip install gymnasium box2d pygame
 
-records DRIVES drives of a scripted driver, for `rover train` and `rover run`; research/readiness.py drives here.
+records DRIVES drives of a scripted driver into WORK, trains a policy and makes its artifacts by `rover train` and
+`rover run`, and drives FP32 and static along the same tracks. What is in WORK is not made again.
 
 Its own picture takes 20 ms or more, so what it shows is drawn here, 128x72 and from above: the road, the car, its speed
 as a bar. A drive ends with its time, or once the car's middle is half a road's width beside the road.
 """
 
+import json
 import math
+import subprocess
 import sys
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from gymnasium.envs.box2d.car_dynamics import Car
 from gymnasium.envs.box2d.car_racing import TRACK_DETAIL_STEP, TRACK_WIDTH, CarRacing
 
+from balloon_world.drives import drive_missing
 from balloon_world.record import FIRST_DRIVE, episode_name
 from rover_lib.onboard.car.car import this_car
 from rover_lib.onboard.car.pwm import ARDUINO_STEP_US
 from rover_lib.onboard.recording.episode import About, EpisodeWriter
+from rover_lib.onboard.stage import plain, sha256_of, write_stage
 
 RATE_HZ, TIMEOUT_S, LEFT_M = 25.0, 8.0, 1.5 * TRACK_WIDTH
 WIDTH, HEIGHT, PX_PER_M, CAR_ROW = 128, 72, 1.6, 58
 GRASS, CAR_COLOUR, BAR = (102, 204, 102), (0, 0, 204), (255, 255, 255)  # BGR
 TOP_SPEED = 50.0  # of the bar
 SHOVE, SHOVE_TICKS = 0.3, 5  # somebody pulls the wheel
-DRIVES = 100
+DRIVES, SEED, REPLAN, DRAWS = 100, 10_000, 8, 10_000
 
 
 class _Unseen(CarRacing):  # type: ignore[misc]
@@ -50,7 +57,15 @@ class Track:
         self._ticks = RATE_HZ * timeout_s
         rng = np.random.default_rng([seed, 25])
         self._shoves = {int(t): rng.choice([-1, 1]) for t in rng.uniform(20, self._ticks, shoves)}
+        self.restart()
+
+    def restart(self) -> "Track":
+        """Put the car on the start again."""
+        if self._env.car:
+            self._env.car.destroy()
+        self._env.car = Car(self._env.world, *self._env.track[0][1:4])
         self._at, self.score, self.ticks, self.done = 0, 0.0, 0, False
+        return self
 
     def _seen(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) metres to the car's right and ahead of it."""
@@ -116,6 +131,61 @@ def record_drive(folder: Path, index: int, seed: int) -> None:
             track.step(float(steering or 0), float(throttle or 0))
 
 
+def metres(track: Track, plan: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> float:
+    """Drive along a track by the first REPLAN actions of each plan; return how far the car got."""
+    state = np.zeros(2, np.float32)
+    while not track.done:
+        for steering, throttle in plan(track.render(), state)[:REPLAN]:
+            state = np.array([np.clip(steering, -1, 1), np.clip(throttle, 0, 1)], np.float32)
+            track.step(*map(float, state))
+            if track.done:
+                break
+    return track.score
+
+
+def compare(fp32_m: np.ndarray, static_m: np.ndarray) -> dict[str, float]:
+    """Return what static loses of FP32's mean metres, in %, with the 95 % interval of a bootstrap over tracks."""
+    drawn = np.random.default_rng(0).integers(0, len(fp32_m), (DRAWS, len(fp32_m)))
+    lost_pct = 100 * (1 - static_m[drawn].mean(1) / fp32_m[drawn].mean(1))
+    low, high = np.percentile(lost_pct, [2.5, 97.5])
+    return {"lost_pct": 100 * (1 - static_m.mean() / fp32_m.mean()), "low_pct": low, "high_pct": high}
+
+
+def main(work: Path, output: Path, tracks: int = 100) -> None:
+    """Record, train, export and drive, as far as it is not done, and write the stage to `output`."""
+    episodes, checkpoint, run = work / "episodes", work / "best_model.pth", work / "racing"
+    for index in range(DRIVES):
+        if not (episodes / episode_name(FIRST_DRIVE + timedelta(seconds=30 * index))).exists():
+            record_drive(episodes, index, 0)
+    rover = [sys.executable, "-m", "rover_lib.cli"]
+    if not checkpoint.exists():
+        subprocess.run([*rover, "train", str(episodes), str(checkpoint), "--backbone", "none"], check=True)
+    if not (run / "run.json").exists():
+        made = [*rover, "run", str(checkpoint), str(episodes), "--name", run.name, "--runs-dir", str(work)]
+        subprocess.run([*made, "-p", "modes", "[static]"], check=False)  # its gates may say no, and it drives here
+    found = {}
+    for mode in ("fp32", "static"):
+        artifact = run / f"policy_{mode}.pt"
+
+        def one(policy: Any, asked: tuple[str, int]) -> dict[str, float]:
+            return {"metres": metres(Track(asked[1]), policy.predict_chunk)}
+
+        asked = [(sha256_of(artifact), SEED + i) for i in range(tracks)]
+        rows = drive_missing(artifact, asked, one, work / "drives.jsonl")
+        found[mode] = np.array([rows[each]["metres"] for each in asked])
+    driver = []
+    for seed in range(SEED, SEED + tracks):
+        track = Track(seed)
+        while not track.done:
+            track.step(*track.expert())
+        driver.append(track.score)
+    found["driver"] = np.array(driver)
+    metrics = {f"{name}_m": each.mean() for name, each in found.items()}
+    metrics |= compare(found["fp32"], found["static"])
+    given = {"tracks": tracks, "seed": SEED, "drives": DRIVES, "replan_every": REPLAN, "timeout_s": TIMEOUT_S}
+    write_stage(output, "racing", params=given, metrics=metrics, inputs={checkpoint.name: sha256_of(checkpoint)})
+    print(json.dumps(plain(metrics), indent=1))
+
+
 if __name__ == "__main__":
-    for number in range(DRIVES):
-        record_drive(Path(sys.argv[1]), number, 0)
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *map(int, sys.argv[3:]))
