@@ -4,7 +4,7 @@
 
 KerasLinear's layout: five convolutions, two dense layers, dropout, MSE, Adam, no augmentation, early stopping, and the
 picture alone. It looks at 80x60, for which its last two convolutions are padded; its linear outputs are steering now
-and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": ...}, "spread": ..., ...}}.
+and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": ...}, ...}}.
 """
 
 import json
@@ -101,20 +101,16 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
     began_s, p = time.process_time(), params()["calibration"]
     recordings = load_recordings(source)
     parts, rate_hz = split(recordings, p["held_out_share"], p["seed"]), usual_rate_hz(recordings.episodes)
-    picked = [pick_evenly(part, MOST) for part in (parts.calibration, parts.choosing, parts.held_out)]
-    learning, choosing, held_out = (tensors(part, rate_hz) for part in picked)
+    three = (parts.calibration, parts.choosing, parts.held_out)
+    learning, choosing, held_out = (tensors(pick_evenly(part, MOST), rate_hz) for part in three)
     network, epochs = train(learning, choosing, p["seed"])
     answers, wanted, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
-    shares, spreads = {}, {}
+    shares = {}
     for i, ahead_s in enumerate(AHEAD_S):
-        known = driven[:, i]
-        shares[f"{ahead_s:g}"] = round(r2(answers[known, i], wanted[known, i]), 4)
-        spreads[f"{ahead_s:g}"] = round(float(answers[known, i].std(correction=0)), 4)
+        rows = driven[:, i]
+        shares[f"{ahead_s:g}"] = round(r2(answers[rows, i], wanted[rows, i]), 4)
     return {
         "r2": shares,
-        "spread": round(float(wanted[:, 0].std(correction=0)), 4),  # the driver's
-        "predicted_spread": spreads,
-        "samples": dict(zip(("learning", "choosing", "held_out"), map(len, picked), strict=True)),
         "rate_hz": round(rate_hz, 2),
         "epochs": epochs,
         "processor_s": round(time.process_time() - began_s, 1),
@@ -127,8 +123,9 @@ def main(out: str, *sources: str) -> None:
     path = Path(out)
     results = json.loads(path.read_text()) if path.exists() else {}
     for source in sources:
-        results[Path(source).name] = found = judge(source)
-        print(f"{Path(source).name}: R² {found['r2']}, spread {found['spread']}, {found['processor_s']} s", flush=True)
+        name = Path(source).name
+        results[name] = judge(source)
+        print(f"{name}: R² {results[name]['r2']}, {results[name]['processor_s']} s", flush=True)
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 
 

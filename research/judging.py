@@ -1,6 +1,6 @@
 """Which error tells the policies that drive worse? Drive degraded versions through the same worlds as FP32.
 
-    python -m research.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim [--level hard]
+    python -m research.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim
 
 Each policy drives in FP32 and in every version of VERSIONS, pushed and with late plans. A version that hits fewer
 worlds than FP32 by more than chance loses; each measure is held against that. Drives are kept in the cache, so that the
@@ -19,7 +19,6 @@ from torch import nn
 
 from balloon_world import drives, world
 from balloon_world.drives import SEED, drive_in, drive_missing
-from balloon_world.level import EASY, Level, level_in_key, level_named
 from balloon_world.world import World
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
@@ -107,15 +106,15 @@ def export_all(opened: Opened, folder: Path) -> None:
         exporter.export(degraded(opened, calibration, **each), folder / f"{label}.pt", calibration)
 
 
-def judge(run: Path, episodes: Path, level: Level) -> list[dict[str, Any]]:
+def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     """Return a row for each version of a policy: its pairs with FP32, and its errors. What was driven is kept."""
     opened, settings = load(run / "best_model.pth", episodes), params()["drive"]
     made_of: dict[str, Any] = {"checkpoint": opened.checkpoint.sha256, "versions": VERSIONS}
     made_of |= {"frames": [CALIBRATION, HELD_OUT], "torch": torch.__version__}
     folder = cache_folder("judged", key_of(made_of), lambda new: export_all(opened, new))
-    made_of |= {"drive": settings, "how": [PUSHES, LATENCY_S], **level_in_key(level)}
+    made_of |= {"drive": settings, "how": [PUSHES, LATENCY_S]}
     path = cache_root() / f"drives-{key_of(made_of, *DRIVING)}.jsonl"
-    hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path, level) for label in (FP32, *VERSIONS)}
+    hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path) for label in (FP32, *VERSIONS)}
     fp32, *others = (load_policy(folder / f"{label}.pt", threads=1) for label in hit)
     versions, samples = dict(zip(VERSIONS, others, strict=True)), pick_evenly(opened.parts.held_out, HELD_OUT)
     report = fidelity(fp32, versions, samples, opened.recordings.action_range())
@@ -128,11 +127,11 @@ def judge(run: Path, episodes: Path, level: Level) -> list[dict[str, Any]]:
     return rows
 
 
-def hits(artifact: Path, settings: Settings, path: Path, level: Level) -> list[bool]:
+def hits(artifact: Path, settings: Settings, path: Path) -> list[bool]:
     """Drive an artifact through the worlds; return which it hit. path: keeps the drives; others are driven."""
 
     def one(policy: Policy, asked: tuple[str, int]) -> dict[str, bool]:
-        return {"hit": drive_in(policy, World(asked[1], PUSHES, level=level), LATENCY_S, settings).outcome == "hit"}
+        return {"hit": drive_in(policy, World(asked[1], PUSHES), LATENCY_S, settings).outcome == "hit"}
 
     asked = [(artifact.stem, SEED + i) for i in range(WORLDS)]
     found = drive_missing(artifact, asked, one, path)
@@ -154,16 +153,15 @@ def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
     return found | {"left_out_passed": passed}
 
 
-def main(output: Path, episodes: Path, *runs: Path, level: Level = EASY) -> None:
+def main(output: Path, episodes: Path, *runs: Path) -> None:
     """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
     torch.set_num_threads(1)  # or XNNPACK's pool gets a thread for each core, which the threads that drive wait for
-    rows = [row for run in runs for row in judge(run, episodes, level)]
+    rows = [row for run in runs for row in judge(run, episodes)]
     found: dict[str, Any] = {"measures": {measure: roc(rows, measure) for measure in rows[0]["errors"]}}
     found |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
     found["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
     found["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
     given: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
-    given["level"] = level.name
     given |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
     inputs = {f"{run.name}/best_model.pth": sha256_of(run / "best_model.pth") for run in runs}
     write_stage(output, "judging", params=given, metrics=found | {"rows": rows}, inputs=inputs)
@@ -171,5 +169,4 @@ def main(output: Path, episodes: Path, *runs: Path, level: Level = EASY) -> None
 
 
 if __name__ == "__main__":
-    *files, option, name = sys.argv[1:] if "--level" in sys.argv else [*sys.argv[1:], "", EASY.name]
-    main(*map(Path, files), level=level_named(name))
+    main(*map(Path, sys.argv[1:]))
