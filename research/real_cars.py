@@ -26,8 +26,9 @@ from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.familiar import EVERY_S
+from rover_lib.workshop.recordings.blocks import group_by_block
 from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, pick_evenly
 from rover_lib.workshop.recordings.source import Source
 
 WINDOW = 15  # pictures that follow one another
@@ -77,11 +78,9 @@ def of_int8(run: Path) -> dict[str, Any]:
 
 def windows(samples: Sequence[Sample]) -> list[list[Sample]]:
     """Return stretches of WINDOW pictures, EVERY_S apart, evenly from all blocks."""
-    blocks: dict[str, list[Sample]] = {}
-    for sample in samples:
-        blocks.setdefault(f"{sample.episode} {block_of(sample)}", []).append(sample)
     stretches = []
-    for block in blocks.values():
+    for rows in group_by_block(samples):
+        block = [samples[row] for row in rows]
         pictures = block[:: max(1, round((frame_rate_hz(block) or 1) * EVERY_S))]
         stretches += [pictures[i : i + WINDOW] for i in range(0, len(pictures) - WINDOW + 1, WINDOW)]
     return list(pick_evenly(stretches, WINDOWS))
