@@ -74,8 +74,8 @@ def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> 
     torch.manual_seed(seed)
     network, (pictures, steering, driven) = linear(), learning
     optimizer = torch.optim.Adam(network.parameters(), RATE)
-    best, kept, waited, epochs = float("inf"), network.state_dict(), 0, 0
-    while waited < PATIENCE and epochs < EPOCHS:
+    best, weights, idle, epochs = float("inf"), network.state_dict(), 0, 0
+    while idle < PATIENCE and epochs < EPOCHS:
         network.train()
         for rows in torch.randperm(len(pictures))[:EPOCH].split(BATCH):
             errors = (network(pictures[rows].float() / 255) - steering[rows]) ** 2
@@ -83,10 +83,10 @@ def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> 
             errors[driven[rows]].mean().backward()
             optimizer.step()
         error = float(((predict(network, choosing[0]) - choosing[1]) ** 2)[choosing[2]].mean())
-        waited, epochs = waited + 1, epochs + 1
+        idle, epochs = idle + 1, epochs + 1
         if error < best:
-            best, waited, kept = error, 0, {k: v.clone() for k, v in network.state_dict().items()}
-    network.load_state_dict(kept)
+            best, idle, weights = error, 0, {k: v.clone() for k, v in network.state_dict().items()}
+    network.load_state_dict(weights)
     return network, epochs
 
 
@@ -104,11 +104,11 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
     three = (parts.calibration, parts.choosing, parts.held_out)
     learning, choosing, held_out = (tensors(pick_evenly(part, MOST), rate_hz) for part in three)
     network, epochs = train(learning, choosing, p["seed"])
-    answers, wanted, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
+    answers, recorded, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
     shares = {}
     for i, ahead_s in enumerate(AHEAD_S):
         rows = driven[:, i]
-        shares[f"{ahead_s:g}"] = round(r2(answers[rows, i], wanted[rows, i]), 4)
+        shares[f"{ahead_s:g}"] = round(r2(answers[rows, i], recorded[rows, i]), 4)
     return {
         "r2": shares,
         "rate_hz": round(rate_hz, 2),

@@ -81,19 +81,19 @@ def degraded(
 
 def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, float]:
     """Return every measure of a version, of the worse action if it is none of the plan. moved_pct: of FP32's look."""
-    found, reference = report.summary(version), report.reference.astype(np.float64)
+    summary, reference = report.summary(version), report.reference.astype(np.float64)
     spread = np.abs(reference - reference.mean(0)).mean((0, 1))
-    mae_pct = {name: found[f"{name}_mae_pct"] for name in report.action_names}
+    mae_pct = {name: summary[f"{name}_mae_pct"] for name in report.action_names}
     by_ms = sum(moved["by_100_ms"] / 100 for moved in moved_pct.values())
     return {
         "range_pct": max(mae_pct.values()),
         "spread_pct": max(100 * report.errors(version).mean((0, 1)) / spread),
-        "first_steps_pct": max(np.mean(found[f"{name}_mae_per_step_pct"][:FIRST_STEPS]) for name in mae_pct),
+        "first_steps_pct": max(np.mean(summary[f"{name}_mae_per_step_pct"][:FIRST_STEPS]) for name in mae_pct),
         "steering_range_pct": mae_pct["steering"],
         "delay_ms": sum(mae_pct.values()) / by_ms,
-        "steering_less_pct": found["steering_less_pct"],
-        "worst_tenth_pct": found["worst_tenth_pct"],
-        "worst_tenth_delay_ms": found["worst_tenth_pct"] / by_ms,
+        "steering_less_pct": summary["steering_less_pct"],
+        "worst_tenth_pct": summary["worst_tenth_pct"],
+        "worst_tenth_delay_ms": summary["worst_tenth_pct"] / by_ms,
     }
 
 
@@ -102,8 +102,8 @@ def export_all(opened: Opened, folder: Path) -> None:
     calibration = calibrate(opened.checkpoint, pick_evenly(opened.parts.calibration, CALIBRATION))
     exporter = Exporter(opened.checkpoint, pick_evenly(opened.parts.held_out, HELD_OUT)[:1])
     exporter.export(exporter.float_policy, folder / f"{FP32}.pt")
-    for label, each in VERSIONS.items():
-        exporter.export(degraded(opened, calibration, **each), folder / f"{label}.pt", calibration)
+    for label, arguments in VERSIONS.items():
+        exporter.export(degraded(opened, calibration, **arguments), folder / f"{label}.pt", calibration)
 
 
 def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
@@ -130,12 +130,12 @@ def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
 def hits(artifact: Path, settings: Settings, path: Path) -> list[bool]:
     """Drive an artifact through the worlds; return which it hit. path: keeps the drives; others are driven."""
 
-    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, bool]:
-        return {"hit": drive_in(policy, World(asked[1], PUSHES), LATENCY_S, settings).outcome == "hit"}
+    def one(policy: Policy, question: tuple[str, int]) -> dict[str, bool]:
+        return {"hit": drive_in(policy, World(question[1], PUSHES), LATENCY_S, settings).outcome == "hit"}
 
-    asked = [(artifact.stem, SEED + i) for i in range(WORLDS)]
-    found = drive_missing(artifact, asked, one, path)
-    return [found[each]["hit"] for each in asked]
+    questions = [(artifact.stem, SEED + i) for i in range(WORLDS)]
+    rows = drive_missing(artifact, questions, one, path)
+    return [rows[question]["hit"] for question in questions]
 
 
 def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
@@ -149,23 +149,23 @@ def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
     auc = (losers[:, None] > others).mean() + 0.5 * (losers[:, None] == others).mean()
     whose = np.array([r["policy"] for r in rows if r["loses"]])
     passed = sum(of < losers[whose != policy].min(initial=np.inf) for of, policy in zip(losers, whose, strict=True))
-    found = {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
-    return found | {"left_out_passed": passed}
+    result = {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
+    return result | {"left_out_passed": passed}
 
 
 def main(output: Path, episodes: Path, *runs: Path) -> None:
     """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
     torch.set_num_threads(1)  # or XNNPACK's pool gets a thread for each core, which the threads that drive wait for
     rows = [row for run in runs for row in judge(run, episodes)]
-    found: dict[str, Any] = {"measures": {measure: roc(rows, measure) for measure in rows[0]["errors"]}}
-    found |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
-    found["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
-    found["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
-    given: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
-    given |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
+    metrics: dict[str, Any] = {"measures": {measure: roc(rows, measure) for measure in rows[0]["errors"]}}
+    metrics |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
+    metrics["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
+    metrics["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
+    settings: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
+    settings |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
     inputs = {f"{run.name}/best_model.pth": sha256_of(run / "best_model.pth") for run in runs}
-    write_stage(output, "judging", params=given, metrics=found | {"rows": rows}, inputs=inputs)
-    print(json.dumps(plain(found), indent=1))
+    write_stage(output, "judging", params=settings, metrics=metrics | {"rows": rows}, inputs=inputs)
+    print(json.dumps(plain(metrics), indent=1))
 
 
 if __name__ == "__main__":

@@ -55,8 +55,8 @@ def steering(car: dict[str, Any], parts: Split) -> dict[str, Any]:
     shares = {}
     for ahead_s in AHEAD_S:
         step = min(round(ahead_s * config.rate_hz), config.chunk - 1)
-        driven = ~is_pad[:, step]
-        planned, recorded = (torch.from_numpy(each[driven, step, 0]).double() for each in (plans, chunks))
+        rows = ~is_pad[:, step]
+        planned, recorded = (torch.from_numpy(actions[rows, step, 0]).double() for actions in (plans, chunks))
         shares[f"{ahead_s:g}"] = round(r2(planned, recorded), 3)
     judges = Judges.of(config.action_names, learned, learned_pad, chunks, is_pad)
     return {

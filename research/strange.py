@@ -110,17 +110,17 @@ def judge_strangeness(
         raise RoverError(f"{artifact}: tells nothing unfamiliar", remedy="record more drives, see quantize.json")
     rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
 
-    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-        how, seed = asked
+    def one(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
+        how, seed = question
         if how in HOW:
             return _drive(policy, StrangeWorld(seed, how, rooms))
         return _drive(policy, World(seed, SHOVES[EASY] * (how == "pushed")))
 
     strange = [how for how in HOW if rooms or how != ROOM]
     counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)
-    asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
-    found = drive_missing(artifact, asked, one, kept, progress)
-    rows = {how: [row | _told(row) for key, row in found.items() if key[0] == how] for how in counts}
+    questions = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
+    drives = drive_missing(artifact, questions, one, kept, progress)
+    rows = {how: [row | _told(row) for key, row in drives.items() if key[0] == how] for how in counts}
     failed = [row for how in strange if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
     return {
         "threshold_drives": policy.manifest["familiar"]["drives"],
@@ -136,11 +136,11 @@ def _drive(policy: Policy, world: World) -> dict[str, Any]:
     """Drive to the end, whatever is unfamiliar. The lists have a value for each plan, smoothed."""
     car = TimedCar(world, policy, LATE_S)
     outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), NoLog()).outcome
-    seen = list[tuple[float, float]]()
+    places = list[tuple[float, float]]()
     for state in world.trajectory:
         world.state = state
-        seen.append(world.balloon_seen())
-    away_m, aside_rad = zip(*seen, strict=True)
+        places.append(world.balloon_seen())
+    away_m, aside_rad = zip(*places, strict=True)
     passed_s, ready_s = world.trajectory[int(np.argmin(away_m))].time_s, [plan.ready_s for plan in car.plans]
     row = {"outcome": outcome, "passed_s": passed_s, "aside_rad": max(map(abs, aside_rad)), "s": ready_s}
     return row | {"strange": _smooth([plan.strange or 0.0 for plan in car.plans])}
@@ -176,10 +176,10 @@ def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _of_recording(policy: Policy, episode: Episode) -> dict[str, Any]:
     """Say when a recording would have stopped the car, in seconds from its first picture, and how much of it would."""
-    seen = episode.samples[:: round(LATE_S * RATE_HZ)]
-    strange = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in seen])
-    at_s = [sample.time_s - seen[0].time_s for sample, score in zip(seen, strange, strict=True) if score >= 1]
-    return {"unfamiliar_s": min(at_s, default=None), "unfamiliar_share": len(at_s) / len(seen)}
+    samples = episode.samples[:: round(LATE_S * RATE_HZ)]
+    strange = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in samples])
+    at_s = [sample.time_s - samples[0].time_s for sample, score in zip(samples, strange, strict=True) if score >= 1]
+    return {"unfamiliar_s": min(at_s, default=None), "unfamiliar_share": len(at_s) / len(samples)}
 
 
 @click.command()

@@ -88,12 +88,12 @@ def watch_recording(samples: Sequence[Sample], stuck_s: float) -> dict[str, Any]
 def in_light(image: np.ndarray, light: Light, at_s: float, rng: Any) -> np.ndarray:
     """Return a picture of 640x480 as a camera would give it in that light, (480, 640, 3) uint8, after JPEG."""
     mean, noise, flicker = light
-    shown = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC).astype(np.float32)
-    shown *= mean / max(float(shown.mean()), 1.0) if mean else 1.0
+    lit = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    lit *= mean / max(float(lit.mean()), 1.0) if mean else 1.0
     row_s = at_s + np.arange(480) / 480 * ROWS_S
-    shown *= (1 + flicker * np.sin(2 * np.pi * 100 * row_s))[:, None, None].astype(np.float32)
-    shown += noise * rng.standard_normal(shown.shape, np.float32)
-    packed = cv2.imencode(".jpg", np.clip(shown, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    lit *= (1 + flicker * np.sin(2 * np.pi * 100 * row_s))[:, None, None].astype(np.float32)
+    lit += noise * rng.standard_normal(lit.shape, np.float32)
+    packed = cv2.imencode(".jpg", np.clip(lit, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
 
 
@@ -101,18 +101,18 @@ def watch_in_light(samples: Sequence[Sample], light: Light) -> tuple[float, floa
     """Return the largest difference that a standing car sees in 2 s, and the least that a driving one sees in 0.5 s."""
     rng, times_s = np.random.default_rng(0), [sample.time_s for sample in samples]
     at_s = np.arange(times_s[0], times_s[-1], EVERY_S)[:STAND_PICTURES].tolist()
-    seen = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]
-    drives = [cells_of(in_light(image, light, 1.003 * t, rng)) for t, image in zip(at_s, seen, strict=True)]
-    stands = [cells_of(in_light(seen[len(seen) // 2], light, 1.003 * t, rng)) for t in at_s]
-    moved = [max(difference(now, drives[i]) for now in drives[i + 1 : i + 6]) for i in range(len(drives) - 5)]
-    return max(difference(now, stands[0]) for now in stands[1:]), min(moved)
+    pictures = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]
+    drives = [cells_of(in_light(image, light, 1.003 * t, rng)) for t, image in zip(at_s, pictures, strict=True)]
+    stands = [cells_of(in_light(pictures[len(pictures) // 2], light, 1.003 * t, rng)) for t in at_s]
+    differences = [max(difference(now, drives[i]) for now in drives[i + 1 : i + 6]) for i in range(len(drives) - 5)]
+    return max(difference(now, stands[0]) for now in stands[1:]), min(differences)
 
 
 def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 200) -> dict[str, Any]:
     """Return the metrics of stage `stuck`. artifact: drives. recordings: a folder of recordings, or None."""
     cv2.setNumThreads(1)
-    asked = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
-    found = dict(everywhere(artifact, asked, drive_stuck))
+    questions = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
+    found = dict(everywhere(artifact, questions, drive_stuck))
     after_s = [s for key, (outcome, s) in sorted(found.items()) if key[0] == "wall" and outcome == "stopped"]
     outcomes = [outcome for (kind, _), (outcome, _) in found.items() if kind == "good"]
     metrics: dict[str, Any] = {

@@ -38,10 +38,10 @@ def run_faults(output: Path | None, only: Collection[str], car: Car, echo: Calla
     if unknown := set(only) - set(names):
         raise RoverError("no such fault", found=sorted(unknown), remedy=f"choose from {names}")
     logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
-    chosen = set(only or names)
+    selection = set(only or names)
     done = []
-    in_stories = (run_row(fault, car) for fault in rows if fault.name in chosen)
-    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in chosen])):
+    in_stories = (run_row(fault, car) for fault in rows if fault.name in selection)
+    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in selection])):
         done.append(row)
         ms = row.get("takeover_ms", row["stopped_after_ms"])
         echo(f"{row['fault']:<35} {row['expected']:<10} {row['found']:<16} {'' if ms is None else f'{ms:.0f} ms'}")

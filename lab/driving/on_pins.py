@@ -106,9 +106,9 @@ class PinBench:
         end = time.monotonic() + seconds
         while True:
             self.events += self.arduino.pulses()
-            if (left := end - time.monotonic()) <= 0:
+            if (remaining_s := end - time.monotonic()) <= 0:
                 return
-            time.sleep(min(left, 0.1))
+            time.sleep(min(remaining_s, 0.1))
 
     def driving(self, seconds: float = BEFORE_S) -> bool:
         """Whether each throttle pulse of the last seconds, at most 1.5, moves the car."""
@@ -212,15 +212,15 @@ def run_pin_row(bench: PinBench, fault: FaultRow) -> dict[str, Any]:
     while spoilt and attempts < ATTEMPTS:
         attempts += 1
         bench.at_speed()
-        seen, code, line = _inject(bench, fault)
-        spoilt = _spoilt(fault, seen)
+        observation, code, line = _inject(bench, fault)
+        spoilt = _spoilt(fault, observation)
     human_us = REST_US[0] + fault.moved_us[0], REST_US[1] + fault.moved_us[1]
-    judged = judge(fault.expected, seen, human_us=human_us)
+    verdict = judge(fault.expected, observation, human_us=human_us)
     with contextlib.suppress(RoverError):  # then it is not recovered
         bench.at_speed()
-    more = {"attempts": attempts, "stalled_ms": round(seen.stalled_ms(), 1)}
+    more = {"attempts": attempts, "stalled_ms": round(observation.stalled_ms(), 1)}
     line = line and line.replace(f"{bench.folder}/", "")
-    return row_of(fault, judged, code, line, bench.driving(), "on pins", **more)
+    return row_of(fault, verdict, code, line, bench.driving(), "on pins", **more)
 
 
 def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
