@@ -20,10 +20,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 import yaml
@@ -32,7 +31,7 @@ from lab.arduino.emulator import REPOSITORY
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
-RANDOM_DRIVES = 2000
+SEED, RANDOM_DRIVES = 1, 2000
 NOTICED = 3  # the exit code of random drives of which one breaks an invariant
 DRIVE = f"""
 from lab.driving.random_drives import random_drives
@@ -80,11 +79,10 @@ class Slip:
         before, after = (text.splitlines()[self.line - 1].strip() for text in (good, self.plant(good)))
         return f"{self.file}:{self.line}: {before}  ->  {after}"
 
-    def runs(self, slow: bool) -> list[tuple[str, ...]]:
-        """Return pytest's options for each run of tests that may notice it. slow: the room's slow tests too."""
+    def runs(self) -> list[tuple[str, ...]]:
+        """Return pytest's options for each run of tests that may notice it, slow tests last."""
         stages = tests_of(self.file)
-        fast = [(*ENDLESS, "-m", FAST, *tests) for tests in stages]
-        return fast + [("-m", SLOW, *tests) for tests in stages if slow]
+        return [(*ENDLESS, "-m", FAST, *tests) for tests in stages] + [("-m", SLOW, *tests) for tests in stages]
 
 
 def slips_in(file: str) -> list[Slip]:
@@ -100,30 +98,23 @@ def slips_in(file: str) -> list[Slip]:
     return slips
 
 
-def draw_slips(count: int, seed: int) -> list[Slip]:
+def draw_slips(count: int) -> list[Slip]:
     """Draw slips, files in proportion to their lines, one on a line. The first of a longer draw are the same."""
     paths = [path for room in ROOMS for path in sorted((REPOSITORY / room).rglob("*.py")) or [REPOSITORY / room]]
     files = [path.relative_to(REPOSITORY).as_posix() for path in paths]
     sizes = [len(path.read_text().splitlines()) for path in paths]
     slips = {file: slips_in(file) for file in files}
-    chance = random.Random(seed)
+    chance = random.Random(SEED)
     drawn: dict[tuple[str, int], Slip] = {}
     while len(drawn) < count:
         (file,) = chance.choices(files, sizes)
         if lines := sorted({slip.line for slip in slips[file]}):
             line = chance.choice(lines)
             slip = chance.choice([slip for slip in slips[file] if slip.line == line])
-            if _compiles(slip.plant((REPOSITORY / file).read_text())):
+            with suppress(SyntaxError):
+                compile(slip.plant((REPOSITORY / file).read_text()), "a slip", "exec")
                 drawn.setdefault((file, line), slip)
     return list(drawn.values())
-
-
-def _compiles(text: str) -> bool:
-    try:
-        compile(text, "a slip", "exec")
-    except SyntaxError:
-        return False
-    return True
 
 
 def tests_of(file: str) -> list[list[str]]:
@@ -167,7 +158,7 @@ class Mutant:
         """Return its name."""
         return self.name
 
-    def runs(self, slow: bool) -> list[tuple[str, ...]]:
+    def runs(self) -> list[tuple[str, ...]]:
         """Return pytest's options for the tests that must notice it."""
         return [("-k", self.words, self.test)]
 
@@ -177,12 +168,17 @@ def read_mutants() -> list[Mutant]:
     return [Mutant(**row) for row in yaml.safe_load((HERE / "planted.yml").read_text())]
 
 
-def make_copy(folder: Path) -> None:
-    """Copy the repository's files, those that git does not know yet too, into a folder."""
+@contextmanager
+def broken_copy(file: str, change: Callable[[str], str]) -> Iterator[Path]:
+    """Yield a copy of the repository's files, those that git does not know yet too, in which a file is changed."""
     listed = run("git", "-C", REPOSITORY, "ls-files", "-co", "--exclude-standard", error=RoverError)
-    for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(REPOSITORY / name, folder / name)
+    with tempfile.TemporaryDirectory(prefix="rover-mutant-") as scratch:
+        folder = Path(scratch)
+        for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(REPOSITORY / name, folder / name)
+        (folder / file).write_text(change((folder / file).read_text()))
+        yield folder
 
 
 def run_python(folder: Path, *arguments: str) -> tuple[int, str]:
@@ -198,62 +194,36 @@ def run_python(folder: Path, *arguments: str) -> tuple[int, str]:
     return done.returncode, printed
 
 
-class Copies:
-    """Copies of the repository, one for each job, in which lines are broken."""
-
-    def __init__(self, scratch: Path, jobs: int):
-        self._free: Queue[Path] = Queue()
-        for job in range(jobs):
-            make_copy(scratch / str(job))
-            self._free.put(scratch / str(job))
-
-    @contextmanager
-    def broken(self, file: str, change: Callable[[str], str]) -> Iterator[Path]:
-        """Yield a copy in which a file is changed."""
-        copy = self._free.get()
-        path = copy / file
-        good = path.read_text()
-        try:
-            path.write_text(change(good))
-            yield copy
-        finally:
-            path.write_text(good)
-            self._free.put(copy)
-
-
-def try_mutants(
-    mutants: Sequence[Slip | Mutant], jobs: int, slow: bool, say: Callable[[str], None]
-) -> tuple[int, list[str]]:
+def try_mutants(mutants: Sequence[Slip | Mutant], jobs: int, say: Callable[[str], None]) -> tuple[int, list[str]]:
     """Plant each mutant in a copy and see whether a test fails; return how many were caught, and what survived.
 
-    slow: run the slow tests too, on what the others did not notice. say: called with a line for each. What
-    survivors.yml gives a reason for is not counted. A mutant that random drives must notice survives if they do not.
-    Raises RoverError if a mutant's line is not there, or if a test that failed fails without mutants too.
+    say: called with a line for each. What survivors.yml gives a reason for is not counted. A mutant that random drives
+    must notice survives if they do not. Raises RoverError if a mutant's line is not there, or if a test that failed
+    fails without mutants too.
     """
     reasons = {row["slip"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
-    with tempfile.TemporaryDirectory(prefix="rover-mutants-") as scratch, ThreadPoolExecutor(jobs) as pool:
-        copies = Copies(Path(scratch), jobs)
 
-        def attempt(mutant: Slip | Mutant) -> tuple[str, str | None]:
-            begin_s = time.monotonic()
-            with copies.broken(mutant.file, mutant.plant) as copy:
-                failed = next(filter(None, (_failed(copy, options) for options in mutant.runs(slow))), None)
-                unnoticed = failed and mutant.random and run_python(copy, "-c", DRIVE)[0] != NOTICED
-            name = mutant.name_in((REPOSITORY / mutant.file).read_text())
-            outcome = f"caught by {failed}" if failed else "SURVIVED"
-            outcome = "NOT noticed by random drives" if unnoticed else outcome
-            say(f"{outcome}: {name} ({time.monotonic() - begin_s:.0f} s)")
-            return name, None if unnoticed else failed
+    def attempt(mutant: Slip | Mutant) -> tuple[str, str | None]:
+        begin_s = time.monotonic()
+        with broken_copy(mutant.file, mutant.plant) as copy:
+            failed = next(filter(None, (_failed(copy, options) for options in mutant.runs())), None)
+            unnoticed = failed and mutant.random and run_python(copy, "-c", DRIVE)[0] != NOTICED
+        name = mutant.name_in((REPOSITORY / mutant.file).read_text())
+        outcome = f"caught by {failed}" if failed else "SURVIVED"
+        outcome = "NOT noticed by random drives" if unnoticed else outcome
+        say(f"{outcome}: {name} ({time.monotonic() - begin_s:.0f} s)")
+        return name, None if unnoticed else failed
 
+    with ThreadPoolExecutor(jobs) as pool:
         outcomes = list(pool.map(attempt, mutants))
-        names = sorted({failed for _, failed in outcomes if failed})
-        with copies.broken(mutants[0].file, str) as copy:
-            for options, tests in (
-                ((), [name for name in names if "::" in name]),
-                (("--collect-only",), [name for name in names if "::" not in name]),  # could not be imported, or hung
-            ):
-                if tests and run_python(copy, *PYTEST, *options, *tests)[0]:
-                    raise RoverError("tests fail without mutants too", found=" ".join(tests), remedy="make test-fast")
+    names = sorted({failed for _, failed in outcomes if failed})
+    with broken_copy(mutants[0].file, str) as copy:
+        for options, tests in (
+            ((), [name for name in names if "::" in name]),
+            (("--collect-only",), [name for name in names if "::" not in name]),  # could not be imported, or hung
+        ):
+            if tests and run_python(copy, *PYTEST, *options, *tests)[0]:
+                raise RoverError("tests fail without mutants too", found=" ".join(tests), remedy="make test-fast")
     survived = [name for name, failed in outcomes if not failed]
     caught = len(outcomes) - len(survived)
     # In survivors.yml a line has no number, which changes.
