@@ -6,7 +6,6 @@ pulses come from simavr. All other faults are in rows.py, in virtual time.
 """
 
 import contextlib
-import functools
 import os
 import re
 import resource
@@ -27,7 +26,6 @@ from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import BEFORE_S, CONTINUES, Command, Observation, judge, most_throttle_us, row_of
 from lab.driving.policy import RATE_HZ, make_artifact, pictures
 from lab.driving.rows import FaultRow
-from lab.driving.stories import read_stories
 from rover_lib.onboard.drive.watch import real_time
 from rover_lib.onboard.errors import RoverError
 
@@ -192,12 +190,6 @@ INJECT: dict[str, Callable[[PinBench], object]] = {
     "disk full while logging": _fill_disk,
 }
 STARVES = "CPU starved"  # takes the drive's time
-
-
-@functools.cache
-def pin_rows() -> list[FaultRow]:
-    """Read the faults on pins from stories.yml."""
-    return [FaultRow(**row) for row in read_stories("pins")]
 
 
 # ---- judging

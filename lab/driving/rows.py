@@ -67,9 +67,9 @@ class FaultRow:
 
 
 @functools.cache
-def all_rows() -> dict[str, FaultRow]:
-    """Read the faults of stories.yml, by their names."""
-    return {row["name"]: FaultRow(**row) for row in read_stories("rows")}
+def all_rows(section: str = "rows") -> dict[str, FaultRow]:
+    """Read the faults of stories.yml, by their names: those in virtual time, or of section "pins"."""
+    return {row["name"]: FaultRow(**row) for row in read_stories(section)}
 
 
 # ---- what only these rows have
