@@ -9,7 +9,6 @@ and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": .
 
 import json
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -98,7 +97,7 @@ def r2(answers: Tensor, wanted: Tensor) -> float:
 def judge(source: Path | str | Source) -> dict[str, Any]:
     """Train on recordings, and return R² of steering on the held-out part, by seconds ahead, and how it came about."""
     torch.set_num_threads(1)  # at this size, a second one mostly waits
-    began_s, p = time.process_time(), params()["calibration"]
+    p = params()["calibration"]
     recordings = load_recordings(source)
     parts, rate_hz = split(recordings, p["held_out_share"], p["seed"]), usual_rate_hz(recordings.episodes)
     three = (parts.calibration, parts.choosing, parts.held_out)
@@ -113,7 +112,6 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
         "r2": shares,
         "rate_hz": round(rate_hz, 2),
         "epochs": epochs,
-        "processor_s": round(time.process_time() - began_s, 1),
         "split": parts.note,
     }
 
@@ -125,7 +123,7 @@ def main(out: str, *sources: str) -> None:
     for source in sources:
         name = Path(source).name
         results[name] = judge(source)
-        print(f"{name}: R² {results[name]['r2']}, {results[name]['processor_s']} s", flush=True)
+        print(f"{name}: R² {results[name]['r2']}", flush=True)
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 
 

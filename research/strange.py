@@ -143,16 +143,13 @@ def _drive(policy: Policy, world: World) -> dict[str, Any]:
     away_m, aside_rad = zip(*places, strict=True)
     passed_s, ready_s = world.trajectory[int(np.argmin(away_m))].time_s, [plan.ready_s for plan in car.plans]
     row = {"outcome": outcome, "passed_s": passed_s, "aside_rad": max(map(abs, aside_rad)), "s": ready_s}
-    return row | {"strange": _smooth([plan.strange or 0.0 for plan in car.plans])}
+    smoother = Smoother()
+    return row | {"strange": [smoother.add(plan.strange or 0.0) for plan in car.plans]}
 
 
 def _unfamiliar(policy: Policy, frame: np.ndarray, state: np.ndarray) -> float:
     policy.predict_unclipped(frame, state)
     return policy.strange or 0.0
-
-
-def _smooth(scores: Sequence[float]) -> list[float]:
-    return list(map(Smoother().add, scores))
 
 
 def _told(row: Mapping[str, Any]) -> dict[str, bool]:
@@ -177,7 +174,8 @@ def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _of_recording(policy: Policy, episode: Episode) -> dict[str, Any]:
     """Say when a recording would have stopped the car, in seconds from its first picture, and how much of it would."""
     samples = episode.samples[:: round(LATE_S * RATE_HZ)]
-    strange = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in samples])
+    smoother = Smoother()
+    strange = [smoother.add(_unfamiliar(policy, sample.frame_bgr(), sample.state)) for sample in samples]
     at_s = [sample.time_s - samples[0].time_s for sample, score in zip(samples, strange, strict=True) if score >= 1]
     return {"unfamiliar_s": min(at_s, default=None), "unfamiliar_share": len(at_s) / len(samples)}
 

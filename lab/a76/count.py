@@ -112,12 +112,8 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
 def side_by_side(counts: Mapping[str, Callable[[], Counted]], progress: Progress) -> dict[str, Counted]:
     """Count in several emulated machines, one for each of this machine's cores at a time."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        started = {name: pool.submit(count) for name, count in counts.items()}
-        try:
-            watched = progress(started, desc="artifacts, emulated", total=len(started))
-            return {name: started[name].result() for name in watched}
-        finally:
-            pool.shutdown(cancel_futures=True)  # if one failed, those that run end, and no more begin
+        done = pool.map(lambda count: count(), counts.values())  # if one fails, no more begin
+        return dict(zip(counts, progress(done, desc="artifacts, emulated", total=len(counts)), strict=True))
 
 
 def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:

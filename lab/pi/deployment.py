@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,18 +24,18 @@ from typing import Any, TextIO
 
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
-from lab.arduino.emulator import NICE, EmulatedArduino
+from lab.arduino.emulator import NICE, REPOSITORY, EmulatedArduino
 from lab.driving.pins import most_throttle_us
 from lab.driving.policy import make_artifact, pictures
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import USER, debian_image
-from lab.pi.emulation import emulation, interruptible, require
+from lab.pi.emulation import emulation, require
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.signal_event import signals
 from rover_lib.onboard.stage import sha256_of, write_stage
 
-REPOSITORY = Path(__file__).parents[2]
 MOST_S = 3600.0
 NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o LogLevel=ERROR"
 ROVER = "rover1"
@@ -57,7 +58,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
     require()
     output.parent.mkdir(parents=True, exist_ok=True)
     with (
-        interruptible(),
+        signals(signal.default_int_handler),  # whatever ends it, all is cleaned up as after ^C
         emulation(),
         tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
         output.with_suffix(".log").open("w") as log,

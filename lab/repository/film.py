@@ -87,10 +87,9 @@ def write_film(path: Path, run_dir: Path, benchmark: Path) -> None:
         count = max(map(len, worlds)) + HELD
         both = [pictures + [pictures[-1]] * (count - len(pictures)) for pictures in worlds]
         frames += [Image.fromarray(np.concatenate(pair, axis=1)) for pair in zip(*both, strict=True)]
-    first, *rest = frames
     options = {"save_all": True, "duration": round(1000 * EVERY / RATE_HZ), "loop": 0, "quality": 60, "method": 4}
     with atomic_path(path) as temporary:
-        first.save(temporary, "webp", append_images=rest, xmp=source_of(benchmark).encode(), **options)
+        frames[0].save(temporary, "webp", append_images=frames[1:], xmp=source_of(benchmark).encode(), **options)
 
 
 if __name__ == "__main__":

@@ -100,8 +100,7 @@ def _faults(root: Path) -> list[Row]:
 
 def _drives(root: Path) -> list[Row]:
     """Hits of the demo's policy when its plans are late, and when the car is pushed."""
-    drives = _metrics(root / "results" / "demo", "drive")["rows"]
-    rows = [r for r in drives if r["compensate"] and r["hits"]]
+    rows = [r for r in _metrics(root / "results" / "demo", "drive")["rows"] if r["compensate"] and r["hits"]]
     alone, pushed = ({r["latency_ms"]: r for r in rows if bool(r["pushes"]) == way} for way in (False, True))
     latencies = sorted(alone.keys() & pushed.keys())
     trials = rows[0]["trials"]

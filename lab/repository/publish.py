@@ -119,9 +119,8 @@ def result(path: Path) -> str:
     """Return a stage's JSON as it is committed: names instead of paths, and numbers of DIGITS digits."""
     content = _shorter(json.loads(path.read_text()))
     if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
-        content["inputs"] = {
-            f"{len(inputs)} files": hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
-        }
+        together = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+        content["inputs"] = {f"{len(inputs)} files": together}
     return json.dumps(content, indent=1) + "\n"
 
 
