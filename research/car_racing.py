@@ -119,11 +119,11 @@ def record_drive(folder: Path, index: int, seed: int) -> None:
     track = Track(1_000_000 * (seed + 1) + index, shoves=4)
     with EpisodeWriter(folder / episode_name(start), about, resolution=(WIDTH, HEIGHT)) as episode:
         while not track.done:
-            at_s, ms = start.timestamp() + track.ticks / RATE_HZ, round(1000 * track.ticks / RATE_HZ)
+            at_s = start.timestamp() + track.ticks / RATE_HZ
             pulses = car.pwm.pulses(*track.expert())
             us = [round(p / ARDUINO_STEP_US) * ARDUINO_STEP_US for p in (pulses.steering_us, pulses.throttle_us)]
             episode.frame(at_s, track.render())
-            episode.control(at_s + 0.004, ms, *us, *periods)
+            episode.control(at_s + 0.004, round(1000 * track.ticks / RATE_HZ), *us, *periods)
             steering, throttle = car.pwm.actions(*us, *periods)
             track.step(float(steering or 0), float(throttle or 0))
 

@@ -62,7 +62,7 @@ def degraded(
     Fewer bits are fewer steps of the same INT8: weights are rounded beforehand, activations get a larger scale.
     noise: of weights, in their channel's standard deviation, by seed. ranges: a factor. block: degraded alone.
     """
-    config, scheme = opened.checkpoint.config, Scheme(smooth=calibration.smooth)
+    scheme = Scheme(smooth=calibration.smooth)
     rng = torch.Generator().manual_seed(seed)
     prepared = restore_observed(opened.checkpoint, scheme, calibration)
     for name, m in prepared.named_modules():
@@ -76,7 +76,7 @@ def degraded(
             weight = weight + noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
             step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (weight_bits - 1) - 1)
             m.weight = nn.Parameter(((weight / step).round() * step).view_as(m.weight), requires_grad=False)
-    return QuantizedPolicy(scheme, convert(prepared, config, scheme).eval(), {})
+    return QuantizedPolicy(scheme, convert(prepared, opened.checkpoint.config, scheme).eval(), {})
 
 
 def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, float]:

@@ -141,8 +141,8 @@ def _drive(policy: Policy, world: World) -> dict[str, Any]:
         world.state = state
         places.append(world.balloon_seen())
     away_m, aside_rad = zip(*places, strict=True)
-    passed_s, ready_s = world.trajectory[int(np.argmin(away_m))].time_s, [plan.ready_s for plan in car.plans]
-    row = {"outcome": outcome, "passed_s": passed_s, "aside_rad": max(map(abs, aside_rad)), "s": ready_s}
+    row = {"outcome": outcome, "passed_s": world.trajectory[int(np.argmin(away_m))].time_s}
+    row |= {"aside_rad": max(map(abs, aside_rad)), "s": [plan.ready_s for plan in car.plans]}
     smoother = Smoother()
     return row | {"strange": [smoother.add(plan.strange or 0.0) for plan in car.plans]}
 

@@ -68,8 +68,8 @@ def drive_stuck(policy: Policy, asked: tuple[str, int]) -> tuple[str, float]:
     """Drive once; return how it ended, and how long after the wall (s). asked: "good" or "wall", and the seed."""
     kind, seed = asked
     wall_s = 0.5 + (seed % 10) / 10 if kind == "wall" else 1e9
-    car, log = _SeeingCar(_Walled(seed, wall_s), policy, LATENCY_S), NoLog()
-    outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), log).outcome
+    car = _SeeingCar(_Walled(seed, wall_s), policy, LATENCY_S)
+    outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), NoLog()).outcome
     return outcome, car.world.state.time_s - wall_s
 
 
@@ -124,8 +124,9 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
         "good_hits": outcomes.count("hit"),
         "moved_limit": MOVED,
     }
-    episodes, stuck_s = load_recordings(recordings).episodes if recordings else (), params()["drive"]["stuck_s"]
-    metrics |= {episode.path.name: watch_recording(episode.samples, stuck_s) for episode in episodes}
+    episodes = load_recordings(recordings).episodes if recordings else ()
+    for episode in episodes:
+        metrics[episode.path.name] = watch_recording(episode.samples, params()["drive"]["stuck_s"])
     if episodes:
         metrics["lights"] = {}
         for name, light in LIGHTS.items():

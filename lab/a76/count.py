@@ -44,8 +44,7 @@ def packages_of(artifact: Path) -> Path | None:
     if read_manifest(artifact)["engine"] != ONNXRUNTIME:
         return None
     wheels = REQUIREMENTS["onnxruntime"]
-    key = key_of({"for": FOR_GUEST}, wheels)
-    return cache_folder("arm-onnxruntime", key, lambda folder: fetch_wheels(folder, wheels))
+    return cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), lambda to: fetch_wheels(to, wheels))
 
 
 class Counted(NamedTuple):
@@ -169,8 +168,9 @@ def _judge(
     if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
         raise RoverError(f"{artifacts[REFERENCE]}: differs by {difference:.2g} on the core", remedy="quantize again")
     for stem, frames in chosen.items():
-        expected, subset = here[list(frames)], [samples[i] for i in frames]
-        at_home = expected if stem == REFERENCE else chunks_here(artifacts[stem], subset, progress)
+        expected = at_home = here[list(frames)]
+        if stem != REFERENCE:
+            at_home = chunks_here(artifacts[stem], [samples[i] for i in frames], progress)
         rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
         rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
         rows[stem] |= {"reference": REFERENCE, "frames_on_the_core": len(frames)}

@@ -106,10 +106,10 @@ def _first(bad: np.ndarray) -> int | None:
 def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
-    checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
-    with_pad, with_receiver = (_armed_at_rest, _pad_lost), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
-    more = (_answered, _in_time, _stuck, _supplied)
-    for check in (*(with_pad if seen.gamepad else with_receiver), *checks, *more):
+    checks = [_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends]
+    checks += [_answered, _in_time, _stuck, _supplied]
+    checks += [_armed_at_rest, _pad_lost] if seen.gamepad else [_asked_for, _human_wins, _human_keeps, _armed_by_people]
+    for check in checks:
         if (problem := check(run)) is not None:
             yield f"{check.__name__[1:]}: {problem}"
 

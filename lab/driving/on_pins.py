@@ -189,7 +189,6 @@ INJECT: dict[str, Callable[[PinBench], object]] = {
     "CPU starved": _starve,
     "disk full while logging": _fill_disk,
 }
-STARVES = "CPU starved"  # takes the drive's time
 
 
 # ---- judging
@@ -234,10 +233,10 @@ def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, 
 
 
 def _spoilt(fault: FaultRow, seen: Observation) -> bool:
-    """Whether this machine had no time for the Arduino or the drive, so that there is nothing to judge."""
+    """Whether this machine had no time for the Arduino or the drive, unless that is the fault: nothing to judge."""
     if seen.stalled_ms() or not seen.was_driving(most_throttle_us()):
         return True
-    return fault.expected == CONTINUES and fault.name != STARVES and seen.longest_pause_s() > LATE_COMMAND_S
+    return fault.expected == CONTINUES and fault.name != "CPU starved" and seen.longest_pause_s() > LATE_COMMAND_S
 
 
 def run_on_pins(faults: Sequence[FaultRow]) -> Iterator[dict[str, Any]]:
