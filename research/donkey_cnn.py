@@ -57,8 +57,8 @@ def tensors(samples: Sequence[Sample], rate_hz: float) -> tuple[Tensor, Tensor, 
         small = cv2.resize(sample.frame_bgr(HEIGHT), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
         pictures[i] = small[..., ::-1].transpose(2, 0, 1)
     steering = np.array([sample.chunk[steps, 0] for sample in samples], np.float32)
-    driven = ~np.array([sample.is_pad[steps] for sample in samples])
-    return torch.from_numpy(pictures), torch.from_numpy(steering), torch.from_numpy(driven)
+    mask = ~np.array([sample.is_pad[steps] for sample in samples])
+    return torch.from_numpy(pictures), torch.from_numpy(steering), torch.from_numpy(mask)
 
 
 @torch.no_grad()
@@ -71,7 +71,7 @@ def predict(network: nn.Module, pictures: Tensor) -> Tensor:
 def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> tuple[nn.Module, int]:
     """Return the network of the least error on the choosing part, and how many epochs it was trained."""
     torch.manual_seed(seed)
-    network, (pictures, steering, driven) = linear(), learning
+    network, (pictures, steering, mask) = linear(), learning
     optimizer = torch.optim.Adam(network.parameters(), RATE)
     best, weights, idle, epochs = float("inf"), network.state_dict(), 0, 0
     while idle < PATIENCE and epochs < EPOCHS:
@@ -79,7 +79,7 @@ def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> 
         for rows in torch.randperm(len(pictures))[:EPOCH].split(BATCH):
             errors = (network(pictures[rows].float() / 255) - steering[rows]) ** 2
             optimizer.zero_grad()
-            errors[driven[rows]].mean().backward()
+            errors[mask[rows]].mean().backward()
             optimizer.step()
         error = float(((predict(network, choosing[0]) - choosing[1]) ** 2)[choosing[2]].mean())
         idle, epochs = idle + 1, epochs + 1
@@ -103,10 +103,10 @@ def judge(source: Path | str | Source) -> dict[str, Any]:
     three = (parts.calibration, parts.choosing, parts.held_out)
     learning, choosing, held_out = (tensors(pick_evenly(part, MOST), rate_hz) for part in three)
     network, epochs = train(learning, choosing, p["seed"])
-    answers, recorded, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
+    answers, recorded, mask = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
     shares = {}
     for i, ahead_s in enumerate(AHEAD_S):
-        rows = driven[:, i]
+        rows = mask[:, i]
         shares[f"{ahead_s:g}"] = round(r2(answers[rows, i], recorded[rows, i]), 4)
     return {
         "r2": shares,

@@ -84,7 +84,7 @@ def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> d
     summary, reference = report.summary(version), report.reference.astype(np.float64)
     spread = np.abs(reference - reference.mean(0)).mean((0, 1))
     mae_pct = {name: summary[f"{name}_mae_pct"] for name in report.action_names}
-    by_ms = sum(moved["by_100_ms"] / 100 for moved in moved_pct.values())
+    by_ms = sum(motion["by_100_ms"] / 100 for motion in moved_pct.values())
     return {
         "range_pct": max(mae_pct.values()),
         "spread_pct": max(100 * report.errors(version).mean((0, 1)) / spread),
@@ -115,8 +115,8 @@ def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     made_of |= {"drive": settings, "how": [PUSHES, LATENCY_S]}
     path = cache_root() / f"drives-{key_of(made_of, *DRIVING)}.jsonl"
     hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path) for label in (FP32, *VERSIONS)}
-    fp32, *others = (load_policy(folder / f"{label}.pt", threads=1) for label in hit)
-    versions, samples = dict(zip(VERSIONS, others, strict=True)), pick_evenly(opened.parts.held_out, HELD_OUT)
+    fp32, *policies = (load_policy(folder / f"{label}.pt", threads=1) for label in hit)
+    versions, samples = dict(zip(VERSIONS, policies, strict=True)), pick_evenly(opened.parts.held_out, HELD_OUT)
     report = fidelity(fp32, versions, samples, opened.recordings.action_range())
     moved_pct, rows = look(fp32, report, opened.parts.held_out).moved_pct, []
     for label in VERSIONS:
@@ -145,11 +145,11 @@ def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
     it lets no loser pass; refused: of the others, how many have at least that. left_out_passed: losers that pass the
     limit that the other policies' losers set.
     """
-    losers, others = (np.array([r["errors"][measure] for r in rows if r["loses"] is kind]) for kind in (True, False))
-    auc = (losers[:, None] > others).mean() + 0.5 * (losers[:, None] == others).mean()
+    losers, fair = (np.array([r["errors"][measure] for r in rows if r["loses"] is kind]) for kind in (True, False))
+    auc = (losers[:, None] > fair).mean() + 0.5 * (losers[:, None] == fair).mean()
     whose = np.array([r["policy"] for r in rows if r["loses"]])
     passed = sum(of < losers[whose != policy].min(initial=np.inf) for of, policy in zip(losers, whose, strict=True))
-    result = {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
+    result = {"auc": auc, "least_of_losers": losers.min(), "refused": (fair >= losers.min()).sum(), "of": len(fair)}
     return result | {"left_out_passed": passed}
 
 

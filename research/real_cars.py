@@ -92,11 +92,11 @@ def main(out: str, described: str) -> None:
     """Write a row for each car, and the matrix: which share of whose windows each policy would stop at."""
     cars = yaml.safe_load(Path(described).read_text())
     p = params()["calibration"]
-    rows, seen = {}, {}
+    rows, stretches = {}, {}
     for name, car in cars.items():
         recordings = load_recordings(Source.of(car["tub"], throttle=car.get("throttle", "")))
         parts = split(recordings, p["held_out_share"], p["seed"])
-        seen[name] = windows((*parts.choosing, *parts.held_out))
+        stretches[name] = windows((*parts.choosing, *parts.held_out))
         rate_hz = frame_rate_hz([s for s in parts.calibration if s.episode == parts.calibration[0].episode])
         rows[name] = {
             "camera": car["camera"],
@@ -114,8 +114,8 @@ def main(out: str, described: str) -> None:
             continue
         policy = load_policy(Path(car["run"], "policy_static.pt"))
         if policy.familiar is not None:
-            counts = {other: [stopped(policy, window) for window in of] for other, of in seen.items()}
-            matrix[name] = {other: f"{sum(each)} of {len(each)}" for other, each in counts.items()}
+            counts = {other: [stopped(policy, window) for window in of] for other, of in stretches.items()}
+            matrix[name] = {other: f"{sum(flags)} of {len(flags)}" for other, flags in counts.items()}
             print(name, matrix[name], flush=True)
     write_stage(Path(out), "cars", params={}, metrics={"cars": rows, "stopped": matrix}, inputs={})
 

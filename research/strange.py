@@ -111,21 +111,21 @@ def judge_strangeness(
     rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
 
     def one(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
-        how, seed = question
-        if how in HOW:
-            return _drive(policy, StrangeWorld(seed, how, rooms))
-        return _drive(policy, World(seed, SHOVES[EASY] * (how == "pushed")))
+        kind, seed = question
+        if kind in HOW:
+            return _drive(policy, StrangeWorld(seed, kind, rooms))
+        return _drive(policy, World(seed, SHOVES[EASY] * (kind == "pushed")))
 
-    strange = [how for how in HOW if rooms or how != ROOM]
+    strange = [kind for kind in HOW if rooms or kind != ROOM]
     counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)
-    questions = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
+    questions = [(kind, SEED + i) for kind, count in counts.items() for i in range(count)]
     drives = drive_missing(artifact, questions, one, kept, progress)
-    rows = {how: [row | _told(row) for key, row in drives.items() if key[0] == how] for how in counts}
-    failed = [row for how in strange if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
+    rows = {kind: [row | _told(row) for key, row in drives.items() if key[0] == kind] for kind in counts}
+    failed = [row for kind in strange if kind not in BESIDE for row in rows[kind] if row["outcome"] != "hit"]
     return {
         "threshold_drives": policy.manifest["familiar"]["drives"],
-        "good_stopped": {how: _share([row["stopped"] for row in rows[how]]) for how in GOOD},
-        "strange": {how: _judge(rows[how]) for how in strange},
+        "good_stopped": {kind: _share([row["stopped"] for row in rows[kind]]) for kind in GOOD},
+        "strange": {kind: _judge(rows[kind]) for kind in strange},
         "failed_in_time": _share([row["in_time"] for row in failed]),
         "pushed_aside": _share([row["stopped"] for row in rows["pushed"] if row["aside_rad"] > ASIDE_RAD]),
         "rooms": {episode.path.name: _of_recording(policy, episode) for episode in rooms},

@@ -112,9 +112,9 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
     """Return the metrics of stage `stuck`. artifact: drives. recordings: a folder of recordings, or None."""
     cv2.setNumThreads(1)
     questions = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
-    found = dict(everywhere(artifact, questions, drive_stuck))
-    after_s = [s for key, (outcome, s) in sorted(found.items()) if key[0] == "wall" and outcome == "stopped"]
-    outcomes = [outcome for (kind, _), (outcome, _) in found.items() if kind == "good"]
+    endings = dict(everywhere(artifact, questions, drive_stuck))
+    after_s = [s for key, (outcome, s) in sorted(endings.items()) if key[0] == "wall" and outcome == "stopped"]
+    outcomes = [outcome for (kind, _), (outcome, _) in endings.items() if kind == "good"]
     metrics: dict[str, Any] = {
         "walls": walls,
         "walls_stopped_in_time": sum(s <= WITHIN_S for s in after_s),
@@ -137,5 +137,5 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
 
 if __name__ == "__main__":
     output, run_dir, *more = map(Path, sys.argv[1:])
-    found = study(run_dir if run_dir.is_file() else run_dir / "policy_static.pt", more[0] if more else None)
-    write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=found)
+    metrics = study(run_dir if run_dir.is_file() else run_dir / "policy_static.pt", more[0] if more else None)
+    write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=metrics)
