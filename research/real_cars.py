@@ -26,9 +26,8 @@ from rover_lib.onboard.stage import read_stage, write_stage
 from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import load_checkpoint
 from rover_lib.workshop.int8.familiar import EVERY_S
-from rover_lib.workshop.recordings.blocks import group_by_block
 from rover_lib.workshop.recordings.episodes import Split, load_recordings, split
-from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, block_of, frame_rate_hz, pick_evenly
 from rover_lib.workshop.recordings.source import Source
 
 WINDOW = 15  # pictures that follow one another
@@ -70,9 +69,11 @@ def of_int8(run: Path) -> dict[str, Any]:
 
 def windows(samples: Sequence[Sample]) -> list[list[Sample]]:
     """Return stretches of WINDOW pictures, EVERY_S apart, evenly from all blocks."""
+    blocks: dict[str, list[Sample]] = {}
+    for sample in samples:
+        blocks.setdefault(f"{sample.episode} {block_of(sample)}", []).append(sample)
     stretches = []
-    for rows in group_by_block(samples):
-        block = [samples[row] for row in rows]
+    for block in blocks.values():
         pictures = block[:: max(1, round((frame_rate_hz(block) or 1) * EVERY_S))]
         stretches += [pictures[i : i + WINDOW] for i in range(0, len(pictures) - WINDOW + 1, WINDOW)]
     return list(pick_evenly(stretches, WINDOWS))
@@ -98,12 +99,8 @@ def main(out: str, described: str) -> None:
         parts = split(recordings, p["held_out_share"], p["seed"])
         stretches[name] = windows((*parts.choosing, *parts.held_out))
         rate_hz = frame_rate_hz([s for s in parts.calibration if s.episode == parts.calibration[0].episode])
-        rows[name] = {
-            "camera": car["camera"],
-            "pictures": len(recordings.samples),
-            "rate_hz": rate_hz,
-            "split": parts.note,
-        }
+        rows[name] = {"camera": car["camera"], "pictures": len(recordings.samples)}
+        rows[name] |= {"rate_hz": rate_hz, "split": parts.note}
         if "run" in car:
             rows[name] |= steering(car, parts) | of_int8(Path(car["run"]))
             rows[name]["cnn_r2"] = json.loads(Path(car["cnn"]).read_text())[Path(car["tub"]).name]["r2"]
