@@ -45,10 +45,10 @@ def debian_sources() -> tuple[str, str]:
 
     They are of that Debian alone, without what else apt knows here.
     """
-    about = platform.freedesktop_os_release()
-    if about["ID"] != "debian":
-        raise RoverError("this needs the apt sources of a Debian 12 or 13", found=about["PRETTY_NAME"])
-    name = about["VERSION_CODENAME"]
+    release = platform.freedesktop_os_release()
+    if release["ID"] != "debian":
+        raise RoverError("this needs the apt sources of a Debian 12 or 13", found=release["PRETTY_NAME"])
+    name = release["VERSION_CODENAME"]
     listed = run("apt-get", "indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Identifier: Packages")
     suites = {name, f"{name}-updates", f"{name}-security"}
     return name, "".join(sorted({f"deb {line}\n" for line in listed.splitlines() if set(line.split()[1:2]) & suites}))

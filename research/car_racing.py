@@ -47,25 +47,22 @@ class _Unseen(CarRacing):  # type: ignore[misc]
 class Track:
     """One drive along a track. seed: determines it, and the pulls at its wheel. `score` is in metres."""
 
-    def __init__(self, seed: int, shoves: int = 0, timeout_s: float = TIMEOUT_S):
+    def __init__(self, seed: int, shoves: int = 0):
         self._env: Any = _Unseen(lap_complete_percent=1.0)
         self._env.reset(seed=seed)
         self._line = np.array([(x, y) for _, _, x, y in self._env.track])
         self._angles = np.unwrap([beta for _, beta, _, _ in self._env.track])
         self._quads = np.array([quad for quad, _ in self._env.road_poly])
         self._colours = [tuple(float(c) for c in colour) for _, colour in self._env.road_poly]
-        self._ticks = RATE_HZ * timeout_s
+        self._ticks = RATE_HZ * TIMEOUT_S
         rng = np.random.default_rng([seed, 25])
         self._shoves = {int(t): rng.choice([-1, 1]) for t in rng.uniform(20, self._ticks, shoves)}
-        self.restart()
-
-    def restart(self) -> "Track":
-        """Put the car on the start again."""
-        if self._env.car:
-            self._env.car.destroy()
+        self._env.car.destroy()  # the environment's own has already moved
         self._env.car = Car(self._env.world, *self._env.track[0][1:4])
-        self._at, self.score, self.ticks, self.done = 0, 0.0, 0, False
-        return self
+        self._at = 0
+        self.score = 0.0
+        self.ticks = 0
+        self.done = False
 
     def _seen(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) metres to the car's right and ahead of it."""
@@ -95,15 +92,15 @@ class Track:
         """Return what a good driver does now: pure pursuit of the road's middle, slower where it turns."""
         right, ahead = self._seen(self._line[(self._at + 3 + round(0.12 * self.speed)) % len(self._line)])
         coming = self._angles[min(self._at + 16, len(self._line) - 1)] - self._angles[self._at]
-        wanted = np.clip(64 - 60 * abs(coming), 23, 64)
-        throttle = np.clip(0.5 + 0.04 * (wanted - self.speed), 0.2, 0.87)
+        target = np.clip(64 - 60 * abs(coming), 23, 64)
+        throttle = np.clip(0.5 + 0.04 * (target - self.speed), 0.2, 0.87)
         return float(np.clip(1.2 * math.atan2(right, ahead), -1, 1)), float(throttle)
 
     def render(self) -> np.ndarray:
         """(72, 128, 3) uint8 BGR, from above, the car's front up."""
         frame = np.full((HEIGHT, WIDTH, 3), GRASS, np.uint8)
-        seen = self._seen(self._quads)
-        px = np.stack([WIDTH / 2 + PX_PER_M * seen[..., 0], CAR_ROW - PX_PER_M * seen[..., 1]], -1)
+        quads = self._seen(self._quads)
+        px = np.stack([WIDTH / 2 + PX_PER_M * quads[..., 0], CAR_ROW - PX_PER_M * quads[..., 1]], -1)
         near = np.abs(px - (WIDTH / 2, HEIGHT / 2)).max((1, 2)) < WIDTH
         fixed = np.round(px * 16).astype(np.int32)
         for i in np.flatnonzero(near):
@@ -122,11 +119,11 @@ def record_drive(folder: Path, index: int, seed: int) -> None:
     track = Track(1_000_000 * (seed + 1) + index, shoves=4)
     with EpisodeWriter(folder / episode_name(start), about, resolution=(WIDTH, HEIGHT)) as episode:
         while not track.done:
-            at_s, ms = start.timestamp() + track.ticks / RATE_HZ, round(1000 * track.ticks / RATE_HZ)
+            at_s = start.timestamp() + track.ticks / RATE_HZ
             pulses = car.pwm.pulses(*track.expert())
             us = [round(p / ARDUINO_STEP_US) * ARDUINO_STEP_US for p in (pulses.steering_us, pulses.throttle_us)]
             episode.frame(at_s, track.render())
-            episode.control(at_s + 0.004, ms, *us, *periods)
+            episode.control(at_s + 0.004, round(1000 * track.ticks / RATE_HZ), *us, *periods)
             steering, throttle = car.pwm.actions(*us, *periods)
             track.step(float(steering or 0), float(throttle or 0))
 
@@ -161,29 +158,29 @@ def main(work: Path, output: Path, tracks: int = 100) -> None:
     if not checkpoint.exists():
         subprocess.run([*rover, "train", str(episodes), str(checkpoint), "--backbone", "none"], check=True)
     if not (run / "run.json").exists():
-        made = [*rover, "run", str(checkpoint), str(episodes), "--name", run.name, "--runs-dir", str(work)]
-        subprocess.run([*made, "-p", "modes", "[static]"], check=False)  # its gates may say no, and it drives here
-    found = {}
+        words = [*rover, "run", str(checkpoint), str(episodes), "--name", run.name, "--runs-dir", str(work)]
+        subprocess.run([*words, "-p", "modes", "[static]"], check=False)  # its gates may say no, and it drives here
+    metres_by = {}
     for mode in ("fp32", "static"):
         artifact = run / f"policy_{mode}.pt"
 
-        def one(policy: Any, asked: tuple[str, int]) -> dict[str, float]:
-            return {"metres": metres(Track(asked[1]), policy.predict_chunk)}
+        def one(policy: Any, question: tuple[str, int]) -> dict[str, float]:
+            return {"metres": metres(Track(question[1]), policy.predict_chunk)}
 
-        asked = [(sha256_of(artifact), SEED + i) for i in range(tracks)]
-        rows = drive_missing(artifact, asked, one, work / "drives.jsonl")
-        found[mode] = np.array([rows[each]["metres"] for each in asked])
+        questions = [(sha256_of(artifact), SEED + i) for i in range(tracks)]
+        rows = drive_missing(artifact, questions, one, work / "drives.jsonl")
+        metres_by[mode] = np.array([rows[question]["metres"] for question in questions])
     driver = []
     for seed in range(SEED, SEED + tracks):
         track = Track(seed)
         while not track.done:
             track.step(*track.expert())
         driver.append(track.score)
-    found["driver"] = np.array(driver)
-    metrics = {f"{name}_m": each.mean() for name, each in found.items()}
-    metrics |= compare(found["fp32"], found["static"])
-    given = {"tracks": tracks, "seed": SEED, "drives": DRIVES, "replan_every": REPLAN, "timeout_s": TIMEOUT_S}
-    write_stage(output, "racing", params=given, metrics=metrics, inputs={checkpoint.name: sha256_of(checkpoint)})
+    metres_by["driver"] = np.array(driver)
+    metrics = {f"{name}_m": lengths.mean() for name, lengths in metres_by.items()}
+    metrics |= compare(metres_by["fp32"], metres_by["static"])
+    settings = {"tracks": tracks, "seed": SEED, "drives": DRIVES, "replan_every": REPLAN, "timeout_s": TIMEOUT_S}
+    write_stage(output, "racing", params=settings, metrics=metrics, inputs={checkpoint.name: sha256_of(checkpoint)})
     print(json.dumps(plain(metrics), indent=1))
 
 

@@ -4,12 +4,11 @@
 
 KerasLinear's layout: five convolutions, two dense layers, dropout, MSE, Adam, no augmentation, early stopping, and the
 picture alone. It looks at 80x60, for which its last two convolutions are padded; its linear outputs are steering now
-and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": ...}, "spread": ..., ...}}.
+and later. cnn.json has {name: {"r2": {"0": 0.6, "0.25": ..., "0.5": ..., "1": ...}, ...}}.
 """
 
 import json
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,8 +57,8 @@ def tensors(samples: Sequence[Sample], rate_hz: float) -> tuple[Tensor, Tensor, 
         small = cv2.resize(sample.frame_bgr(HEIGHT), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
         pictures[i] = small[..., ::-1].transpose(2, 0, 1)
     steering = np.array([sample.chunk[steps, 0] for sample in samples], np.float32)
-    driven = ~np.array([sample.is_pad[steps] for sample in samples])
-    return torch.from_numpy(pictures), torch.from_numpy(steering), torch.from_numpy(driven)
+    mask = ~np.array([sample.is_pad[steps] for sample in samples])
+    return torch.from_numpy(pictures), torch.from_numpy(steering), torch.from_numpy(mask)
 
 
 @torch.no_grad()
@@ -72,21 +71,21 @@ def predict(network: nn.Module, pictures: Tensor) -> Tensor:
 def train(learning: Sequence[Tensor], choosing: Sequence[Tensor], seed: int) -> tuple[nn.Module, int]:
     """Return the network of the least error on the choosing part, and how many epochs it was trained."""
     torch.manual_seed(seed)
-    network, (pictures, steering, driven) = linear(), learning
+    network, (pictures, steering, mask) = linear(), learning
     optimizer = torch.optim.Adam(network.parameters(), RATE)
-    best, kept, waited, epochs = float("inf"), network.state_dict(), 0, 0
-    while waited < PATIENCE and epochs < EPOCHS:
+    best, weights, idle, epochs = float("inf"), network.state_dict(), 0, 0
+    while idle < PATIENCE and epochs < EPOCHS:
         network.train()
         for rows in torch.randperm(len(pictures))[:EPOCH].split(BATCH):
             errors = (network(pictures[rows].float() / 255) - steering[rows]) ** 2
             optimizer.zero_grad()
-            errors[driven[rows]].mean().backward()
+            errors[mask[rows]].mean().backward()
             optimizer.step()
         error = float(((predict(network, choosing[0]) - choosing[1]) ** 2)[choosing[2]].mean())
-        waited, epochs = waited + 1, epochs + 1
+        idle, epochs = idle + 1, epochs + 1
         if error < best:
-            best, waited, kept = error, 0, {k: v.clone() for k, v in network.state_dict().items()}
-    network.load_state_dict(kept)
+            best, idle, weights = error, 0, {k: v.clone() for k, v in network.state_dict().items()}
+    network.load_state_dict(weights)
     return network, epochs
 
 
@@ -98,26 +97,21 @@ def r2(answers: Tensor, wanted: Tensor) -> float:
 def judge(source: Path | str | Source) -> dict[str, Any]:
     """Train on recordings, and return R² of steering on the held-out part, by seconds ahead, and how it came about."""
     torch.set_num_threads(1)  # at this size, a second one mostly waits
-    began_s, p = time.process_time(), params()["calibration"]
+    p = params()["calibration"]
     recordings = load_recordings(source)
     parts, rate_hz = split(recordings, p["held_out_share"], p["seed"]), usual_rate_hz(recordings.episodes)
-    picked = [pick_evenly(part, MOST) for part in (parts.calibration, parts.choosing, parts.held_out)]
-    learning, choosing, held_out = (tensors(part, rate_hz) for part in picked)
+    three = (parts.calibration, parts.choosing, parts.held_out)
+    learning, choosing, held_out = (tensors(pick_evenly(part, MOST), rate_hz) for part in three)
     network, epochs = train(learning, choosing, p["seed"])
-    answers, wanted, driven = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
-    shares, spreads = {}, {}
+    answers, recorded, mask = predict(network, held_out[0]).double(), held_out[1].double(), held_out[2]
+    shares = {}
     for i, ahead_s in enumerate(AHEAD_S):
-        known = driven[:, i]
-        shares[f"{ahead_s:g}"] = round(r2(answers[known, i], wanted[known, i]), 4)
-        spreads[f"{ahead_s:g}"] = round(float(answers[known, i].std(correction=0)), 4)
+        rows = mask[:, i]
+        shares[f"{ahead_s:g}"] = round(r2(answers[rows, i], recorded[rows, i]), 4)
     return {
         "r2": shares,
-        "spread": round(float(wanted[:, 0].std(correction=0)), 4),  # the driver's
-        "predicted_spread": spreads,
-        "samples": dict(zip(("learning", "choosing", "held_out"), map(len, picked), strict=True)),
         "rate_hz": round(rate_hz, 2),
         "epochs": epochs,
-        "processor_s": round(time.process_time() - began_s, 1),
         "split": parts.note,
     }
 
@@ -127,8 +121,9 @@ def main(out: str, *sources: str) -> None:
     path = Path(out)
     results = json.loads(path.read_text()) if path.exists() else {}
     for source in sources:
-        results[Path(source).name] = found = judge(source)
-        print(f"{Path(source).name}: R² {found['r2']}, spread {found['spread']}, {found['processor_s']} s", flush=True)
+        name = Path(source).name
+        results[name] = judge(source)
+        print(f"{name}: R² {results[name]['r2']}", flush=True)
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 
 

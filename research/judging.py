@@ -1,6 +1,6 @@
 """Which error tells the policies that drive worse? Drive degraded versions through the same worlds as FP32.
 
-    python -m research.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim [--level hard]
+    python -m research.judging runs/judging.json runs/demo/episodes runs/demo runs/tiny runs/slim
 
 Each policy drives in FP32 and in every version of VERSIONS, pushed and with late plans. A version that hits fewer
 worlds than FP32 by more than chance loses; each measure is held against that. Drives are kept in the cache, so that the
@@ -19,7 +19,6 @@ from torch import nn
 
 from balloon_world import drives, world
 from balloon_world.drives import SEED, drive_in, drive_missing
-from balloon_world.level import EASY, Level, level_in_key, level_named
 from balloon_world.world import World
 from rover_lib.onboard.drive import loop, pilot, plan
 from rover_lib.onboard.drive.plan import Settings
@@ -63,7 +62,7 @@ def degraded(
     Fewer bits are fewer steps of the same INT8: weights are rounded beforehand, activations get a larger scale.
     noise: of weights, in their channel's standard deviation, by seed. ranges: a factor. block: degraded alone.
     """
-    config, scheme = opened.checkpoint.config, Scheme(smooth=calibration.smooth)
+    scheme = Scheme(smooth=calibration.smooth)
     rng = torch.Generator().manual_seed(seed)
     prepared = restore_observed(opened.checkpoint, scheme, calibration)
     for name, m in prepared.named_modules():
@@ -77,24 +76,24 @@ def degraded(
             weight = weight + noise * weight.std(1, keepdim=True) * torch.randn(weight.shape, generator=rng)
             step = weight.abs().amax(1, keepdim=True).clamp(min=1e-12) / (2 ** (weight_bits - 1) - 1)
             m.weight = nn.Parameter(((weight / step).round() * step).view_as(m.weight), requires_grad=False)
-    return QuantizedPolicy(scheme, convert(prepared, config, scheme).eval(), {})
+    return QuantizedPolicy(scheme, convert(prepared, opened.checkpoint.config, scheme).eval(), {})
 
 
 def errors_of(report: Fidelity, version: str, moved_pct: Mapping[str, Any]) -> dict[str, float]:
     """Return every measure of a version, of the worse action if it is none of the plan. moved_pct: of FP32's look."""
-    found, reference = report.summary(version), report.reference.astype(np.float64)
+    summary, reference = report.summary(version), report.reference.astype(np.float64)
     spread = np.abs(reference - reference.mean(0)).mean((0, 1))
-    mae_pct = {name: found[f"{name}_mae_pct"] for name in report.action_names}
-    by_ms = sum(moved["by_100_ms"] / 100 for moved in moved_pct.values())
+    mae_pct = {name: summary[f"{name}_mae_pct"] for name in report.action_names}
+    by_ms = sum(motion["by_100_ms"] / 100 for motion in moved_pct.values())
     return {
         "range_pct": max(mae_pct.values()),
         "spread_pct": max(100 * report.errors(version).mean((0, 1)) / spread),
-        "first_steps_pct": max(np.mean(found[f"{name}_mae_per_step_pct"][:FIRST_STEPS]) for name in mae_pct),
+        "first_steps_pct": max(np.mean(summary[f"{name}_mae_per_step_pct"][:FIRST_STEPS]) for name in mae_pct),
         "steering_range_pct": mae_pct["steering"],
         "delay_ms": sum(mae_pct.values()) / by_ms,
-        "steering_less_pct": found["steering_less_pct"],
-        "worst_tenth_pct": found["worst_tenth_pct"],
-        "worst_tenth_delay_ms": found["worst_tenth_pct"] / by_ms,
+        "steering_less_pct": summary["steering_less_pct"],
+        "worst_tenth_pct": summary["worst_tenth_pct"],
+        "worst_tenth_delay_ms": summary["worst_tenth_pct"] / by_ms,
     }
 
 
@@ -103,21 +102,21 @@ def export_all(opened: Opened, folder: Path) -> None:
     calibration = calibrate(opened.checkpoint, pick_evenly(opened.parts.calibration, CALIBRATION))
     exporter = Exporter(opened.checkpoint, pick_evenly(opened.parts.held_out, HELD_OUT)[:1])
     exporter.export(exporter.float_policy, folder / f"{FP32}.pt")
-    for label, each in VERSIONS.items():
-        exporter.export(degraded(opened, calibration, **each), folder / f"{label}.pt", calibration)
+    for label, arguments in VERSIONS.items():
+        exporter.export(degraded(opened, calibration, **arguments), folder / f"{label}.pt", calibration)
 
 
-def judge(run: Path, episodes: Path, level: Level) -> list[dict[str, Any]]:
+def judge(run: Path, episodes: Path) -> list[dict[str, Any]]:
     """Return a row for each version of a policy: its pairs with FP32, and its errors. What was driven is kept."""
     opened, settings = load(run / "best_model.pth", episodes), params()["drive"]
     made_of: dict[str, Any] = {"checkpoint": opened.checkpoint.sha256, "versions": VERSIONS}
     made_of |= {"frames": [CALIBRATION, HELD_OUT], "torch": torch.__version__}
     folder = cache_folder("judged", key_of(made_of), lambda new: export_all(opened, new))
-    made_of |= {"drive": settings, "how": [PUSHES, LATENCY_S], **level_in_key(level)}
+    made_of |= {"drive": settings, "how": [PUSHES, LATENCY_S]}
     path = cache_root() / f"drives-{key_of(made_of, *DRIVING)}.jsonl"
-    hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path, level) for label in (FP32, *VERSIONS)}
-    fp32, *others = (load_policy(folder / f"{label}.pt", threads=1) for label in hit)
-    versions, samples = dict(zip(VERSIONS, others, strict=True)), pick_evenly(opened.parts.held_out, HELD_OUT)
+    hit = {label: hits(folder / f"{label}.pt", Settings.of(settings), path) for label in (FP32, *VERSIONS)}
+    fp32, *policies = (load_policy(folder / f"{label}.pt", threads=1) for label in hit)
+    versions, samples = dict(zip(VERSIONS, policies, strict=True)), pick_evenly(opened.parts.held_out, HELD_OUT)
     report = fidelity(fp32, versions, samples, opened.recordings.action_range())
     moved_pct, rows = look(fp32, report, opened.parts.held_out).moved_pct, []
     for label in VERSIONS:
@@ -128,15 +127,15 @@ def judge(run: Path, episodes: Path, level: Level) -> list[dict[str, Any]]:
     return rows
 
 
-def hits(artifact: Path, settings: Settings, path: Path, level: Level) -> list[bool]:
+def hits(artifact: Path, settings: Settings, path: Path) -> list[bool]:
     """Drive an artifact through the worlds; return which it hit. path: keeps the drives; others are driven."""
 
-    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, bool]:
-        return {"hit": drive_in(policy, World(asked[1], PUSHES, level=level), LATENCY_S, settings).outcome == "hit"}
+    def one(policy: Policy, question: tuple[str, int]) -> dict[str, bool]:
+        return {"hit": drive_in(policy, World(question[1], PUSHES), LATENCY_S, settings).outcome == "hit"}
 
-    asked = [(artifact.stem, SEED + i) for i in range(WORLDS)]
-    found = drive_missing(artifact, asked, one, path)
-    return [found[each]["hit"] for each in asked]
+    questions = [(artifact.stem, SEED + i) for i in range(WORLDS)]
+    rows = drive_missing(artifact, questions, one, path)
+    return [rows[question]["hit"] for question in questions]
 
 
 def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
@@ -146,30 +145,28 @@ def roc(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, Any]:
     it lets no loser pass; refused: of the others, how many have at least that. left_out_passed: losers that pass the
     limit that the other policies' losers set.
     """
-    losers, others = (np.array([r["errors"][measure] for r in rows if r["loses"] is kind]) for kind in (True, False))
-    auc = (losers[:, None] > others).mean() + 0.5 * (losers[:, None] == others).mean()
+    losers, fair = (np.array([r["errors"][measure] for r in rows if r["loses"] is kind]) for kind in (True, False))
+    auc = (losers[:, None] > fair).mean() + 0.5 * (losers[:, None] == fair).mean()
     whose = np.array([r["policy"] for r in rows if r["loses"]])
     passed = sum(of < losers[whose != policy].min(initial=np.inf) for of, policy in zip(losers, whose, strict=True))
-    found = {"auc": auc, "least_of_losers": losers.min(), "refused": (others >= losers.min()).sum(), "of": len(others)}
-    return found | {"left_out_passed": passed}
+    result = {"auc": auc, "least_of_losers": losers.min(), "refused": (fair >= losers.min()).sum(), "of": len(fair)}
+    return result | {"left_out_passed": passed}
 
 
-def main(output: Path, episodes: Path, *runs: Path, level: Level = EASY) -> None:
+def main(output: Path, episodes: Path, *runs: Path) -> None:
     """Judge the policies of these folders, each with its best_model.pth, and write the stage to `output`."""
     torch.set_num_threads(1)  # or XNNPACK's pool gets a thread for each core, which the threads that drive wait for
-    rows = [row for run in runs for row in judge(run, episodes, level)]
-    found: dict[str, Any] = {"measures": {measure: roc(rows, measure) for measure in rows[0]["errors"]}}
-    found |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
-    found["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
-    found["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
-    given: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
-    given["level"] = level.name
-    given |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
+    rows = [row for run in runs for row in judge(run, episodes)]
+    metrics: dict[str, Any] = {"measures": {measure: roc(rows, measure) for measure in rows[0]["errors"]}}
+    metrics |= {"pairs": len(rows), "lose": sum(row["loses"] for row in rows)}
+    metrics["losers_passed"] = sum(row["loses"] and not row["refused"] for row in rows)
+    metrics["others_refused"] = sum(row["refused"] and not row["loses"] for row in rows)
+    settings: dict[str, Any] = {"worlds": WORLDS, "seed": SEED, "pushes": PUSHES, "latency_ms": 1e3 * LATENCY_S}
+    settings |= {"chance": CHANCE, "versions": VERSIONS, "drive": params()["drive"], "gates": params()["gates"]}
     inputs = {f"{run.name}/best_model.pth": sha256_of(run / "best_model.pth") for run in runs}
-    write_stage(output, "judging", params=given, metrics=found | {"rows": rows}, inputs=inputs)
-    print(json.dumps(plain(found), indent=1))
+    write_stage(output, "judging", params=settings, metrics=metrics | {"rows": rows}, inputs=inputs)
+    print(json.dumps(plain(metrics), indent=1))
 
 
 if __name__ == "__main__":
-    *files, option, name = sys.argv[1:] if "--level" in sys.argv else [*sys.argv[1:], "", EASY.name]
-    main(*map(Path, files), level=level_named(name))
+    main(*map(Path, sys.argv[1:]))

@@ -32,14 +32,6 @@ from rover_lib.workshop.recordings.source import Source
 
 WINDOW = 15  # pictures that follow one another
 WINDOWS = 12  # of each car
-ARTIFACT = "policy_static.pt"
-
-
-def _parts(car: dict[str, Any]) -> tuple[Split, int]:
-    """Return the parts of a car's recordings, and the number of its pictures."""
-    p = params()["calibration"]
-    recordings = load_recordings(Source.of(car["tub"], throttle=car.get("throttle", "")))
-    return split(recordings, p["held_out_share"], p["seed"]), len(recordings.samples)
 
 
 def steering(car: dict[str, Any], parts: Split) -> dict[str, Any]:
@@ -54,8 +46,8 @@ def steering(car: dict[str, Any], parts: Split) -> dict[str, Any]:
     shares = {}
     for ahead_s in AHEAD_S:
         step = min(round(ahead_s * config.rate_hz), config.chunk - 1)
-        driven = ~is_pad[:, step]
-        planned, recorded = (torch.from_numpy(each[driven, step, 0]).double() for each in (plans, chunks))
+        rows = ~is_pad[:, step]
+        planned, recorded = (torch.from_numpy(actions[rows, step, 0]).double() for actions in (plans, chunks))
         shares[f"{ahead_s:g}"] = round(r2(planned, recorded), 3)
     judges = Judges.of(config.action_names, learned, learned_pad, chunks, is_pad)
     return {
@@ -100,12 +92,15 @@ def stopped(policy: Policy, window: Sequence[Sample]) -> bool:
 def main(out: str, described: str) -> None:
     """Write a row for each car, and the matrix: which share of whose windows each policy would stop at."""
     cars = yaml.safe_load(Path(described).read_text())
-    rows, seen = {}, {}
+    p = params()["calibration"]
+    rows, stretches = {}, {}
     for name, car in cars.items():
-        parts, pictures = _parts(car)
-        seen[name] = windows((*parts.choosing, *parts.held_out))
+        recordings = load_recordings(Source.of(car["tub"], throttle=car.get("throttle", "")))
+        parts = split(recordings, p["held_out_share"], p["seed"])
+        stretches[name] = windows((*parts.choosing, *parts.held_out))
         rate_hz = frame_rate_hz([s for s in parts.calibration if s.episode == parts.calibration[0].episode])
-        rows[name] = {"camera": car["camera"], "pictures": pictures, "rate_hz": rate_hz, "split": parts.note}
+        rows[name] = {"camera": car["camera"], "pictures": len(recordings.samples)}
+        rows[name] |= {"rate_hz": rate_hz, "split": parts.note}
         if "run" in car:
             rows[name] |= steering(car, parts) | of_int8(Path(car["run"]))
             rows[name]["cnn_r2"] = json.loads(Path(car["cnn"]).read_text())[Path(car["tub"]).name]["r2"]
@@ -114,10 +109,10 @@ def main(out: str, described: str) -> None:
     for name, car in cars.items():
         if "run" not in car:
             continue
-        policy = load_policy(Path(car["run"], ARTIFACT))
+        policy = load_policy(Path(car["run"], "policy_static.pt"))
         if policy.familiar is not None:
-            counts = {other: [stopped(policy, window) for window in of] for other, of in seen.items()}
-            matrix[name] = {other: f"{sum(each)} of {len(each)}" for other, each in counts.items()}
+            counts = {other: [stopped(policy, window) for window in of] for other, of in stretches.items()}
+            matrix[name] = {other: f"{sum(flags)} of {len(flags)}" for other, flags in counts.items()}
             print(name, matrix[name], flush=True)
     write_stage(Path(out), "cars", params={}, metrics={"cars": rows, "stopped": matrix}, inputs={})
 

@@ -5,7 +5,7 @@ drive goes on to its end, so that its outcome is known, and whether the car woul
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from balloon_world.drives import NoLog, TimedCar, drive_missing, wilson_interval
 from balloon_world.level import EASY
 from balloon_world.record import SHOVES
 from balloon_world.world import HORIZON_ROW as WALL
-from balloon_world.world import RATE_HZ, World, expert
+from balloon_world.world import RATE_HZ, World
 from rover_lib.onboard.cli import FILE, show
 from rover_lib.onboard.drive.plan import OFF, Settings, Smoother
 from rover_lib.onboard.errors import RoverError
@@ -34,9 +34,8 @@ OTHER = 20_000  # from a world's seed to that of the world whose look or picture
 CHANGE_S, LATE_S = 0.5, 0.1  # LATE_S: of a plan, as on a Pi 5
 BEFORE_S, AFTER_S = 0.5, 1.0  # a stop is in time 0.5 s before the car passes the balloon, or within 1 s of the change
 TURNED_RAD, BLUR_PX, HUE, DUSK = math.radians(15), 15, 40, 0.3
-GOOD = ("recorded", "driven", "pushed")  # by the expert, as the recordings; by the policy; by the policy with pushes
+GOOD = ("driven", "pushed")
 ASIDE_RAD = 0.48  # 99 % of recorded pictures have the balloon nearer to the middle; the edge is at 0.67
-COMPARED = 5  # worlds of each kind, in whose pictures INT8 and FP32 are compared
 ROOM = "another room's pictures"  # where there are recordings of one
 BESIDE = ("a film of another world", "mirrored", "a wall like a floor")  # of which nothing is promised
 
@@ -106,31 +105,30 @@ def judge_strangeness(
     """
     cv2.setNumThreads(1)
     artifact = run_dir / "policy_static.pt"
-    policy, fp32 = (load_policy(path, threads=1) for path in (artifact, run_dir / "policy_fp32.pt"))
+    policy = load_policy(artifact, threads=1)
     if "familiar" not in policy.manifest:
         raise RoverError(f"{artifact}: tells nothing unfamiliar", remedy="record more drives, see quantize.json")
     rooms = load_recordings(real, policy.chunk, params()["calibration"]["sync_s"]).episodes if real else ()
 
-    def one(policy: Policy, asked: tuple[str, int]) -> dict[str, Any]:
-        return (_watch if asked[0] == "recorded" else _drive)(policy, world(*asked))
+    def one(policy: Policy, question: tuple[str, int]) -> dict[str, Any]:
+        kind, seed = question
+        if kind in HOW:
+            return _drive(policy, StrangeWorld(seed, kind, rooms))
+        return _drive(policy, World(seed, SHOVES[EASY] * (kind == "pushed")))
 
-    def world(how: str, seed: int) -> World:
-        return StrangeWorld(seed, how, rooms) if how in HOW else World(seed, SHOVES[EASY] * (how != "driven"))
-
-    strange = [how for how in HOW if rooms or how != ROOM]
+    strange = [kind for kind in HOW if rooms or kind != ROOM]
     counts = dict.fromkeys(GOOD, worlds) | dict.fromkeys(strange, each)
-    asked = [(how, SEED + i) for how, count in counts.items() for i in range(count)]
-    found = drive_missing(artifact, asked, one, kept, progress)
-    rows = {how: [row | _told(row) for key, row in found.items() if key[0] == how] for how in counts}
-    failed = [row for how in strange if how not in BESIDE for row in rows[how] if row["outcome"] != "hit"]
+    questions = [(kind, SEED + i) for kind, count in counts.items() for i in range(count)]
+    drives = drive_missing(artifact, questions, one, kept, progress)
+    rows = {kind: [row | _told(row) for key, row in drives.items() if key[0] == kind] for kind in counts}
+    failed = [row for kind in strange if kind not in BESIDE for row in rows[kind] if row["outcome"] != "hit"]
     return {
         "threshold_drives": policy.manifest["familiar"]["drives"],
-        "good_stopped": {how: _share([row["stopped"] for row in rows[how]]) for how in GOOD},
-        "strange": {how: _judge(rows[how]) for how in strange},
+        "good_stopped": {kind: _share([row["stopped"] for row in rows[kind]]) for kind in GOOD},
+        "strange": {kind: _judge(rows[kind]) for kind in strange},
         "failed_in_time": _share([row["in_time"] for row in failed]),
         "pushed_aside": _share([row["stopped"] for row in rows["pushed"] if row["aside_rad"] > ASIDE_RAD]),
         "rooms": {episode.path.name: _of_recording(policy, episode) for episode in rooms},
-        "int8_as_fp32": _compare(policy, fp32, world, [*counts]),
     }
 
 
@@ -138,41 +136,20 @@ def _drive(policy: Policy, world: World) -> dict[str, Any]:
     """Drive to the end, whatever is unfamiliar. The lists have a value for each plan, smoothed."""
     car = TimedCar(world, policy, LATE_S)
     outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), NoLog()).outcome
-    seen = list[tuple[float, float]]()
+    places = list[tuple[float, float]]()
     for state in world.trajectory:
         world.state = state
-        seen.append(world.balloon_seen())
-    away_m, aside_rad = zip(*seen, strict=True)
-    passed_s, ready_s = world.trajectory[int(np.argmin(away_m))].time_s, [plan.ready_s for plan in car.plans]
-    row = {"outcome": outcome, "passed_s": passed_s, "aside_rad": max(map(abs, aside_rad)), "s": ready_s}
-    return row | {"strange": _smooth([plan.strange or 0.0 for plan in car.plans])}
-
-
-def _watch(policy: Policy, world: World) -> dict[str, Any]:
-    """Let the expert drive, as it does in recordings, and the policy look on."""
-    strange = _smooth([score for (score,) in _look_on([policy], world)])
-    return {"outcome": world.outcome, "passed_s": world.state.time_s, "s": [], "strange": strange}
-
-
-def _look_on(policies: Sequence[Policy], world: World) -> list[list[float]]:
-    """Return each policy's score of each picture on the expert's way."""
-    seen, action = list[list[float]](), (0.0, 0.0)
-    while not world.done:
-        if world.state.time_s >= LATE_S * len(seen) - 1e-6:
-            frame = world.render()
-            seen.append([_unfamiliar(policy, frame, np.array(action)) for policy in policies])
-        action = expert(world)
-        world.step(*action)
-    return seen
+        places.append(world.balloon_seen())
+    away_m, aside_rad = zip(*places, strict=True)
+    row = {"outcome": outcome, "passed_s": world.trajectory[int(np.argmin(away_m))].time_s}
+    row |= {"aside_rad": max(map(abs, aside_rad)), "s": [plan.ready_s for plan in car.plans]}
+    smoother = Smoother()
+    return row | {"strange": [smoother.add(plan.strange or 0.0) for plan in car.plans]}
 
 
 def _unfamiliar(policy: Policy, frame: np.ndarray, state: np.ndarray) -> float:
     policy.predict_unclipped(frame, state)
     return policy.strange or 0.0
-
-
-def _smooth(scores: Sequence[float]) -> list[float]:
-    return list(map(Smoother().add, scores))
 
 
 def _told(row: Mapping[str, Any]) -> dict[str, bool]:
@@ -196,21 +173,11 @@ def _judge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def _of_recording(policy: Policy, episode: Episode) -> dict[str, Any]:
     """Say when a recording would have stopped the car, in seconds from its first picture, and how much of it would."""
-    seen = episode.samples[:: round(LATE_S * RATE_HZ)]
-    strange = _smooth([_unfamiliar(policy, sample.frame_bgr(), sample.state) for sample in seen])
-    at_s = [sample.time_s - seen[0].time_s for sample, score in zip(seen, strange, strict=True) if score >= 1]
-    return {"unfamiliar_s": min(at_s, default=None), "unfamiliar_share": len(at_s) / len(seen)}
-
-
-def _compare(policy: Policy, other: Policy, make: Callable[[str, int], World], hows: Sequence[str]) -> dict[str, Any]:
-    """In how many pictures both policies say the same: in worlds of each kind, and in all good and all strange ones."""
-    same = {how: list[bool]() for how in (*hows, "good", "strange")}
-    for how in hows:
-        for seed in range(SEED, SEED + COMPARED):
-            alike = [(one >= 1) is (two >= 1) for one, two in _look_on([policy, other], make(how, seed))]
-            same[how] += alike
-            same["good" if how in GOOD else "strange"] += alike
-    return {how: _share(alike) for how, alike in same.items()}
+    samples = episode.samples[:: round(LATE_S * RATE_HZ)]
+    smoother = Smoother()
+    strange = [smoother.add(_unfamiliar(policy, sample.frame_bgr(), sample.state)) for sample in samples]
+    at_s = [sample.time_s - samples[0].time_s for sample, score in zip(samples, strange, strict=True) if score >= 1]
+    return {"unfamiliar_s": min(at_s, default=None), "unfamiliar_share": len(at_s) / len(samples)}
 
 
 @click.command()

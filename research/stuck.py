@@ -68,8 +68,8 @@ def drive_stuck(policy: Policy, asked: tuple[str, int]) -> tuple[str, float]:
     """Drive once; return how it ended, and how long after the wall (s). asked: "good" or "wall", and the seed."""
     kind, seed = asked
     wall_s = 0.5 + (seed % 10) / 10 if kind == "wall" else 1e9
-    car, log = _SeeingCar(_Walled(seed, wall_s), policy, LATENCY_S), NoLog()
-    outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), log).outcome
+    car = _SeeingCar(_Walled(seed, wall_s), policy, LATENCY_S)
+    outcome = car.drive(Settings.of(params()["drive"], unfamiliar=OFF), NoLog()).outcome
     return outcome, car.world.state.time_s - wall_s
 
 
@@ -88,12 +88,12 @@ def watch_recording(samples: Sequence[Sample], stuck_s: float) -> dict[str, Any]
 def in_light(image: np.ndarray, light: Light, at_s: float, rng: Any) -> np.ndarray:
     """Return a picture of 640x480 as a camera would give it in that light, (480, 640, 3) uint8, after JPEG."""
     mean, noise, flicker = light
-    shown = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC).astype(np.float32)
-    shown *= mean / max(float(shown.mean()), 1.0) if mean else 1.0
+    lit = cv2.resize(image, (640, 480), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    lit *= mean / max(float(lit.mean()), 1.0) if mean else 1.0
     row_s = at_s + np.arange(480) / 480 * ROWS_S
-    shown *= (1 + flicker * np.sin(2 * np.pi * 100 * row_s))[:, None, None].astype(np.float32)
-    shown += noise * rng.standard_normal(shown.shape, np.float32)
-    packed = cv2.imencode(".jpg", np.clip(shown, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    lit *= (1 + flicker * np.sin(2 * np.pi * 100 * row_s))[:, None, None].astype(np.float32)
+    lit += noise * rng.standard_normal(lit.shape, np.float32)
+    packed = cv2.imencode(".jpg", np.clip(lit, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
 
 
@@ -101,20 +101,20 @@ def watch_in_light(samples: Sequence[Sample], light: Light) -> tuple[float, floa
     """Return the largest difference that a standing car sees in 2 s, and the least that a driving one sees in 0.5 s."""
     rng, times_s = np.random.default_rng(0), [sample.time_s for sample in samples]
     at_s = np.arange(times_s[0], times_s[-1], EVERY_S)[:STAND_PICTURES].tolist()
-    seen = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]
-    drives = [cells_of(in_light(image, light, 1.003 * t, rng)) for t, image in zip(at_s, seen, strict=True)]
-    stands = [cells_of(in_light(seen[len(seen) // 2], light, 1.003 * t, rng)) for t in at_s]
-    moved = [max(difference(now, drives[i]) for now in drives[i + 1 : i + 6]) for i in range(len(drives) - 5)]
-    return max(difference(now, stands[0]) for now in stands[1:]), min(moved)
+    pictures = [samples[int(np.abs(np.subtract(times_s, t)).argmin())].frame_bgr() for t in at_s]
+    drives = [cells_of(in_light(image, light, 1.003 * t, rng)) for t, image in zip(at_s, pictures, strict=True)]
+    stands = [cells_of(in_light(pictures[len(pictures) // 2], light, 1.003 * t, rng)) for t in at_s]
+    differences = [max(difference(now, drives[i]) for now in drives[i + 1 : i + 6]) for i in range(len(drives) - 5)]
+    return max(difference(now, stands[0]) for now in stands[1:]), min(differences)
 
 
 def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 200) -> dict[str, Any]:
     """Return the metrics of stage `stuck`. artifact: drives. recordings: a folder of recordings, or None."""
     cv2.setNumThreads(1)
-    asked = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
-    found = dict(everywhere(artifact, asked, drive_stuck))
-    after_s = [s for key, (outcome, s) in sorted(found.items()) if key[0] == "wall" and outcome == "stopped"]
-    outcomes = [outcome for (kind, _), (outcome, _) in found.items() if kind == "good"]
+    questions = [("wall", SEED + i) for i in range(walls)] + [("good", SEED + i) for i in range(good)]
+    endings = dict(everywhere(artifact, questions, drive_stuck))
+    after_s = [s for key, (outcome, s) in sorted(endings.items()) if key[0] == "wall" and outcome == "stopped"]
+    outcomes = [outcome for (kind, _), (outcome, _) in endings.items() if kind == "good"]
     metrics: dict[str, Any] = {
         "walls": walls,
         "walls_stopped_in_time": sum(s <= WITHIN_S for s in after_s),
@@ -124,8 +124,9 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
         "good_hits": outcomes.count("hit"),
         "moved_limit": MOVED,
     }
-    episodes, stuck_s = load_recordings(recordings).episodes if recordings else (), params()["drive"]["stuck_s"]
-    metrics |= {episode.path.name: watch_recording(episode.samples, stuck_s) for episode in episodes}
+    episodes = load_recordings(recordings).episodes if recordings else ()
+    for episode in episodes:
+        metrics[episode.path.name] = watch_recording(episode.samples, params()["drive"]["stuck_s"])
     if episodes:
         metrics["lights"] = {}
         for name, light in LIGHTS.items():
@@ -136,5 +137,5 @@ def study(artifact: Path, recordings: Path | None, walls: int = 50, good: int = 
 
 if __name__ == "__main__":
     output, run_dir, *more = map(Path, sys.argv[1:])
-    found = study(run_dir if run_dir.is_file() else run_dir / "policy_static.pt", more[0] if more else None)
-    write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=found)
+    metrics = study(run_dir if run_dir.is_file() else run_dir / "policy_static.pt", more[0] if more else None)
+    write_stage(output, "stuck", params={"stuck_s": params()["drive"]["stuck_s"]}, metrics=metrics)

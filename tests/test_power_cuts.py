@@ -26,7 +26,6 @@ from rover_lib.onboard.recording import episode as module
 from rover_lib.onboard.recording.episode import About, EpisodeWriter, find_killed, finish_killed
 from tests.helpers.needs import Late, real_time, until
 from tests.helpers.recorded import record_drives
-from tests.helpers.tubs import records, tub
 
 HZ, LAST_S, SLOW_DISK_S = 30, 1.0, 0.3
 NAME = "episode_20260101_120000"
@@ -180,12 +179,8 @@ def finish(inputs, folder):
         finish_killed(part)
 
 
-def export(inputs, folder, source="episodes"):
-    main(["export-dataset", str(inputs / source), str(folder / "out")])
-
-
-def import_tub(inputs, folder):
-    export(inputs, folder, "tub")
+def export(inputs, folder):
+    main(["export-dataset", str(inputs / "episodes"), str(folder / "out")])
 
 
 def train(inputs, folder):
@@ -211,7 +206,6 @@ def content_of(folder):
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
     record_drives(folder / "episodes")
-    tub(folder / "tub", records(70))
     child = start(train, folder, folder)
     assert os.waitpid(child, 0)[1] == 0
     with pytest.raises(ZeroDivisionError), EpisodeWriter(folder / NAME, About(), resolution=None) as writer:
@@ -223,7 +217,7 @@ def inputs(tmp_path_factory):
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("work", [finish, export, import_tub, train, run])
+@pytest.mark.parametrize("work", [finish, export, train, run])
 def test_what_a_power_cut_leaves_is_whole_or_not_there(inputs, disk, work, monkeypatch):
     """And after it the work can be done again: it is, once, at a moment in the middle."""
     monkeypatch.setenv("ROVER_CACHE", str(disk / "cache"))

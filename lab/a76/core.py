@@ -111,8 +111,8 @@ def _make_userland(root: Path) -> None:
 
 def fetch_wheels(folder: Path, requirements: Path) -> None:
     """Fetch the guest's Python packages into a folder with uv, without installing them. Raises RoverError."""
-    beside = Path(sys.executable).with_name("uv")
-    uv = beside if beside.is_file() else "uv"
+    local = Path(sys.executable).with_name("uv")
+    uv = local if local.is_file() else "uv"
     options = ["--quiet", "--only-binary", ":all:", "--no-deps", "--require-hashes", *FOR_GUEST, "--target", folder]
     remedy = f"pip install uv, and have the index within reach that has {requirements.name}"
     run(uv, "pip", "install", *options, "--requirement", requirements, error=RoverError, remedy=remedy)

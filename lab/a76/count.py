@@ -44,8 +44,7 @@ def packages_of(artifact: Path) -> Path | None:
     if read_manifest(artifact)["engine"] != ONNXRUNTIME:
         return None
     wheels = REQUIREMENTS["onnxruntime"]
-    key = key_of({"for": FOR_GUEST}, wheels)
-    return cache_folder("arm-onnxruntime", key, lambda folder: fetch_wheels(folder, wheels))
+    return cache_folder("arm-onnxruntime", key_of({"for": FOR_GUEST}, wheels), lambda to: fetch_wheels(to, wheels))
 
 
 class Counted(NamedTuple):
@@ -73,8 +72,8 @@ def count_artifact(
         folder, observations = Path(scratch), Path(scratch) / "observations.npz"  # which guest/predict.py explains
         frames: dict[str, Any] = {f"frame_{i:04d}": sample.frame_bgr() for i, sample in enumerate(samples)}
         np.savez(observations, state=np.stack([s.state for s in samples]).astype(np.float32), **frames)
-        given = [artifact.resolve(), observations, folder, counted]
-        done = emulate_artifact(core, given, folder, packages, f"memory={STEADY}")
+        arguments = [artifact.resolve(), observations, folder, counted]
+        done = emulate_artifact(core, arguments, folder, packages, f"memory={STEADY}")
         return Counted(_row(done, folder, counted, manifest), np.load(folder / "chunks.npy"))
 
 
@@ -112,12 +111,8 @@ def _row(done: Emulation, folder: Path, counted: int, manifest: dict[str, Any]) 
 def side_by_side(counts: Mapping[str, Callable[[], Counted]], progress: Progress) -> dict[str, Counted]:
     """Count in several emulated machines, one for each of this machine's cores at a time."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        started = {name: pool.submit(count) for name, count in counts.items()}
-        try:
-            watched = progress(started, desc="artifacts, emulated", total=len(started))
-            return {name: started[name].result() for name in watched}
-        finally:
-            pool.shutdown(cancel_futures=True)  # if one failed, those that run end, and no more begin
+        done = pool.map(lambda count: count(), counts.values())  # if one fails, no more begin
+        return dict(zip(counts, progress(done, desc="artifacts, emulated", total=len(counts)), strict=True))
 
 
 def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress = silent) -> dict[str, Any]:
@@ -139,20 +134,20 @@ def count_run(run_dir: Path | str, *, frames: int = FRAMES, progress: Progress =
     if not samples:
         raise RoverError(f"{run_dir}: its recordings have no held-out frames", remedy="record more episodes")
     core, jobs = prepare(), {}
-    chosen = {stem: pick_evenly(range(len(samples)), FEW.get(m["mode"], len(samples))) for stem, m in manifests.items()}
-    for stem in sorted(artifacts, key=lambda stem: len(chosen[stem])):  # FP32, which takes longest, first
-        path, manifest, seen = artifacts[stem], manifests[stem], [samples[i] for i in chosen[stem]]
-        most = min(COUNTED, FEW.get(manifest["mode"], COUNTED))
-        jobs[stem] = partial(count_artifact, core, path, manifest, seen, packages=packages_of(path), counted=most)
+    picks = {stem: pick_evenly(range(len(samples)), FEW.get(m["mode"], len(samples))) for stem, m in manifests.items()}
+    for stem in sorted(artifacts, key=lambda stem: len(picks[stem])):  # FP32, which takes longest, first
+        path, manifest, subset = artifacts[stem], manifests[stem], [samples[i] for i in picks[stem]]
+        limit = min(COUNTED, FEW.get(manifest["mode"], COUNTED))
+        jobs[stem] = partial(count_artifact, core, path, manifest, subset, packages=packages_of(path), counted=limit)
     counts = side_by_side(jobs, progress)
-    judged = _judge(artifacts, chosen, counts, samples, again, progress)
-    rows = {stem: counts[stem].row | judged[stem] for stem in artifacts}
+    errors = _judge(artifacts, picks, counts, samples, again, progress)
+    rows = {stem: counts[stem].row | errors[stem] for stem in artifacts}
     metrics: dict[str, Any] = {"label": LABEL, "artifacts": rows}
     metrics["gates"] = gates(metrics, PARAMS["arm"]["gates"])
-    given = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
-    given["qemu"] = run("qemu-aarch64", "--version", error=RoverError).splitlines()[0]
+    settings = {"frames": len(samples), "steady": STEADY, "cpu": A76, "threads": 1}
+    settings["qemu"] = run("qemu-aarch64", "--version", error=RoverError).splitlines()[0]
     inputs = {p.name: sha256_of(p) for p in artifacts.values()}
-    return write_stage(run_dir / "arm.json", "arm", params=given, metrics=metrics, inputs=inputs)
+    return write_stage(run_dir / "arm.json", "arm", params=settings, metrics=metrics, inputs=inputs)
 
 
 def _judge(
@@ -173,8 +168,9 @@ def _judge(
     if not all(d <= tolerance[name] for name, d in zip(names, differences, strict=True)):
         raise RoverError(f"{artifacts[REFERENCE]}: differs by {difference:.2g} on the core", remedy="quantize again")
     for stem, frames in chosen.items():
-        expected, seen = here[list(frames)], [samples[i] for i in frames]
-        at_home = expected if stem == REFERENCE else chunks_here(artifacts[stem], seen, progress)
+        expected = at_home = here[list(frames)]
+        if stem != REFERENCE:
+            at_home = chunks_here(artifacts[stem], [samples[i] for i in frames], progress)
         rows[stem] = errors_pct(expected, counts[stem].chunks, names, ranges)
         rows[stem] |= {f"workstation_{k}": v for k, v in errors_pct(expected, at_home, names, ranges).items()}
         rows[stem] |= {"reference": REFERENCE, "frames_on_the_core": len(frames)}

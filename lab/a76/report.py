@@ -50,15 +50,15 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
             continue
         here = {k.removeprefix("workstation_"): v for k, v in artifact.items() if k.startswith("workstation_")}
         off_pct = 100 * abs(artifact["tenth_g"] / artifact["instructions_g"] - 1)
-        held = [
+        checks = [
             ("error on the emulated core, times the workstation's", _times(artifact, here), "x_workstation_error"),
             ("cost of the tenth plan against the third, %", off_pct, "tenth_pct"),
         ]
-        held += [(key, artifact[key], key) for key in ("peak_memory_mb", "peak_memory_loading_mb") if key not in own]
+        checks += [(key, artifact[key], key) for key in ("peak_memory_mb", "peak_memory_loading_mb") if key not in own]
         if stem == STATIC_ONNX and (torchs := metrics["artifacts"].get(STATIC)):
             there = {key: torchs[key] for key in here}
-            held.append(("error on the emulated core, times torch's there", _times(artifact, there), "x_torch_error"))
-        rows += [gate(f"{stem} {what}", found, "<=", limits[limit]) for what, found, limit in held]
+            checks.append(("error on the emulated core, times torch's there", _times(artifact, there), "x_torch_error"))
+        rows += [gate(f"{stem} {name}", value, "<=", limits[limit]) for name, value, limit in checks]
         frames = artifact["frames_on_the_core"]
         rows.append(gate(f"{stem} frames judged on the emulated core", frames, ">=", limits["frames"]))
     return rows
@@ -66,18 +66,18 @@ def gates(metrics: dict[str, Any], limits: dict[str, Any]) -> list[dict[str, Any
 
 def _times(artifact: dict[str, Any], errors: dict[str, float | None]) -> float | None:
     """Return the largest ratio of the artifact's errors to these; None if no action is judged."""
-    judged = [(artifact[key], error) for key, error in errors.items() if error is not None]
-    return worst(mine / error if error else float("inf") for mine, error in judged)
+    pairs = [(artifact[key], error) for key, error in errors.items() if error is not None]
+    return worst(mine / error if error else float("inf") for mine, error in pairs)
 
 
 def rows_of(metrics: Mapping[str, Any]) -> list[list[str]]:
     """Return a row for each count, a header first, and the fewest instructions after it. metrics: of arm.json."""
     rows = [["", *COLUMNS, "worst error, %", "frames", f"computed ms, {DRIVING} threads"]]
-    for name, found in sorted(metrics["artifacts"].items(), key=lambda item: item[1]["instructions_g"]):
-        cells = [number(found[key], how) for key, how in COLUMNS.values()]
-        errors = [value for key, value in found.items() if key.endswith("_mae_pct") and not key.startswith("work")]
-        span = "{low:.3g} to {high:.3g}".format_map(found["computed_pi5_ms"])
-        rows.append([name, *cells, number(worst(errors), ".3f"), str(found["frames_on_the_core"]), span])
+    for name, counts in sorted(metrics["artifacts"].items(), key=lambda item: item[1]["instructions_g"]):
+        cells = [number(counts[key], form) for key, form in COLUMNS.values()]
+        errors = [value for key, value in counts.items() if key.endswith("_mae_pct") and not key.startswith("work")]
+        span = "{low:.3g} to {high:.3g}".format_map(counts["computed_pi5_ms"])
+        rows.append([name, *cells, number(worst(errors), ".3f"), str(counts["frames_on_the_core"]), span])
     return rows
 
 

@@ -28,8 +28,8 @@ class Functions:
         nm = ["nm", "--no-sort", "--defined-only", "--print-size"]
         listing = run(*nm, path, error=RoverError)
         self.complete = bool(listing)  # a stripped file names only the functions that it exports
-        found = SYMBOL.findall(listing or run(*nm, "--dynamic", path, error=RoverError))
-        symbols = [(int(at, 16), int(size or "0", 16), name) for at, size, name in found]
+        matches = SYMBOL.findall(listing or run(*nm, "--dynamic", path, error=RoverError))
+        symbols = [(int(at, 16), int(size or "0", 16), name) for at, size, name in matches]
         self._symbols = sorted(symbols, key=lambda symbol: symbol[:2])
         self._at = [at for at, _, _ in self._symbols]
 

@@ -95,7 +95,7 @@ def _set_nice(pid: int, nice: int) -> None:
         Path(f"/proc/{pid}/autogroup").write_text(f"{nice}\n")
 
 
-class EmulatedArduino:
+class EmulatedArduino(contextlib.AbstractContextManager["EmulatedArduino"]):
     """The real firmware in simavr, in real time, in its own process, which ends with this one.
 
     port: for a ServoLink. Opening it resets the Arduino, as with a real one, unless the last user of the port left DTR
@@ -144,9 +144,6 @@ class EmulatedArduino:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> "EmulatedArduino":
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from lab.driving.on_pins import pin_rows, run_on_pins
+from lab.driving.on_pins import run_on_pins
 from lab.driving.pins import DEFAULT, GATES, STOPPED
 from lab.driving.rows import all_rows, run_row
 from rover_lib.onboard.car import servo_link
@@ -32,16 +32,15 @@ def run_faults(output: Path | None, only: Collection[str], car: Car, echo: Calla
     if car.human != DEFAULT.human:
         raise RoverError(f"{car.name}: its human holds a gamepad", remedy="'python -m lab random' drives with one, too")
     begin = time.monotonic()
-    on_pins = pin_rows() if car == DEFAULT else ()
-    rows = [row for row in all_rows().values() if row.name not in {row.name for row in on_pins}]
-    names = [row.name for row in (*rows, *on_pins)]
+    on_pins = all_rows("pins") if car == DEFAULT else {}
+    names = list(dict.fromkeys([*all_rows(), *on_pins]))
     if unknown := set(only) - set(names):
         raise RoverError("no such fault", found=sorted(unknown), remedy=f"choose from {names}")
     logging.getLogger(servo_link.__name__).setLevel(logging.ERROR)  # it would warn of what is broken here on purpose
-    chosen = set(only or names)
+    selection = [name for name in names if name in (only or names)]
     done = []
-    in_stories = (run_row(fault, car) for fault in rows if fault.name in chosen)
-    for row in itertools.chain(in_stories, run_on_pins([fault for fault in on_pins if fault.name in chosen])):
+    in_stories = (run_row(all_rows()[name], car) for name in selection if name not in on_pins)
+    for row in itertools.chain(in_stories, run_on_pins([on_pins[name] for name in selection if name in on_pins])):
         done.append(row)
         ms = row.get("takeover_ms", row["stopped_after_ms"])
         echo(f"{row['fault']:<35} {row['expected']:<10} {row['found']:<16} {'' if ms is None else f'{ms:.0f} ms'}")

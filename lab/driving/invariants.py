@@ -84,8 +84,8 @@ class Run:
 
 def _each_ms(changes: list, n: int, value: Callable[[Any], Any]) -> np.ndarray:
     out = np.zeros(n, int)
-    for (ms, what), (until, _) in pairwise([*changes, (n, None)]):
-        out[ms:until] = value(what)
+    for (ms, change), (until, _) in pairwise([*changes, (n, None)]):
+        out[ms:until] = value(change)
     return out
 
 
@@ -106,12 +106,12 @@ def _first(bad: np.ndarray) -> int | None:
 def broken(seen: Seen) -> Iterator[str]:
     """Yield a sentence, with the millisecond, for each invariant that is broken."""
     run = Run(seen)
-    checks = (_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends)
-    with_pad, with_receiver = (_armed_at_rest, _pad_lost), (_asked_for, _human_wins, _human_keeps, _armed_by_people)
-    more = (_answered, _in_time, _stuck, _supplied)
-    for check in (*(with_pad if seen.gamepad else with_receiver), *checks, *more):
-        if (what := check(run)) is not None:
-            yield f"{check.__name__[1:]}: {what}"
+    checks = [_capped, _slewed, _not_blind, _told, _ends_when_told, _stopped_is_neutral, _as_planned, _bad_ends]
+    checks += [_answered, _in_time, _stuck, _supplied]
+    checks += [_armed_at_rest, _pad_lost] if seen.gamepad else [_asked_for, _human_wins, _human_keeps, _armed_by_people]
+    for check in checks:
+        if (problem := check(run)) is not None:
+            yield f"{check.__name__[1:]}: {problem}"
 
 
 def _asked_for(run: Run) -> str | None:
@@ -159,21 +159,21 @@ def _not_blind(run: Run) -> str | None:
         content[c.at_ms :] = c.content_ms if c.planned else 10**9
     age = np.arange(len(content)) - content
     blind = run.autonomous & (run.throttle > RESTING_US) & (age > STALE_MS)
-    for armed, left in run.drives:
-        if (count := int(blind[armed:left].sum())) > BLIND_MS:
-            return f"{count} ms by pictures that were {int(age[armed:left][blind[armed:left]].max())} ms old"
+    for armed, end in run.drives:
+        if (count := int(blind[armed:end].sum())) > BLIND_MS:
+            return f"{count} ms by pictures that were {int(age[armed:end][blind[armed:end]].max())} ms old"
     return None
 
 
 def _human_wins(run: Run) -> str | None:
     """A moved stick, or a lost signal, ends autonomy within 100 ms."""
-    for armed, left in run.drives:
-        span, before = slice(armed, left), slice(max(0, armed - 45), armed + 1)
-        moved = np.zeros(left - armed, bool)
+    for armed, end in run.drives:
+        span, before = slice(armed, end), slice(max(0, armed - 45), armed + 1)
+        is_moved = np.zeros(end - armed, bool)
         for channel, stick in run.stick.items():
             rests = np.unique(stick[before])
-            moved |= np.abs(stick[span][:, None] - rests).min(1) > DEAD_BAND_US[channel]
-        must_end = (moved & (run.live[span] == 1) & bool(run.live[before].all())) | (run.signals[span] == 0)
+            is_moved |= np.abs(stick[span][:, None] - rests).min(1) > DEAD_BAND_US[channel]
+        must_end = (is_moved & (run.live[span] == 1) & bool(run.live[before].all())) | (run.signals[span] == 0)
         for hung_ms, until_ms in run.seen.hung:  # a hung loop notices nothing; the watchdog ends that a little later
             must_end[max(0, hung_ms - armed) : max(0, until_ms - armed)] = False
         if (late := _first(_for_ms(must_end, SIGNAL_MS + 1))) is not None:
@@ -204,16 +204,16 @@ def _armed_by_people(run: Run) -> str | None:
     used = 0
     for armed in run.armed:
         stopped = max((ms for ms in run.left if ms < armed), default=-1)
-        asked = [ms for ms in run.seen.asked if stopped < ms <= armed]
-        if not asked or armed - asked[-1] > run.seen.asked_most_ms + SPARE_MS:
+        requests = [ms for ms in run.seen.asked if stopped < ms <= armed]
+        if not requests or armed - requests[-1] > run.seen.asked_most_ms + SPARE_MS:
             return f"armed at {armed} ms, asked for at {run.seen.asked}, stopped at {stopped}"
         since = max(used, armed - GESTURE_MS - SIDES_MS - SPARE_MS)
         since = max([since, *(ms for ms in run.seen.starts if ms <= armed)])
         for ends_it in (lost[: max(0, armed - SIGNAL_MS)], off_rest[:armed]):
             since = max([since, *np.flatnonzero(ends_it)[-1:].tolist()])
-        held = np.abs(off[armed - LET_GO_MS + 60 : armed - 25]) > LET_GO_US
+        off_centre = np.abs(off[armed - LET_GO_MS + 60 : armed - 25]) > LET_GO_US
         sides = [np.flatnonzero(side[since:armed]) + since for side in (off <= -SIDE_US, off >= SIDE_US)]
-        if _for_ms(held, GLIMPSE_MS).any() or not any(ms <= SIDES_MS + 60 for ms in _gaps(*sides)):
+        if _for_ms(off_centre, GLIMPSE_MS).any() or not any(ms <= SIDES_MS + 60 for ms in _gaps(*sides)):
             return f"armed at {armed} ms without a gesture since {since} ms"
         used = armed
     return None
@@ -223,10 +223,10 @@ def _armed_at_rest(run: Run) -> str | None:
     """A gamepad whose throttle is off rest, or whose L1 is up, arms nothing: what was never seen is not at rest."""
     off_rest = np.abs(run.stick["throttle"] - NEUTRAL_US["throttle"]) > DEAD_BAND_US["throttle"]
     let_go = _each_ms(run.seen.hands, len(off_rest), lambda hand: hand.receiver == LOST) == 1
-    for what, holds in (("off rest", off_rest), ("without L1", let_go)):
+    for fault, holds in (("off rest", off_rest), ("without L1", let_go)):
         for armed in run.armed:
             if _for_ms(holds, UNSEEN_MS)[armed]:
-                return f"armed at {armed} ms with a gamepad's throttle {what}"
+                return f"armed at {armed} ms with a gamepad's throttle {fault}"
     return None
 
 
@@ -252,9 +252,9 @@ def _gaps(left: np.ndarray, right: np.ndarray) -> Iterator[int]:
 
 def _off_after(run: Run, since_ms: int, limit_ms: int, what: str, until_ms: int = 10**9) -> str | None:
     """Say whether a drive that goes on at since_ms still moves the car limit_ms later, before until_ms."""
-    for armed, left in run.drives:
-        if armed <= since_ms < left:
-            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : min(left, until_ms)] > RESTING_US)
+    for armed, end in run.drives:
+        if armed <= since_ms < end:
+            moving = np.flatnonzero(run.throttle[since_ms + limit_ms : min(end, until_ms)] > RESTING_US)
             if len(moving):
                 return f"{what} at {since_ms} ms, and throttle at {since_ms + limit_ms + int(moving[0])}"
     return None
@@ -265,8 +265,8 @@ def _ends_when_told(run: Run) -> str | None:
     for ms, since in run.seen.stops:
         if ms < run.seen.end_ms and (not since or any(a <= since <= ms < b for a, b in run.drives)):
             limit_ms = STOP_MS if run.clean[ms] else VALID_MS + 20
-            if what := _off_after(run, ms, limit_ms, "told to stop"):
-                return what
+            if problem := _off_after(run, ms, limit_ms, "told to stop"):
+                return problem
     return None
 
 
@@ -312,26 +312,26 @@ def _as_planned(run: Run) -> str | None:
 def _bad_ends(run: Run) -> str | None:
     """A plan that nobody may drive by, or black or missing pictures, end the drive's motion."""
     for p in run.seen.plans:
-        if p.bad and (what := _off_after(run, p.at_ms, VALID_MS + 20, "a bad plan")):
-            return what
+        if p.bad and (problem := _off_after(run, p.at_ms, VALID_MS + 20, "a bad plan")):
+            return problem
     for (ms, _), (until, _) in pairwise([*run.seen.frames, (run.seen.end_ms, False)]):
         limit_ms = MISSING_MS if run.clean[ms] else MISSING_MS + VALID_MS
-        if until - ms > limit_ms and (what := _off_after(run, ms, limit_ms, "the last picture", until)):
-            return what
+        if until - ms > limit_ms and (problem := _off_after(run, ms, limit_ms, "the last picture", until)):
+            return problem
     blacks = 0
     for ms, black in run.seen.frames:
         blacks = blacks + 1 if black else 0
-        if blacks == BLACK_FRAMES and (what := _off_after(run, ms, VALID_MS + 20, "black pictures")):
-            return what
+        if blacks == BLACK_FRAMES and (problem := _off_after(run, ms, VALID_MS + 20, "black pictures")):
+            return problem
     return None
 
 
 def _stuck(run: Run) -> str | None:
     """A car that stands although its throttle is on is stopped within two seconds, and no car that moves is."""
     stands = _each_ms(run.seen.stands, len(run.throttle), int) == 1
-    for armed, left in run.drives:
-        still = np.concatenate([[False], (stands & run.clean)[armed:left], [False]])
-        on = (run.autonomous & (run.throttle > DRIVEN_US))[armed:left]
+    for armed, drive_end in run.drives:
+        still = np.concatenate([[False], (stands & run.clean)[armed:drive_end], [False]])
+        on = (run.autonomous & (run.throttle > DRIVEN_US))[armed:drive_end]
         for begin, end in np.flatnonzero(np.diff(still)).reshape(-1, 2):
             if (count := int(on[begin:end].sum())) > STUCK_MS:
                 return f"{count} ms of throttle until {armed + end} ms while the car stands"
@@ -380,11 +380,11 @@ def _in_time(run: Run) -> str | None:
     for i, (start, end) in enumerate(pauses):
         begun = max((armed for armed in run.armed if armed <= end), default=end) + 40
         lateness = [b - a - 34 for a, b in pauses[: i + 1] if b > end - 480 and b - a >= 70 and a >= begun]
-        if sum(lateness) > 160 and (what := _off_after(run, end, VALID_MS + 20, "pauses until then")):
-            return what
+        if sum(lateness) > 160 and (problem := _off_after(run, end, VALID_MS + 20, "pauses until then")):
+            return problem
         first = [b for a, b in pauses[:i] if 103 <= b - a <= 148 and b + 20 < start and end < b + 480]
-        judged = first and end - start >= 48 and not run.sick[first[0] - 200 : end].any() and end < run.seen.end_ms
-        if judged and any(a < first[0] - 150 and end + 2 < b for a, b in run.drives):
+        is_judged = first and end - start >= 48 and not run.sick[first[0] - 200 : end].any() and end < run.seen.end_ms
+        if is_judged and any(a < first[0] - 150 and end + 2 < b for a, b in run.drives):
             return f"autonomous at {end} ms after a second pause"
     return None
 

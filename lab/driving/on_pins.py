@@ -6,7 +6,6 @@ pulses come from simavr. All other faults are in rows.py, in virtual time.
 """
 
 import contextlib
-import functools
 import os
 import re
 import resource
@@ -27,7 +26,6 @@ from lab.arduino.emulator import NICE, EmulatedArduino
 from lab.driving.pins import BEFORE_S, CONTINUES, Command, Observation, judge, most_throttle_us, row_of
 from lab.driving.policy import RATE_HZ, make_artifact, pictures
 from lab.driving.rows import FaultRow
-from lab.driving.stories import read_stories
 from rover_lib.onboard.drive.watch import real_time
 from rover_lib.onboard.errors import RoverError
 
@@ -106,9 +104,9 @@ class PinBench:
         end = time.monotonic() + seconds
         while True:
             self.events += self.arduino.pulses()
-            if (left := end - time.monotonic()) <= 0:
+            if (remaining_s := end - time.monotonic()) <= 0:
                 return
-            time.sleep(min(left, 0.1))
+            time.sleep(min(remaining_s, 0.1))
 
     def driving(self, seconds: float = BEFORE_S) -> bool:
         """Whether each throttle pulse of the last seconds, at most 1.5, moves the car."""
@@ -191,13 +189,6 @@ INJECT: dict[str, Callable[[PinBench], object]] = {
     "CPU starved": _starve,
     "disk full while logging": _fill_disk,
 }
-STARVES = "CPU starved"  # takes the drive's time
-
-
-@functools.cache
-def pin_rows() -> list[FaultRow]:
-    """Read the faults on pins from stories.yml."""
-    return [FaultRow(**row) for row in read_stories("pins")]
 
 
 # ---- judging
@@ -212,15 +203,15 @@ def run_pin_row(bench: PinBench, fault: FaultRow) -> dict[str, Any]:
     while spoilt and attempts < ATTEMPTS:
         attempts += 1
         bench.at_speed()
-        seen, code, line = _inject(bench, fault)
-        spoilt = _spoilt(fault, seen)
+        observation, code, line = _inject(bench, fault)
+        spoilt = _spoilt(fault, observation)
     human_us = REST_US[0] + fault.moved_us[0], REST_US[1] + fault.moved_us[1]
-    judged = judge(fault.expected, seen, human_us=human_us)
+    verdict = judge(fault.expected, observation, human_us=human_us)
     with contextlib.suppress(RoverError):  # then it is not recovered
         bench.at_speed()
-    more = {"attempts": attempts, "stalled_ms": round(seen.stalled_ms(), 1)}
+    more = {"attempts": attempts, "stalled_ms": round(observation.stalled_ms(), 1)}
     line = line and line.replace(f"{bench.folder}/", "")
-    return row_of(fault, judged, code, line, bench.driving(), "on pins", **more)
+    return row_of(fault, verdict, code, line, bench.driving(), "on pins", **more)
 
 
 def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, str | None]:
@@ -242,10 +233,10 @@ def _inject(bench: PinBench, fault: FaultRow) -> tuple[Observation, int | None, 
 
 
 def _spoilt(fault: FaultRow, seen: Observation) -> bool:
-    """Whether this machine had no time for the Arduino or the drive, so that there is nothing to judge."""
+    """Whether this machine had no time for the Arduino or the drive, unless that is the fault: nothing to judge."""
     if seen.stalled_ms() or not seen.was_driving(most_throttle_us()):
         return True
-    return fault.expected == CONTINUES and fault.name != STARVES and seen.longest_pause_s() > LATE_COMMAND_S
+    return fault.expected == CONTINUES and fault.name != "CPU starved" and seen.longest_pause_s() > LATE_COMMAND_S
 
 
 def run_on_pins(faults: Sequence[FaultRow]) -> Iterator[dict[str, Any]]:

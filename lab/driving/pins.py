@@ -96,9 +96,9 @@ def judge(
     if expected != REFUSED and not seen.was_driving(most_us):
         wrong.append(f"the car was not driving in the {BEFORE_S * 1e3:g} ms before the fault")
     for pin, period_us in periods_of(car).items():
-        count, wanted = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
-        if count < wanted - 2:
-            wrong.append(f"{count} {pin} pulses in the last {LAST_S * 1e3:g} ms, {wanted:.0f} are its rate")
+        count, nominal = len(seen.pulses(pin, seen.end_s - LAST_S)), LAST_S * 1e6 / period_us
+        if count < nominal - 2:
+            wrong.append(f"{count} {pin} pulses in the last {LAST_S * 1e3:g} ms, {nominal:.0f} are its rate")
     if expected == STOPPED:
         wrong += _not_stopped(seen, figures, most_us, (car.numbers[2], human_us[0]))
     elif expected == REFUSED:

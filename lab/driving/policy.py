@@ -58,9 +58,9 @@ def make_artifact(
         "parity": {"tolerance": dict.fromkeys(names, 1e-6), "reason": "constant"},
         "versions": {"torch": torch.__version__, "rover_lib": ""},
     }
-    seen: dict[str, np.ndarray] = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
+    arrays: dict[str, np.ndarray] = {"state": np.zeros((1, 2), np.float32), frame: np.zeros((1, *size, 3), np.uint8)}
     graph = torch.jit.trace(Constant().eval(), (torch.zeros(1, 2), torch.zeros((*size, 3), dtype=torch.uint8)))
-    save_artifact(path, torch.jit.freeze(graph), manifest, seen | {"chunk": planned[None]})
+    save_artifact(path, torch.jit.freeze(graph), manifest, arrays | {"chunk": planned[None]})
 
 
 def pictures(size: tuple[int, int] = SIZE, count: int = 40) -> list[bytes]:
@@ -70,10 +70,10 @@ def pictures(size: tuple[int, int] = SIZE, count: int = 40) -> list[bytes]:
     remembers.
     """
     rng = np.random.default_rng(0)
-    made = []
+    jpegs = []
     for i in range(count):
         picture = rng.integers(100, 112, (*size, 3), np.uint8)
         picture[: size[0] // 3, : size[1] // 3] -= 75  # so that there is something to see
         picture = np.roll(picture, i * size[1] // count, 1)  # or the car would be stuck
-        made.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
-    return made
+        jpegs.append(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+    return jpegs

@@ -67,9 +67,9 @@ class FaultRow:
 
 
 @functools.cache
-def all_rows() -> dict[str, FaultRow]:
-    """Read the faults of stories.yml, by their names."""
-    return {row["name"]: FaultRow(**row) for row in read_stories("rows")}
+def all_rows(section: str = "rows") -> dict[str, FaultRow]:
+    """Read the faults of stories.yml, by their names: those in virtual time, or of section "pins"."""
+    return {row["name"]: FaultRow(**row) for row in read_stories(section)}
 
 
 # ---- what only these rows have
@@ -80,10 +80,10 @@ def _film(stage: Stage, h: Happening) -> None:
 
 
 def _flickering() -> list[np.ndarray]:
-    shown = [np.full_like(scenery()[0], 128) for _ in range(40)]
-    for i, picture in enumerate(shown):
+    film = [np.full_like(scenery()[0], 128) for _ in range(40)]
+    for i, picture in enumerate(film):
         picture[50, 50] = 6 * i
-    return shown
+    return film
 
 
 FILMS: dict[str, Callable[[], Sequence[np.ndarray]]] = {
@@ -121,8 +121,8 @@ def run_row(fault: FaultRow, car: Car = DEFAULT) -> dict[str, Any]:
     watched = _observe(seen, car, at_ms, end_ms)
     figures, wrong = judge(fault.expected, watched, car, human_us=human_us, until_limit=fault.until_limit)
     code = next((_exit_code(error) for ms, error in seen.errors if ms < over_ms), None)
-    said = [text for ms, text in seen.log if ms >= at_ms] + [words for _, ms, words in seen.drives if words]
-    line = next((text for text in said if re.search(fault.message, text)), None)
+    texts = [text for ms, text in seen.log if ms >= at_ms] + [words for _, ms, words in seen.drives if words]
+    line = next((text for text in texts if re.search(fault.message, text)), None)
     run = Run(seen)
     recovered = bool((run.autonomous & (run.throttle != car.numbers[6]))[AGAIN_MS:].any())
     if car == DEFAULT:  # the invariants' numbers are this car's

@@ -185,8 +185,8 @@ def _replay(stage: Stage, h: Happening) -> None:
 
 @_may("another program writes to the port", (0, 5), (20, 1000))
 def _intrude(stage: Stage, h: Happening) -> None:
-    what = (b"AT+GCAP\r\n", b">D 1", frame(">D 0 7 2000 700"), frame(">A 0 8 0 0 0"), frame(">N 0 9"), frame(">Q"))
-    stage.again_and_again(h, 10, lambda: stage.world.down.send(what[h.amount]))
+    lines = (b"AT+GCAP\r\n", b">D 1", frame(">D 0 7 2000 700"), frame(">A 0 8 0 0 0"), frame(">N 0 9"), frame(">Q"))
+    stage.again_and_again(h, 10, lambda: stage.world.down.send(lines[h.amount]))
 
 
 _may("the Arduino is reset")(lambda stage, h: stage.world.reset())
@@ -199,8 +199,8 @@ _may("the receiver's steering wire is off", for_ms=A_WHILE)(during("hand", steer
 @_may("the human steers to both sides, seconds apart", (3200, 6000))
 def _steer_slowly(stage: Stage, h: Happening) -> None:
     for ms, amount in ((0, -300), (h.amount, 300)):
-        moved = Happening(h.at_ms, h.what, amount, 120)
-        stage.world.at(stage.world.now_ms + ms, partial(_steer, stage, moved))
+        move = Happening(h.at_ms, h.what, amount, 120)
+        stage.world.at(stage.world.now_ms + ms, partial(_steer, stage, move))
 
 
 @_may("the human drives by hand", (130, 400), (1000, 12_000))
@@ -320,10 +320,10 @@ def random_story(seed: int) -> Story:
     happenings = []
     longer_ms = LONGER_MS if rng.random() < 0.03 else 0
     for _ in range(rng.randint(0, 8)):
-        what = rng.choice(list(HAPPENINGS))
-        _, amount, (shortest, longest) = HAPPENINGS[what]
+        name = rng.choice(list(HAPPENINGS))
+        _, amount, (shortest, longest) = HAPPENINGS[name]
         for_ms = round(shortest * (longest / shortest) ** rng.random()) if shortest else 0
-        happenings.append(Happening(rng.randint(0, STOP_MS + longer_ms), what, rng.randint(*amount), for_ms))
+        happenings.append(Happening(rng.randint(0, STOP_MS + longer_ms), name, rng.randint(*amount), for_ms))
     in_order = tuple(sorted(happenings, key=lambda h: h.at_ms))
     path = rng.choice(["service", "service", "terminal", "at once"])
     limits = rng.random() < 0.2, rng.random() < 0.2
@@ -349,8 +349,8 @@ def drive_story(story: Story, car: Car | None = None) -> Seen:
     usual = {START_MS + later_ms: "the operator starts it", stop_ms: "the operator says stop"}
     if story.service:
         usual[ASK_MS + later_ms + pad_ms] = "the operator starts it"
-    for ms, what in usual.items():
-        world.at(ms, partial(HAPPENINGS[what][0], stage, Happening(ms, what)))
+    for ms, name in usual.items():
+        world.at(ms, partial(HAPPENINGS[name][0], stage, Happening(ms, name)))
     while world.now_ms < stop_ms + END_MS - STOP_MS:
         world.advance(world.now_ms + 1)
         if stage.start_due and world.now_ms < stop_ms:

@@ -274,11 +274,11 @@ class World:
                 heapq.heappop(self._due)[2]()
             if self.now_ms >= until_ms:
                 return
-            ms, said = min(until_ms, self._due[0][0] if self._due else until_ms) - self.now_ms, b""
+            ms, output = min(until_ms, self._due[0][0] if self._due else until_ms) - self.now_ms, b""
             if self.board and not self._hung_ms:
-                ms, said = self.board.run(ms)
+                ms, output = self.board.run(ms)
             self.now_ms += ms
-            for line in said.splitlines(keepends=True):
+            for line in output.splitlines(keepends=True):
                 self.up.send(line)
 
     def sleep(self, seconds: float) -> None:
@@ -386,6 +386,6 @@ class World:
         self.written.append(line)
         if line.startswith(b">D"):
             _, sequence, _, steering_us, throttle_us = map(int, line[3:].split(b"*")[0].split())
-            asked = Asked(self.now_ms, throttle_us, self.content_ms, self.planned, sequence, steering_us)
-            self.seen.commands.append(asked)
+            command = Asked(self.now_ms, throttle_us, self.content_ms, self.planned, sequence, steering_us)
+            self.seen.commands.append(command)
         self.down.send(line)

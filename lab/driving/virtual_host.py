@@ -56,9 +56,9 @@ class _Waiting:
 
     def wait_for(self, predicate: Callable[[], Any], timeout: float) -> Any:
         end_s = self._world.clock() + timeout
-        while not (found := predicate()) and self._world.clock() < end_s:
+        while not (result := predicate()) and self._world.clock() < end_s:
             self._world.sleep(0.001)
-        return found
+        return result
 
 
 class VirtualPad(gamepad.Gamepad):
@@ -204,8 +204,8 @@ class Eyes:
     def _pictures(self) -> Iterator[tuple[np.ndarray, float | None]]:
         try:
             self._idle.put(None)
-            while given := self._given.get():
-                yield given
+            while picture := self._given.get():
+                yield picture
                 self._idle.put(None)
         finally:
             self._over = True
@@ -364,8 +364,8 @@ class _Feed(Feed):
     world: World
 
     def over(self) -> str | None:
-        told, self.world.view_stop = self.world.view_stop, False
-        return "stopped from the view (127.0.0.1)" if told else None
+        is_stopped, self.world.view_stop = self.world.view_stop, False
+        return "stopped from the view (127.0.0.1)" if is_stopped else None
 
 
 class _Session(Session):

@@ -169,11 +169,11 @@ def _lend_registries(etc: Path) -> None:
 
 def pip_settings(config: str, proxy: str = "") -> str:
     """Make a pip.conf for another machine from `pip config list` here, without folders of this machine."""
-    found = {"cert": str(CERTIFICATES), "proxy": proxy}
+    settings = {"cert": str(CERTIFICATES), "proxy": proxy}
     for line in config.splitlines():
         key, _, value = line.partition("=")
         name = key.rpartition(".")[2]
         if name in ("index-url", "extra-index-url", "trusted-host", "proxy", "timeout", "default-timeout", "retries"):
             there = [word for word in str(ast.literal_eval(value)).split() if not word.startswith(("file:", "/"))]
-            found[name] = " ".join(there)
-    return "[global]\n" + "".join(f"{k} = {v}\n" for k, v in found.items() if v)
+            settings[name] = " ".join(there)
+    return "[global]\n" + "".join(f"{k} = {v}\n" for k, v in settings.items() if v)

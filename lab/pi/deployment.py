@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,18 +24,18 @@ from typing import Any, TextIO
 
 from balloon_world.car import CameraFeed
 from balloon_world.simulated_arduino import REST_US
-from lab.arduino.emulator import NICE, EmulatedArduino
+from lab.arduino.emulator import NICE, REPOSITORY, EmulatedArduino
 from lab.driving.pins import most_throttle_us
 from lab.driving.policy import make_artifact, pictures
 from lab.pi.container import CAMERA, PORT, Container
 from lab.pi.debian_image import USER, debian_image
-from lab.pi.emulation import emulation, interruptible, require
+from lab.pi.emulation import emulation, require
 from rover_lib.onboard.artifact.manifest import content_hash
 from rover_lib.onboard.drive.flight_log import read_log
 from rover_lib.onboard.errors import RoverError
+from rover_lib.onboard.signal_event import signals
 from rover_lib.onboard.stage import sha256_of, write_stage
 
-REPOSITORY = Path(__file__).parents[2]
 MOST_S = 3600.0
 NO_KNOWN_HOSTS = "-o UserKnownHostsFile=/dev/null -o StrictHostKeyChecking=no -o LogLevel=ERROR"
 ROVER = "rover1"
@@ -57,7 +58,7 @@ def deploy_and_drive(output: Path, demo: Path, say: Callable[[str], None] = lamb
     require()
     output.parent.mkdir(parents=True, exist_ok=True)
     with (
-        interruptible(),
+        signals(signal.default_int_handler),  # whatever ends it, all is cleaned up as after ^C
         emulation(),
         tempfile.TemporaryDirectory(prefix="rover-plays-") as folder,  # ssh's sockets want a short path
         output.with_suffix(".log").open("w") as log,
@@ -175,12 +176,12 @@ class Deployment:
         self.board.pulses()  # drop what was before
         self.play("drive", rover_arm=True, rover_seconds=DRIVE_S)
         log = next(iter((self.folder / "fetched" / ROVER).rglob("flight.log")), None)
-        driven = sum(state == "A" for state in read_log(log).ticks["state"]) if log else 0
-        self.gate("ticks driven", f"at least {LEAST_TICKS}", driven, driven >= LEAST_TICKS)
+        ticks = sum(state == "A" for state in read_log(log).ticks["state"]) if log else 0
+        self.gate("ticks driven", f"at least {LEAST_TICKS}", ticks, ticks >= LEAST_TICKS)
         throttle_us = [e.pulse_us for e in self.board.pulses() if e.kind == "pulse" and e.pin == "throttle"]
         most_us = most_throttle_us()
-        moved = max(throttle_us, default=0.0) > most_us >= (throttle_us or [most_us + 1])[-1]
-        self.gate("throttle's pulses", "moved the car, and stopped it", throttle_us[-1:], moved)
+        is_moved = max(throttle_us, default=0.0) > most_us >= (throttle_us or [most_us + 1])[-1]
+        self.gate("throttle's pulses", "moved the car, and stopped it", throttle_us[-1:], is_moved)
 
 
 @contextlib.contextmanager
@@ -213,8 +214,8 @@ class Play:
     @property
     def changed(self) -> int:
         """How many tasks changed something, by Ansible's last lines; -1 if it did not get that far."""
-        found = re.findall(r" : ok=\d+ +changed=(\d+) ", self.output.partition("PLAY RECAP")[2])
-        return sum(map(int, found)) if found else -1
+        counts = re.findall(r" : ok=\d+ +changed=(\d+) ", self.output.partition("PLAY RECAP")[2])
+        return sum(map(int, counts)) if counts else -1
 
     @property
     def end(self) -> str:
@@ -229,12 +230,12 @@ def run_playbook(book: str, pi: Container, folder: Path, variables: Mapping[str,
     """
     program = Path(sys.executable).with_name("ansible-playbook")
     (folder / "inventory.ini").write_text(inventory(pi))
-    given = {"rover_command": str(program.with_name("rover")), **variables}
-    command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml", "-e", json.dumps(given)]
+    extra = {"rover_command": str(program.with_name("rover")), **variables}
+    command = [program, "-i", folder / "inventory.ini", REPOSITORY / "ansible" / f"{book}.yml", "-e", json.dumps(extra)]
     try:
-        how: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        how |= {"cwd": REPOSITORY, "env": _environment(folder), "errors": "replace", "timeout": MOST_S}
-        done = subprocess.run([str(word) for word in command], text=True, **how)
+        options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        options |= {"cwd": REPOSITORY, "env": _environment(folder), "errors": "replace", "timeout": MOST_S}
+        done = subprocess.run([str(word) for word in command], text=True, **options)
     except subprocess.TimeoutExpired:
         raise RoverError(f"{book}.yml took more than {MOST_S:g} s") from None
     return Play(done.returncode, done.stdout)
@@ -243,15 +244,15 @@ def run_playbook(book: str, pi: Container, folder: Path, variables: Mapping[str,
 def inventory(pi: Container) -> str:
     """Return the repository's inventory.ini with this rover instead of its own."""
     text = (REPOSITORY / "inventory.ini").read_text()
-    where = f"ansible_host=127.0.0.1 ansible_port={pi.port} ansible_ssh_private_key_file={pi.key}"
-    text = re.sub("(?m)^rover1 .*", f"{pi.name} {where}", text)
+    address = f"ansible_host=127.0.0.1 ansible_port={pi.port} ansible_ssh_private_key_file={pi.key}"
+    text = re.sub("(?m)^rover1 .*", f"{pi.name} {address}", text)
     return f"{text}\nansible_user={USER}\nansible_ssh_extra_args={NO_KNOWN_HOSTS}\n"
 
 
 def _environment(folder: Path) -> dict[str, str]:
     """Return Ansible's environment: without the user's own settings for it, and with its files in the folder."""
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("ANSIBLE")}
+    inherited = {key: value for key, value in os.environ.items() if not key.startswith("ANSIBLE")}
     own = {"ANSIBLE_HOME": str(folder), "ANSIBLE_NOCOLOR": "1", "ANSIBLE_LOCAL_TEMP": str(folder / "local")}
     own["PWD"] = str(REPOSITORY)  # below which the playbooks put wheels and logs
     own["ANSIBLE_TIMEOUT"] = "120"  # sudo, emulated on a busy machine, took more than the usual 10 s
-    return {**kept, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
+    return {**inherited, **own, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}

@@ -11,7 +11,6 @@ from pathlib import Path
 from lab.arduino import emulator as arduino
 from lab.debian import install_packages, missing_packages
 from rover_lib.onboard.errors import RoverError
-from rover_lib.onboard.signal_event import signals
 from rover_lib.workshop.run_program import run
 
 NEEDS = {  # commands, each with its Debian package
@@ -35,17 +34,6 @@ def require() -> None:
     if os.geteuid() != 0:
         raise RoverError("an emulated Pi mounts file systems and starts a container", remedy="use sudo")
     install_packages(missing_packages(NEEDS | arduino.NEEDS), "an emulated Pi")
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block as ^C does, so that everything in it is cleaned up."""
-
-    def on_signal(number: int, frame: object) -> None:
-        raise KeyboardInterrupt(signal.Signals(number).name)
-
-    with signals(on_signal):
-        yield
 
 
 @contextlib.contextmanager

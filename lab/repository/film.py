@@ -86,11 +86,10 @@ def write_film(path: Path, run_dir: Path, benchmark: Path) -> None:
     for worlds in zip(*(pictures_of(m, timed[m]["latency_p50_ms"] / 1e3, run_dir) for m in MODES), strict=True):
         count = max(map(len, worlds)) + HELD
         both = [pictures + [pictures[-1]] * (count - len(pictures)) for pictures in worlds]
-        frames += [Image.fromarray(np.concatenate(beside, axis=1)) for beside in zip(*both, strict=True)]
-    first, *others = frames
-    how = {"save_all": True, "duration": round(1000 * EVERY / RATE_HZ), "loop": 0, "quality": 60, "method": 4}
+        frames += [Image.fromarray(np.concatenate(pair, axis=1)) for pair in zip(*both, strict=True)]
+    options = {"save_all": True, "duration": round(1000 * EVERY / RATE_HZ), "loop": 0, "quality": 60, "method": 4}
     with atomic_path(path) as temporary:
-        first.save(temporary, "webp", append_images=others, xmp=source_of(benchmark).encode(), **how)
+        frames[0].save(temporary, "webp", append_images=frames[1:], xmp=source_of(benchmark).encode(), **options)
 
 
 if __name__ == "__main__":

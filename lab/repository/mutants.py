@@ -20,10 +20,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 import yaml
@@ -32,7 +31,7 @@ from lab.arduino.emulator import REPOSITORY
 from rover_lib.onboard.errors import RoverError
 from rover_lib.workshop.run_program import run
 
-RANDOM_DRIVES = 2000
+SEED, RANDOM_DRIVES = 1, 2000
 NOTICED = 3  # the exit code of random drives of which one breaks an invariant
 DRIVE = f"""
 from lab.driving.random_drives import random_drives
@@ -67,6 +66,7 @@ class Slip:
     line: int
     operator: str
     occurrence: int
+    random = False  # whether random drives must notice it
 
     def plant(self, good: str) -> str:
         """Return the file's text with the slip in it."""
@@ -74,47 +74,47 @@ class Slip:
 
         return mutating.mutate_code(good, plugins.get_operator(self.operator)(), self.occurrence) or good
 
-    def told(self, good: str) -> str:
+    def name_in(self, good: str) -> str:
         """Say what becomes of the line."""
         before, after = (text.splitlines()[self.line - 1].strip() for text in (good, self.plant(good)))
         return f"{self.file}:{self.line}: {before}  ->  {after}"
+
+    def runs(self) -> list[tuple[str, ...]]:
+        """Return pytest's options for each run of tests that may notice it, slow tests last."""
+        stages = tests_of(self.file)
+        return [(*ENDLESS, "-m", FAST, *tests) for tests in stages] + [("-m", SLOW, *tests) for tests in stages]
 
 
 def slips_in(file: str) -> list[Slip]:
     """Return all slips that may be planted in a file."""
     from cosmic_ray import ast, plugins
 
-    nodes, found = list(ast.ast_nodes(ast.get_ast((REPOSITORY / file).read_text()))), []
+    nodes = list(ast.ast_nodes(ast.get_ast((REPOSITORY / file).read_text())))
+    slips = []
     for name in filter(SLIPS.fullmatch, plugins.operator_names()):
         operator = plugins.get_operator(name)()
         lines = [start[0] for node in nodes for start, _ in operator.mutation_positions(node)]
-        found += [Slip(file, line, name, occurrence) for occurrence, line in enumerate(lines)]
-    return found
+        slips += [Slip(file, line, name, occurrence) for occurrence, line in enumerate(lines)]
+    return slips
 
 
-def draw_slips(count: int, seed: int) -> list[Slip]:
+def draw_slips(count: int) -> list[Slip]:
     """Draw slips, files in proportion to their lines, one on a line. The first of a longer draw are the same."""
     paths = [path for room in ROOMS for path in sorted((REPOSITORY / room).rglob("*.py")) or [REPOSITORY / room]]
     files = [path.relative_to(REPOSITORY).as_posix() for path in paths]
     sizes = [len(path.read_text().splitlines()) for path in paths]
-    there = {file: slips_in(file) for file in files}
-    chance, drawn = random.Random(seed), dict[tuple[str, int], Slip]()
+    slips = {file: slips_in(file) for file in files}
+    chance = random.Random(SEED)
+    drawn: dict[tuple[str, int], Slip] = {}
     while len(drawn) < count:
         (file,) = chance.choices(files, sizes)
-        if lines := sorted({slip.line for slip in there[file]}):
+        if lines := sorted({slip.line for slip in slips[file]}):
             line = chance.choice(lines)
-            slip = chance.choice([slip for slip in there[file] if slip.line == line])
-            if _compiles(slip.plant((REPOSITORY / file).read_text())):
+            slip = chance.choice([slip for slip in slips[file] if slip.line == line])
+            with suppress(SyntaxError):
+                compile(slip.plant((REPOSITORY / file).read_text()), "a slip", "exec")
                 drawn.setdefault((file, line), slip)
     return list(drawn.values())
-
-
-def _compiles(text: str) -> bool:
-    try:
-        compile(text, "a slip", "exec")
-    except SyntaxError:
-        return False
-    return True
 
 
 def tests_of(file: str) -> list[list[str]]:
@@ -148,27 +148,41 @@ class Mutant:
     words: str
     random: bool = False
 
+    def plant(self, good: str) -> str:
+        """Return the file's text with the broken line. Raises RoverError unless the line is there once."""
+        if (count := good.count(self.good)) != 1:
+            raise RoverError(f"{self.file}: {self.good!r} is there {count} times", remedy=f"mend {self.name!r}")
+        return good.replace(self.good, self.bad)
+
+    def name_in(self, good: str) -> str:
+        """Return its name."""
+        return self.name
+
+    def runs(self) -> list[tuple[str, ...]]:
+        """Return pytest's options for the tests that must notice it."""
+        return [("-k", self.words, self.test)]
+
 
 def read_mutants() -> list[Mutant]:
     """Read the table of mutants."""
     return [Mutant(**row) for row in yaml.safe_load((HERE / "planted.yml").read_text())]
 
 
-def make_copy(folder: Path) -> None:
-    """Copy the repository's files, those that git does not know yet too, into a folder."""
+@contextmanager
+def broken_copy(file: str, change: Callable[[str], str]) -> Iterator[Path]:
+    """Yield a copy of the repository's files, those that git does not know yet too, in which a file is changed."""
     listed = run("git", "-C", REPOSITORY, "ls-files", "-co", "--exclude-standard", error=RoverError)
-    for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(REPOSITORY / name, folder / name)
+    with tempfile.TemporaryDirectory(prefix="rover-mutant-") as scratch:
+        folder = Path(scratch)
+        for name in filter(lambda name: (REPOSITORY / name).is_file(), listed.splitlines()):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(REPOSITORY / name, folder / name)
+        (folder / file).write_text(change((folder / file).read_text()))
+        yield folder
 
 
-def exit_code(folder: Path, *arguments: str) -> int:
-    """Run Python in a copy; return its exit code, 1 if it hangs. Raises RoverError if C cannot be compiled."""
-    return _outcome(folder, *arguments)[0]
-
-
-def _outcome(folder: Path, *arguments: str) -> tuple[int, str]:
-    """Run Python in a copy; return its exit code and what it printed."""
+def run_python(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Run Python in a copy; return its exit code, 1 if it hangs, and its output. RoverError if C cannot be compiled."""
     env = {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "ROVER_CACHE": str(folder / ".cache")}
     options: dict[str, Any] = {"cwd": folder, "env": os.environ | env, "capture_output": True, "timeout": HANGS_S}
     try:
@@ -180,109 +194,46 @@ def _outcome(folder: Path, *arguments: str) -> tuple[int, str]:
     return done.returncode, printed
 
 
-class Copies:
-    """Copies of the repository, one for each job, in which lines are broken."""
+def try_mutants(mutants: Sequence[Slip | Mutant], jobs: int, say: Callable[[str], None]) -> tuple[int, list[str]]:
+    """Plant each mutant in a copy and see whether a test fails; return how many were caught, and what survived.
 
-    def __init__(self, scratch: Path, jobs: int):
-        self._free: Queue[Path] = Queue()
-        for job in range(jobs):
-            make_copy(scratch / str(job))
-            self._free.put(scratch / str(job))
-
-    @contextmanager
-    def broken(self, file: str, change: Callable[[str], str]) -> Iterator[Path]:
-        """Yield a copy in which a file is changed."""
-        copy = self._free.get()
-        path = copy / file
-        good = path.read_text()
-        try:
-            path.write_text(change(good))
-            yield copy
-        finally:
-            path.write_text(good)
-            self._free.put(copy)
-
-
-def try_slips(slips: Sequence[Slip], jobs: int, slow: bool, say: Callable[[str], None]) -> dict[str, Any]:
-    """Plant each slip and see whether a test fails. Returns how many were caught, and what survived.
-
-    slow: run the room's slow tests too, on what the others did not notice. Raises RoverError if a test that failed
-    fails without slips too. A survivor that survivors.yml gives a reason is not counted.
+    say: called with a line for each. What survivors.yml gives a reason for is not counted. A mutant that random drives
+    must notice survives if they do not. Raises RoverError if a mutant's line is not there, or if a test that failed
+    fails without mutants too.
     """
-    reasons = {row["slip"]: row["why"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
-    with tempfile.TemporaryDirectory(prefix="rover-slips-") as scratch, ThreadPoolExecutor(jobs) as pool:
-        copies = Copies(Path(scratch), jobs)
+    reasons = {row["slip"] for row in yaml.safe_load((HERE / "survivors.yml").read_text()) or []}
 
-        def attempt(slip: Slip) -> str | None:
-            begin_s, stages = time.monotonic(), tests_of(slip.file)
-            runs = [(FAST, tests) for tests in stages]
-            if slow:
-                runs += [(SLOW, tests) for tests in stages]
-            with copies.broken(slip.file, slip.plant) as copy:
-                failed = next(filter(None, (_failed(copy, marks, tests) for marks, tests in runs)), None)
-            told = slip.told((REPOSITORY / slip.file).read_text())
-            outcome = f"caught by {failed}" if failed else "has a reason" if _key(told) in reasons else "SURVIVED"
-            say(f"{outcome}: {told} ({time.monotonic() - begin_s:.0f} s)")
-            return failed
+    def attempt(mutant: Slip | Mutant) -> tuple[str, str | None]:
+        begin_s = time.monotonic()
+        with broken_copy(mutant.file, mutant.plant) as copy:
+            failed = next(filter(None, (_failed(copy, options) for options in mutant.runs())), None)
+            unnoticed = failed and mutant.random and run_python(copy, "-c", DRIVE)[0] != NOTICED
+        name = mutant.name_in((REPOSITORY / mutant.file).read_text())
+        outcome = f"caught by {failed}" if failed else "SURVIVED"
+        outcome = "NOT noticed by random drives" if unnoticed else outcome
+        say(f"{outcome}: {name} ({time.monotonic() - begin_s:.0f} s)")
+        return name, None if unnoticed else failed
 
-        failed = list(pool.map(attempt, slips))
-        with copies.broken(slips[0].file, str) as copy:
-            named = sorted({name for name in failed if name})
-            for options, tests in (
-                ((), [name for name in named if "::" in name]),
-                (("--collect-only",), [name for name in named if "::" not in name]),  # could not be imported, or hung
-            ):
-                if tests and exit_code(copy, *PYTEST, *options, *tests):
-                    raise RoverError("tests fail without slips too", found=" ".join(tests), remedy="run make test-fast")
-    told = [slip.told((REPOSITORY / slip.file).read_text()) for slip, f in zip(slips, failed, strict=True) if not f]
-    survived = [text for text in told if _key(text) not in reasons]
-    caught = len(slips) - len(told)
-    return {"slips": len(slips), "caught_pct": 100 * caught / max(caught + len(survived), 1), "survived": survived}
+    with ThreadPoolExecutor(jobs) as pool:
+        outcomes = list(pool.map(attempt, mutants))
+    names = sorted({failed for _, failed in outcomes if failed})
+    with broken_copy(mutants[0].file, str) as copy:
+        for options, tests in (
+            ((), [name for name in names if "::" in name]),
+            (("--collect-only",), [name for name in names if "::" not in name]),  # could not be imported, or hung
+        ):
+            if tests and run_python(copy, *PYTEST, *options, *tests)[0]:
+                raise RoverError("tests fail without mutants too", found=" ".join(tests), remedy="make test-fast")
+    survived = [name for name, failed in outcomes if not failed]
+    caught = len(outcomes) - len(survived)
+    # In survivors.yml a line has no number, which changes.
+    return caught, [name for name in survived if re.sub(r":\d+:", ":", name, count=1) not in reasons]
 
 
-def _failed(copy: Path, marks: str, tests: Sequence[str]) -> str | None:
-    """Return the first of these tests that fails in a copy, their first file if it names none, or None."""
-    code, printed = _outcome(copy, *PYTEST, *(ENDLESS if marks == FAST else ()), "-m", marks, *tests)
-    if code in (0, 5):
+def _failed(copy: Path, options: Sequence[str]) -> str | None:
+    """Return the first test of such a run that fails in a copy, the run's last file if it names none, or None."""
+    code, printed = run_python(copy, *PYTEST, *options)
+    if code in (0, 5):  # 5: no test has that name
         return None
-    found = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", printed, re.MULTILINE)
-    return found[1] if found else tests[0]
-
-
-def _key(told: str) -> str:
-    """Return what survivors.yml calls a slip: without its line's number, which changes."""
-    return re.sub(r":\d+:", ":", told, count=1)
-
-
-def try_mutants(
-    mutants: Sequence[Mutant], jobs: int, drives: bool, say: Callable[[str], None]
-) -> dict[str, int | list[str]]:
-    """Plant each mutant and see whether its test fails, and with `drives` whether random drives notice it.
-
-    say: called with a line for each. Returns how many there were, who survived, and how many random drives noticed.
-    Raises RoverError if a mutant's line is not there, or if a named test does not pass without mutants.
-    """
-    for mutant in mutants:
-        if (count := (REPOSITORY / mutant.file).read_text().count(mutant.good)) != 1:
-            raise RoverError(f"{mutant.file}: {mutant.good!r} is there {count} times", remedy=f"mend {mutant.name!r}")
-    with tempfile.TemporaryDirectory(prefix="rover-mutants-") as scratch, ThreadPoolExecutor(jobs) as pool:
-        copies = Copies(Path(scratch), jobs)
-        words = " or ".join(sorted({m.words for m in mutants}))
-        with copies.broken(mutants[0].file, str) as copy:
-            if exit_code(copy, *PYTEST, "-k", words, *sorted({m.test for m in mutants})):
-                raise RoverError("the named tests fail without mutants", remedy="run them")
-
-        def attempt(mutant: Mutant) -> tuple[bool, bool | None]:
-            begin_s = time.monotonic()
-            with copies.broken(mutant.file, lambda good: good.replace(mutant.good, mutant.bad)) as copy:
-                caught = exit_code(copy, *PYTEST, "-k", mutant.words, mutant.test) == 1  # 5: no test has that name
-                noticed = exit_code(copy, "-c", DRIVE) == NOTICED if drives and mutant.random else None
-            by_drives = {None: "", True: ", noticed by random drives", False: ", NOT noticed by random drives"}[noticed]
-            seconds = time.monotonic() - begin_s
-            say(f"{'caught' if caught else 'SURVIVED'}{by_drives}: {mutant.name} ({seconds:.0f} s)")
-            return caught, noticed
-
-        outcomes = dict(zip([m.name for m in mutants], pool.map(attempt, mutants), strict=True))
-    survived = [name for name, (caught, noticed) in outcomes.items() if not caught or noticed is False]
-    noticed = sum(noticed is True for _, noticed in outcomes.values())
-    return {"mutants": len(outcomes), "survived": survived, "noticed_by_random_drives": noticed}
+    match = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", printed, re.MULTILINE)
+    return match[1] if match else options[-1]

@@ -68,11 +68,11 @@ def _demo(root: Path) -> list[Row]:
         modes.pop("mixed", None)
 
     def row(mode: str) -> Row:
-        found = modes[mode]
-        errors = [f"{found[f'{action}_mae_pct']:.2f}" for action in ("steering", "throttle") if mode != "fp32"]
-        hits = f"{found['hits']} of {found['trials']}"
+        metrics = modes[mode]
+        errors = [f"{metrics[f'{action}_mae_pct']:.2f}" for action in ("steering", "throttle") if mode != "fp32"]
+        hits = f"{metrics['hits']} of {metrics['trials']}"
         faster = f"{timed['fp32']['latency_p50_ms'] / timed[mode]['latency_p50_ms']:.1f}"
-        fields = (f"{found['size_mb']:.1f}", hits, " / ".join(errors), faster)
+        fields = (f"{metrics['size_mb']:.1f}", hits, " / ".join(errors), faster)
         return EXPLAINED[mode], *(f"**{field}**" if mode == BEST else field for field in fields)
 
     return [("", "MB", "balloons hit", "error, %", "times faster"), *(row(mode) for mode in EXPLAINED if mode in modes)]
@@ -100,8 +100,7 @@ def _faults(root: Path) -> list[Row]:
 
 def _drives(root: Path) -> list[Row]:
     """Hits of the demo's policy when its plans are late, and when the car is pushed."""
-    driven = _metrics(root / "results" / "demo", "drive")["rows"]
-    rows = [r for r in driven if r["compensate"] and r["hits"]]
+    rows = [r for r in _metrics(root / "results" / "demo", "drive")["rows"] if r["compensate"] and r["hits"]]
     alone, pushed = ({r["latency_ms"]: r for r in rows if bool(r["pushes"]) == way} for way in (False, True))
     latencies = sorted(alone.keys() & pushed.keys())
     trials = rows[0]["trials"]
@@ -120,11 +119,11 @@ def _cars(root: Path) -> list[Row]:
     for place, car in _metrics(root / "results" / "real", "cars")["cars"].items():
         if "r2" not in car:
             continue
-        seen = f"{car['r2']['0.5']:.2f} / {car['cnn_r2']['0.5']:.2f}"
+        r2 = f"{car['r2']['0.5']:.2f} / {car['cnn_r2']['0.5']:.2f}"
         off = f"{car['off_pct'][0]:.1f} ({car['blind_pct'][0]:.1f})"
         static = f"{max(car['static_pct']):.2f} / {car['static_ms'][0]:.0f}"
         verdict = "ready" if car["ready"] else "not ready"
-        rows.append((f"{place}, {car['camera']}", f"{car['pictures']:,}", seen, off, static, verdict))
+        rows.append((f"{place}, {car['camera']}", f"{car['pictures']:,}", r2, off, static, verdict))
     return rows
 
 
@@ -135,9 +134,9 @@ def _learning(root: Path) -> list[Row]:
 
     def row(policy: Mapping[str, Any]) -> Row:
         name = policy["arm"] + (f", round {policy['round']}" if policy["round"] else "")
-        return (name, f"{policy['human_s']:.0f}", *(str(policy[how]["hits"]) for how in conditions))
+        return (name, f"{policy['human_s']:.0f}", *(str(policy[condition]["hits"]) for condition in conditions))
 
-    hits = (f"{HOW[how]}: hits of {trials}" for how, trials in conditions.items())
+    hits = (f"{HOW[condition]}: hits of {trials}" for condition, trials in conditions.items())
     return [("policy", "seconds by a human", *hits), *map(row, policies)]
 
 
@@ -145,9 +144,9 @@ def _judging(root: Path) -> list[Row]:
     """How well each measure tells the versions of policies that lose worlds from the others, the best first."""
     measures = _metrics(root / "results" / "lab", "judging")["measures"]
     rows: list[Row] = [("error", "area", "least of losers", "others above")]
-    for name, found in sorted(measures.items(), key=lambda item: -item[1]["auc"]):
+    for name, measure in sorted(measures.items(), key=lambda item: -item[1]["auc"]):
         words = name.replace("_ms", ", ms").replace("_pct", ", %").replace("_", " ")
-        rows.append((words, f"{found['auc']:.2f}", f"{found['least_of_losers']:.3g}", str(found["refused"])))
+        rows.append((words, f"{measure['auc']:.2f}", f"{measure['least_of_losers']:.3g}", str(measure["refused"])))
     return rows
 
 

@@ -51,8 +51,8 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
     for target, text in texts.items():
         if len(text) > LIMIT:
             raise RoverError(f"{target.name}: {len(text) / 1e6:.1f} MB of at most 1", remedy="draw or tell less")
-        if shown := ABSOLUTE.search(text):
-            around = text[max(shown.start() - 40, 0) : shown.end() + 40]
+        if path_shown := ABSOLUTE.search(text):
+            around = text[max(path_shown.start() - 40, 0) : path_shown.end() + 40]
             raise RoverError(f"{target.name}: shows a path of this machine", found=around, remedy="write names only")
     for target, text in texts.items():
         with atomic_path(target) as temporary:
@@ -67,10 +67,10 @@ def publish_all(runs_dir: Path | str = "runs", notebooks_dir: Path | str = NOTEB
 
 def store_picture(figure: Path, target: Path, shown: Path) -> None:
     """Store a run's figure in 256 colours, which says what JSON it shows."""
-    about = PngInfo()
-    about.add_text("Source", source_of(shown))
+    info = PngInfo()
+    info.add_text("Source", source_of(shown))
     with Image.open(figure) as drawn, atomic_path(target) as temporary:
-        drawn.convert("RGB").quantize(256).save(temporary, "png", optimize=True, pnginfo=about)
+        drawn.convert("RGB").quantize(256).save(temporary, "png", optimize=True, pnginfo=info)
 
 
 def source_of(shown: Path) -> str:
@@ -95,8 +95,8 @@ def with_outputs(source: Any, executed: Any, name: str) -> str:
     for cell in source.cells:
         if cell.cell_type != "code":
             continue
-        turned = "parameters" in cell.metadata.get("tags", [])  # a run writes its own values there
-        if cell.id not in ran or (ran[cell.id].source != cell.source and not turned):
+        is_parameters = "parameters" in cell.metadata.get("tags", [])  # a run writes its own values there
+        if cell.id not in ran or (ran[cell.id].source != cell.source and not is_parameters):
             raise RoverError(f"{name}: cell '{cell.id}' is not what was executed", remedy="execute the run again")
         cell.outputs = [_plain(output) for output in ran[cell.id].outputs if output.get("name") != "stderr"]
         cell.execution_count = None
@@ -111,7 +111,7 @@ def _plain(output: Any) -> Any:
     if picture := output.get("data", {}).get("image/png"):
         output.data = {"image/png": picture}  # without "<Figure size ...>"
     if "metadata" in output:
-        output.metadata = {kind: how for kind, how in output.metadata.items() if kind == "image/png"}  # its size
+        output.metadata = {kind: size for kind, size in output.metadata.items() if kind == "image/png"}  # its size
     return output
 
 
@@ -119,9 +119,8 @@ def result(path: Path) -> str:
     """Return a stage's JSON as it is committed: names instead of paths, and numbers of DIGITS digits."""
     content = _shorter(json.loads(path.read_text()))
     if len(inputs := content.get("inputs", {})) > MANY_INPUTS:
-        content["inputs"] = {
-            f"{len(inputs)} files": hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
-        }
+        together = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+        content["inputs"] = {f"{len(inputs)} files": together}
     return json.dumps(content, indent=1) + "\n"
 
 

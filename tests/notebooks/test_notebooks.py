@@ -2,7 +2,11 @@
 
 import ast
 import json
+import os
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import nbformat
 import pytest
@@ -199,3 +203,17 @@ def test_each_parameter_that_is_turned_is_seen_in_the_json(turned):
     assert (found["frames"], found["fp32"]["trials"], set(found["modes"])) == (4, 1, {"static", "mixed"})
     assert timed["params"]["threads"] == 1 and timed["metrics"]["artifacts"]["static"]["n"] == 3
     assert run_report.write(turned)["metrics"]["modes"]
+
+
+@pytest.mark.release  # a minute
+def test_papermill_turns_a_parameter_as_the_page_types_it(demo_run, tmp_path):
+    shutil.copytree(demo_run, tmp_path / "try1", ignore=shutil.ignore_patterns("episodes", "*.pth"))
+    there = {"runs/try1": str(tmp_path / "try1"), "out.ipynb": str(tmp_path / "out.ipynb")}
+    page = (NOTEBOOKS.parent / "docs" / "notebooks.md").read_text()
+    (line,) = (line.strip() for line in page.splitlines() if line.startswith("    papermill "))
+    words = [there.get(word, word) for word in line.split()]
+    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    subprocess.run([*words, "-p", "held_out_frames", "8"], cwd=NOTEBOOKS.parent, env=env, check=True)
+    compared = json.loads((tmp_path / "try1" / "compare.json").read_text())
+    assert compared["metrics"]["fp32"]["trials"] == 10
+    assert (tmp_path / "out.ipynb").is_file()

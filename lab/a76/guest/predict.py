@@ -39,10 +39,10 @@ def predict_all(policy: Policy, observations: str, counted: int) -> np.ndarray:
     Reading a frame is not counted.
     """
     chunks = []
-    with np.load(observations) as seen:
-        states = seen["state"]
+    with np.load(observations) as arrays:
+        states = arrays["state"]
         for i in range(max(len(states), counted)):
-            state, frame = states[i % len(states)], seen[f"frame_{i % len(states):04d}"]
+            state, frame = states[i % len(states)], arrays[f"frame_{i % len(states):04d}"]
             print("predict", flush=True)
             if i < counted:
                 mark(True, i + 1)

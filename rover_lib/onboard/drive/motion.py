@@ -12,7 +12,7 @@ GAP_S = 0.25  # at most this is counted for a picture: nobody knows what the car
 BLOCKS = 80, 60  # across and down: a JPEG's, of 8 pixels, in a picture of 640x480
 ACROSS, DOWN = 2, 3  # blocks of a half in a cell
 # How far two pictures differ, of a mean of 100, if the car has moved between them. Those of a standing car differ by up
-# to 2 in the dark and under lamps that flicker by a fifth, those of a driving one by more than 5 within half a second
+# to 2 in the dark and under lamps that flicker by a fifth, those of a driving one by more than 3 within half a second
 # (results/lab/stuck.json).
 MOVED = 2.5
 
