@@ -47,22 +47,25 @@ class _Unseen(CarRacing):  # type: ignore[misc]
 class Track:
     """One drive along a track. seed: determines it, and the pulls at its wheel. `score` is in metres."""
 
-    def __init__(self, seed: int, shoves: int = 0):
+    def __init__(self, seed: int, shoves: int = 0, timeout_s: float = TIMEOUT_S):
         self._env: Any = _Unseen(lap_complete_percent=1.0)
         self._env.reset(seed=seed)
         self._line = np.array([(x, y) for _, _, x, y in self._env.track])
         self._angles = np.unwrap([beta for _, beta, _, _ in self._env.track])
         self._quads = np.array([quad for quad, _ in self._env.road_poly])
         self._colours = [tuple(float(c) for c in colour) for _, colour in self._env.road_poly]
-        self._ticks = RATE_HZ * TIMEOUT_S
+        self._ticks = RATE_HZ * timeout_s
         rng = np.random.default_rng([seed, 25])
         self._shoves = {int(t): rng.choice([-1, 1]) for t in rng.uniform(20, self._ticks, shoves)}
-        self._env.car.destroy()  # the environment's own has already moved
+        self.restart()
+
+    def restart(self) -> "Track":
+        """Put the car on the start again."""
+        if self._env.car:
+            self._env.car.destroy()
         self._env.car = Car(self._env.world, *self._env.track[0][1:4])
-        self._at = 0
-        self.score = 0.0
-        self.ticks = 0
-        self.done = False
+        self._at, self.score, self.ticks, self.done = 0, 0.0, 0, False
+        return self
 
     def _seen(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) metres to the car's right and ahead of it."""
