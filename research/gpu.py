@@ -17,6 +17,7 @@ import torch
 
 from balloon_world.record import record_episodes
 from rover_learn import train as training
+from rover_learn.act_phases import Overrides
 from rover_learn.train import SIZES, train
 from rover_learn.training import Machine, Resumable
 from rover_lib.onboard.cli import FILE
@@ -74,12 +75,12 @@ def time_phases(run: Run, machine: Machine, row: dict[str, Any]) -> list[str]:
 
 def compare_weights(run: Run, _machine: Machine, row: dict[str, Any]) -> list[str]:
     """Train REPEATED_STEPS twice, the second time interrupted inside each phase, after it was saved."""
-    once, resumed = run("once", steps=REPEATED_STEPS), dict[str, int]()
+    once, resumed = run("once", overrides=Overrides(REPEATED_STEPS)), dict[str, int]()
     with patch.object(training, "Resumable", partial(Resumable, every_s=0.0)):
         for phase in (*STOPPED_IN, ""):
             bars = Bars(phase)
             with suppress(SystemExit):
-                twice = run("twice", steps=REPEATED_STEPS, progress=bars)
+                twice = run("twice", overrides=Overrides(REPEATED_STEPS), progress=bars)
             resumed |= bars.resumed
     differ = sum(not torch.equal(value, twice[name]) for name, value in once.items())
     row |= {"tensors": len(once), "differ": differ, "resumed_at": resumed}

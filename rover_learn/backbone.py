@@ -63,8 +63,8 @@ class Pretrained:
         try:
             content = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # whatever another file makes torch say
-            what = f"{file}: not a file of weights that torch can read"
-            raise TrainingError(what, found=type(error).__name__, remedy="save resnet18's state_dict()") from error
+            problem = f"{file}: not a file of weights that torch can read"
+            raise TrainingError(problem, found=type(error).__name__, remedy="save resnet18's state_dict()") from error
         return cls(_of_backbone(content, str(file)), {"backbone": file.name, "backbone_sha256": sha256_of(file)})
 
 
@@ -75,11 +75,9 @@ def _of_backbone(content: Any, where: str) -> dict[str, Tensor]:
     for name, shape in expected.items():
         value = entries.get(name)
         if not isinstance(value, Tensor) or value.shape != shape:
-            found = list(value.shape) if isinstance(value, Tensor) else sorted(map(str, entries))[:3] or None
-            remedy = "save the state_dict() of torchvision's resnet18"
-            raise TrainingError(
-                f"{where}: not ResNet18's weights: {name} is missing or differs", found=found, remedy=remedy
-            )
+            actual = list(value.shape) if isinstance(value, Tensor) else sorted(map(str, entries))[:3] or None
+            problem = f"{where}: not ResNet18's weights: {name} is missing or differs"
+            raise TrainingError(problem, found=actual, remedy="save the state_dict() of torchvision's resnet18")
         if not torch.isfinite(value).all():
             raise TrainingError(f"{where}: {name} has values that are not finite", remedy="take another file")
     return {name: entries[name] for name in expected}

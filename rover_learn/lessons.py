@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from rover_learn import training
 from rover_learn.augment import GAIN
-from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, Frames, Given, Resumable, RowFile
+from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, FeatureInput, Frames, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ActConfig, Affine, lerobot_act
@@ -54,7 +54,7 @@ class BatchedPolicy(nn.Module):
         acting = {name: weight for name, weight in weights.items() if not name.startswith("vae_")}
         self.model = lerobot_act(replace(config, vae_layers=0), acting).model
         self.backbone = self.model.backbone
-        self.model.backbone = Given()
+        self.model.backbone = FeatureInput()
         self.eval()
         norms = {"image": config.image_norm[0], "state": config.state_norm, "action": config.action_unnorm}
         for name, norm in norms.items():
@@ -112,13 +112,13 @@ def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progres
 class Lessons:
     """n samples, each seen in two views: a file has a row for each sample, or the row 2 * sample + view.
 
-    asked: (2 n, 2) float32, the states with which the teacher plans. frames: for each sample, (height, width, 3) uint8
+    teacher_states: (2 n, 2) float32 with which the teacher plans. frames: for each sample, (height, width, 3) uint8
     RGB at the student's size, not mirrored. maps: for each view, (D, h, w) float16, the teacher's feature map pooled to
     the student's grid. plans: for each view, (C, A) float32, the teacher's. tokens: as maps, the student's own.
     """
 
     data: Frames
-    asked: np.ndarray
+    teacher_states: np.ndarray
     frames: RowFile
     maps: RowFile
     plans: RowFile
@@ -171,7 +171,7 @@ class Lessons:
         """
         both = 2 * rows + views
         mirror = np.where((views == MIRRORED)[:, None], MIRROR, 1).astype(np.float32)
-        states = self.asked[both]
+        states = self.teacher_states[both]
         if new:
             states = self.data.states[rows] * mirror
             states[:, 0] *= rng.uniform(*FADED, len(rows))
@@ -199,7 +199,7 @@ class Lessons:
             rows = blocks[block]
             self.frames.append(own)
             features = policy.features(_in_both_views(teachers, device))
-            states = torch.from_numpy(self.asked[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
+            states = torch.from_numpy(self.teacher_states[2 * rows[0] : 2 * rows[-1] + 2]).to(device)
             self.maps.append(F.adaptive_avg_pool2d(features, grid).half().cpu())
             self.plans.append(policy.plan(features, states).cpu())
 

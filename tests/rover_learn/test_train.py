@@ -13,6 +13,7 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from rover_learn import act_phases
 from rover_learn import train as train_module
 from rover_learn import training as training_module
+from rover_learn.act_phases import Overrides
 from rover_learn.backbone import IMAGENET, Pretrained
 from rover_learn.train import SIZES, train
 from rover_learn.training import Machine
@@ -124,7 +125,9 @@ def test_what_a_lost_gpu_began_goes_on_or_is_said_to_begin_anew(
     assert ["begins anew" in words for words in said] == [False, False, True][: 2 + anew]
 
 
-@pytest.mark.parametrize("wrong", [{"size": "huge"}, {"device": "tpu"}, {"steps": 0}, {"seed": -1}, {"episodes": "."}])
+@pytest.mark.parametrize(
+    "wrong", [{"size": "huge"}, {"device": "tpu"}, {"overrides": Overrides(0)}, {"seed": -1}, {"episodes": "."}]
+)
 def test_what_cannot_be_trained_is_refused(drives, tmp_path, wrong, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RoverError):

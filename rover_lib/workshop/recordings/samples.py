@@ -267,6 +267,11 @@ def following(actions: np.ndarray, chunk: int) -> tuple[np.ndarray, np.ndarray]:
     return actions[np.minimum(index, n - 1)], index >= n
 
 
+def stack_chunks(samples: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return what was done at n samples, (n, C, A), and which of its steps are padding, (n, C) bool."""
+    return np.stack([s.chunk for s in samples]), np.stack([s.is_pad for s in samples])
+
+
 def pick_evenly(samples: Sequence[Any], at_most: int) -> tuple[Any, ...]:
     """Return at most `at_most` of the samples, evenly spaced, first and last among them."""
     if len(samples) <= at_most:
