@@ -49,6 +49,7 @@ from rover_lib.workshop.recordings.samples import (
     frame_rate_hz,
     is_another_rate,
     pick_evenly,
+    stack_chunks,
 )
 from rover_lib.workshop.recordings.source import Source
 
@@ -162,7 +163,9 @@ def _open(
 def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Material:
     """Split the old and the new episodes into those to learn from and those that judge."""
     old = [e for e in read[0].episodes if not e.by_policy]
-    new = [(r, e) for r in read for e in r.episodes if r is not read[0] or e.by_policy]
+    new = [(read[0], e) for e in read[0].episodes if e.by_policy]
+    for recordings in read[1:]:
+        new += [(recordings, e) for e in recordings.episodes]
     corrected = [(r, e) for r, e in new if any(s.driver == HUMAN for s in e.samples)]
     if not corrected:
         remedy = "give the new recordings after the old ones, with drives in which a human took over"
@@ -273,11 +276,10 @@ class Finetuning(Work):
         candidates = {when: self.machine.taking(BatchedPolicy(self.config, state)) for when, state in policies.items()}
         for name, kind, samples_of in self.progress(held_out, desc="judging", total=len(held_out)):
             samples = pick_evenly(samples_of, self.recipe.judged_frames)
-            present = ~np.stack([s.is_pad for s in samples])
-            actions = np.stack([s.chunk for s in samples])
+            chunks, is_pad = stack_chunks(samples)
             row: dict[str, Any] = {"episode": name, "kind": kind, "frames": len(samples)}
             for when, policy in candidates.items():
-                off = np.abs(plans_of(policy, samples).astype(np.float64) - actions)[present].mean(0)
+                off = np.abs(plans_of(policy, samples).astype(np.float64) - chunks)[~is_pad].mean(0)
                 for error, (action, ends) in zip(off, self.action_range.items(), strict=True):
                     row[f"{when}_{action}_pct"] = pct_of_range(error, ends)
             rows.append(row)

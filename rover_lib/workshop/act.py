@@ -30,7 +30,6 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,6 +39,7 @@ from torch import Tensor, nn
 
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
+from rover_lib.workshop.hooks import watched
 from rover_lib.workshop.recordings.samples import Sample
 
 Projection = nn.Linear | nn.Conv2d
@@ -496,17 +496,15 @@ def block_of(module_name: str) -> str:
 def multiply_accumulates(model: ACT) -> dict[str, int]:
     """Count the multiply-accumulates of one inference by block. Attention's two products count for its block."""
     counts: Counter[str] = Counter()
-    with ExitStack() as hooks, torch.inference_mode():
-        for name, module in model.named_modules():
 
-            def watch(m: nn.Module, args: tuple, out: Tensor, block: str = block_of(name)) -> None:
-                if isinstance(m, Attention):
-                    residual, _, key, _ = args
-                    counts[block] += 2 * residual.shape[1] * key.numel()  # queries x tokens x width
-                elif isinstance(m, Projection):
-                    counts[block] += out.numel() * m.weight[0].numel()
+    def watch(name: str, module: nn.Module, inputs: tuple, output: Tensor) -> None:
+        if isinstance(module, Attention):
+            residual, _, key, _ = inputs
+            counts[block_of(name)] += 2 * residual.shape[1] * key.numel()  # queries x tokens x width
+        elif isinstance(module, Projection):
+            counts[block_of(name)] += output.numel() * module.weight[0].numel()
 
-            hooks.enter_context(module.register_forward_hook(watch))
+    with watched(dict(model.named_modules()), watch), torch.inference_mode():
         model(*example_inputs(model.config))
     return dict(counts)
 

@@ -25,7 +25,7 @@ from rover_lib.workshop.checkpoint.files import CORRECT_IT, RATE_HZ, as_checkpoi
 from rover_lib.workshop.checkpoint.lerobot import SIZE_OF_BASE, lerobot_folder, read_lerobot, write_lerobot
 from rover_lib.workshop.checkpoint.trainer import read_trainer, trainer_config
 from rover_lib.workshop.checkpoint.weights import Weights, tensor_bytes
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Layout, Sample, pick_evenly, stack_chunks
 from rover_lib.workshop.untrusted import quote, quote_all
 
 FEATURE_PX = 32  # a ResNet sees one feature for 32 pixels a side
@@ -236,8 +236,8 @@ class Checkpoint:
 def planned_error(policy: Checkpoint, samples: Sequence[Sample], action: int | None = None) -> float:
     """The mean error of one action, or of all, against the recorded ones."""
     plans = predictions(ACT(policy.config, policy.weights), [inputs_of(s, policy.config) for s in samples]).numpy()
-    present = ~np.stack([s.is_pad for s in samples])
-    errors = np.abs(plans - np.stack([s.chunk for s in samples]))[present]
+    chunks, is_pad = stack_chunks(samples)
+    errors = np.abs(plans - chunks)[~is_pad]
     return float((errors if action is None else errors[:, action]).mean())
 
 

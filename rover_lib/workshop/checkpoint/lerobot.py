@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import astuple, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +58,7 @@ def lerobot_folder(path: Path) -> Path:
         if (path / inner / "config.json").exists():
             return path / inner
     places = (f"*/{PRETRAINED}", f"checkpoints/*/{PRETRAINED}", "snapshots/*", "*.pth")
-    actual = sorted(p.relative_to(path).as_posix() for place in places for p in path.glob(place))
+    actual = sorted(p.relative_to(path).as_posix() for p in chain.from_iterable(map(path.glob, places)))
     problem = f"{path}: no config.json, nor a link to the last checkpoint"
     remedy = "give best_model.pth, or one pretrained_model folder with config.json; merge an adapter before"
     raise CheckpointError(problem, found=quote_all(actual) or "none", remedy=remedy)
@@ -70,13 +71,15 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
         raise CheckpointError(problem, remedy="merge it (merge_and_unload), save_pretrained, and remove its files")
     raw = _of_today(folder, _read_json(folder / CONFIG))
     settings = _act_config(folder, raw, facts)
-    tensors, inside = (name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored), dict[str, Tensor]())
-    # Statistics of before LeRobot had processors.
-    for key in () if (folder / OUTER[0]).exists() else (*settings.input_features, *settings.output_features):
-        for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
-            inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
+    tensors = name_weights(folder, _read_safetensors(folder / WEIGHTS), facts.ignored)
+    inside: dict[str, Tensor] = {}
+    if not (folder / OUTER[0]).exists():  # of before LeRobot had processors
+        for key in (*settings.input_features, *settings.output_features):
+            for name in [n for n in tensors if re.search(IN_WEIGHTS.format(key=key.replace(".", "_")), n)]:
+                inside[f"{key}.{name.rpartition('.')[2]}"] = tensors.pop(name)
     weights = check_weights_are_whole(folder, tensors)
-    inner, outer = Normaliser(folder, *INNER, settings, inside), Normaliser(folder, *OUTER, settings, inside)
+    inner = Normaliser(folder, *INNER, settings, inside)
+    outer = Normaliser(folder, *OUTER, settings, inside)
     origin = _read_json(folder / ORIGIN) if (folder / ORIGIN).exists() else {}  # what we noted in one that we wrote
     images = settings.image_features
     numbers = settings.robot_state_feature
@@ -224,7 +227,7 @@ def _act_config(folder: Path, raw: dict[str, Any], facts: Facts) -> "ACTConfig":
         decoded = draccus.decode(ACTConfig, {k: v for k, v in raw.items() if k in options} | {"device": "cpu"})
         cameras = [tuple(camera.shape) for camera in decoded.image_features.values()]
         rows = [tuple(row.shape) for row in (decoded.robot_state_feature, decoded.action_feature) if row]
-        whole = all(is_whole(n, 1, files.MOST) for shape in (*cameras, *rows) for n in shape)
+        whole = all(is_whole(n, 1, files.MOST) for n in chain(*cameras, *rows))
         right = all(len(s) == 3 and s[0] == 3 for s in cameras) and all(len(s) == 1 for s in rows)
     if not (cameras and decoded.action_feature and whole and right) or decoded.env_state_feature:
         features = {**decoded.input_features, **decoded.output_features}

@@ -221,6 +221,7 @@ class Exporter:
         scheme = getattr(policy, "scheme", None)
         mode = scheme.mode if scheme else "fp32"
         static = scheme if mode in ("static", "mixed") else None
+        kind = {"fp32": "float", "dynamic": "dynamic"}.get(mode, "symmetric")
         calibrated = calibration and {
             "samples": calibration.samples,
             "observer": static.observer if static else None,
@@ -235,7 +236,7 @@ class Exporter:
         return {
             "schema": artifact.SCHEMA,
             "mode": mode,
-            "scheme": "symmetric" if static else "dynamic" if scheme else "float",
+            "scheme": kind,
             "engine": form.engine,
             "cameras": cameras,
             "state_names": list(config.state_names),

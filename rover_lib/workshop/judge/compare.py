@@ -28,6 +28,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
+from rover_lib.workshop.recordings.samples import stack_chunks
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES)
@@ -198,14 +199,15 @@ def fidelity(
         frame = sample.frame_bgr()
         for mode, policy in policies.items():
             planned[mode].append(policy.predict_chunk(frame, sample.state))
+    recorded, is_pad = stack_chunks(samples)
     return Fidelity(
         action_names=names,
         action_range={n: (float(action_range[n][0]), float(action_range[n][1])) for n in names},
         samples=tuple(samples),
         reference=np.stack(planned.pop("")),
         chunks={mode: np.stack(chunks) for mode, chunks in planned.items()},
-        recorded=np.stack([s.chunk for s in samples]),
-        is_pad=np.stack([s.is_pad for s in samples]),
+        recorded=recorded,
+        is_pad=is_pad,
     )
 
 

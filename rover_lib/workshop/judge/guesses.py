@@ -21,7 +21,7 @@ from rover_lib.workshop.judge.compare import Fidelity
 from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
 from rover_lib.workshop.recordings.blocks import group_by_block
-from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.recordings.samples import Sample, stack_chunks
 
 DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
@@ -155,7 +155,7 @@ def least_blind_errors(
     return np.asarray(errors).min(0)
 
 
-def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) -> Judged | None:
+def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | None:
     """Hold the FP32 plans of a comparison and the guesses against the driver, action by action.
 
     learned: samples of other drives, which the policy could learn from; the guesses know no others. None without any.
@@ -165,8 +165,8 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         return None
     recorded = report.recorded
     is_pad = report.is_pad
-    half = report.recorded.shape[1] // 2
-    blind = blind_plans(np.stack([s.chunk for s in learned]), np.stack([s.is_pad for s in learned]))
+    half = recorded.shape[1] // 2
+    blind = blind_plans(*stack_chunks(learned))
     own = frame_errors(report.reference, recorded, is_pad)
     errors = {name: frame_errors(plan, recorded, is_pad) for name, plan in blind.items()}
     compared = {MEAN_PLAN: (errors[MEAN_PLAN], own)}
@@ -175,7 +175,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample], seed: int = 0) 
         later = recorded[:, half:], is_pad[:, half:]
         compared[LAST] = frame_errors(states[:, None], *later), frame_errors(report.reference[:, half:], *later)
     drawn, pieces = _pieces(report)
-    draws = np.random.default_rng(seed).integers(0, len(pieces), (DRAWS, len(pieces)))
+    draws = np.random.default_rng(0).integers(0, len(pieces), (DRAWS, len(pieces)))
     actions = {}
     for i, action in enumerate(report.action_names):
         if (pct := report.pct(action)) is None:

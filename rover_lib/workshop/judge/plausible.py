@@ -18,7 +18,7 @@ from rover_lib.workshop.act import ACT, inputs_of, predictions
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.recorded_range import HELD_OFF, Range, constant_actions, hardly_varies, usual_size
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly
+from rover_lib.workshop.recordings.samples import Sample, frame_rate_hz, is_another_rate, pick_evenly, stack_chunks
 
 FRAMES = 12  # planned in FP32, which takes ten seconds for a policy of full size
 BEYOND = 0.5  # a prediction lies beyond if it passes either end by this share of the range; a good policy does not
@@ -89,21 +89,20 @@ def fits(checkpoint: Checkpoint, samples: Sequence[Sample], action_range: Mappin
     config = checkpoint.config
     tried = pick_evenly(samples, FRAMES)
     plans = predictions(ACT(config, checkpoint.weights), [inputs_of(s, config) for s in tried]).numpy()
-    present = ~np.stack([s.is_pad for s in tried])
-    recorded = np.stack([s.chunk for s in tried])
+    recorded, is_pad = stack_chunks(tried)
     actions = {}
     for i, (name, (low, high)) in enumerate(action_range.items()):
         if name in constant_actions(action_range):
             continue
         values = plans[..., i]
-        acted = recorded[..., i][present]
+        acted = recorded[..., i][~is_pad]
         constant = hardly_varies(name, acted)
         margin = max(BEYOND * (high - low), HELD_OFF * usual_size(acted) if constant else 0)
         beyond = (values < low - margin) | (values > high + margin)
         actions[name] = {
             "predicted": [float(values.min()), float(values.max())],
             "beyond_pct": 100 * float(beyond.mean()),
-            "spread": float(values[present].std() / max(acted.std(), 1e-12)),
+            "spread": float(values[~is_pad].std() / max(acted.std(), 1e-12)),
             "held": constant,
         }
     largest: dict[str, float] = {}

@@ -79,7 +79,9 @@ def draw_blocks(places: Sequence[Sequence[str]], share: float, rng: np.random.Ge
 
 def part_by_blocks(episodes: Sequence[Episode], drawn: Mapping[str, str]) -> dict[str, tuple[Sample, ...]]:
     """Return the samples of each part, without those of the gaps. drawn: what draw_blocks returned."""
-    pairs = [(e, s) for e in episodes for s in e.samples]
+    pairs: list[tuple[Episode, Sample]] = []
+    for episode in episodes:
+        pairs += [(episode, sample) for sample in episode.samples]
     ranks = np.array([PARTS.index(drawn.get(s.block, PARTS[0])) for _, s in pairs])
     usable = np.ones(len(pairs), bool)
     chunk = len(pairs[0][1].chunk)

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +195,9 @@ class _Dataset:
             tables = sorted(path for path in self.root.glob("meta/episodes/[!.]*/*") if OURS.fullmatch(path.name))
             if not tables:
                 raise _broken(f"{self.root}: has no meta/episodes/*/*.parquet")
-            rows = [row for path in tables for row in _read_table(self.root, path, "(?!stats/).*").to_pylist()]
+            rows = []
+            for path in tables:
+                rows += _read_table(self.root, path, "(?!stats/).*").to_pylist()
         self.entries = sorted(rows, key=lambda row: row["episode_index"])
         return list(dict.fromkeys(map(self._file, self.entries)))
 
@@ -236,7 +238,7 @@ class _Dataset:
         self.drivers = {row["episode_index"]: driver for row, driver in zip(self.entries, drivers, strict=True)}
         self._check_numbers()
         self.cameras = {name: self._camera(key, self.layout.image_sizes[name]) for name, key in self.keys.items()}
-        self.unusable = {row for camera in self.cameras.values() for row in camera.find_unusable(self.faults)}
+        self.unusable = set().union(*(camera.find_unusable(self.faults) for camera in self.cameras.values()))
 
     def _check_order(self) -> None:
         """Raise EpisodeError for rows that are not the frames of meta/ in their order, each once; note other counts."""
@@ -308,7 +310,9 @@ class _Dataset:
         from datasets import Dataset, Features, Image
         from lerobot.utils.utils import SuppressProgressBars
 
-        paths = [path for row in self.entries for path in [self._file(row)] * row["length"]]
+        paths: list[Path] = []
+        for row in self.entries:
+            paths += [self._file(row)] * row["length"]
         with SuppressProgressBars():
             undecoded = Features({key: Image(decode=False)})
             rows = Dataset.from_parquet([str(path) for path in dict.fromkeys(paths)], columns=[key], features=undecoded)
@@ -316,7 +320,9 @@ class _Dataset:
 
     def _video_camera(self, key: str, size: tuple[int, int]) -> _Camera:
         """Find each row's picture in a video. Raises EpisodeError for times at which a video shows none."""
-        parts = [part for row in self.entries for part in [(*self._shown(row, key), row)] * row["length"]]
+        parts: list[tuple[Path, float, float, Mapping[str, Any]]] = []
+        for row in self.entries:
+            parts += [(*self._shown(row, key), row)] * row["length"]
         times_s = np.array([first_s for _, first_s, *_ in parts]) + self.columns["timestamp"]
         torn = np.zeros(len(parts), bool)
         for path in dict.fromkeys(path for path, *_ in parts):
@@ -416,7 +422,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     fps = info.get("fps")
     try:
         shapes = [feature.get("shape") or () for feature in features.values()]
-        right = all(is_whole(n, 1, 10_000) for shape in shapes for n in shape)
+        right = all(is_whole(n, 1, 10_000) for n in chain.from_iterable(shapes))
         right = right and 0 < len(features) <= MOST_FEATURES and isinstance(info.get("data_path"), str)
     except (AttributeError, TypeError, KeyError):
         right = False

@@ -204,7 +204,8 @@ class Recordings:
         changed = [e for e in self.episodes if e.formulas]
         if not changed:
             return ""
-        formulas = ", ".join(sorted({f"{name} = {formula}" for e in changed for name, formula in e.formulas.items()}))
+        pairs = chain.from_iterable(e.formulas.items() for e in changed)
+        formulas = ", ".join(sorted({f"{name} = {formula}" for name, formula in pairs}))
         count = f"{len(changed)} of {len(self.episodes)} episodes"
         return f"the actions of {count} were recomputed from their pulses, as they follow another formula: {formulas}"
 

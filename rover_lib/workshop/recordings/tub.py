@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +90,10 @@ def find_tubs(root: Path, kinds: Sequence[str], deepest: int = DEEPEST) -> list[
     if kinds or not deepest or not root.is_dir():
         return []
     folders = [p for p in root.iterdir() if p.is_dir() and not p.name.startswith((".", "__MACOSX"))][:MOST_FOLDERS]
-    if any((folder / name).exists() for folder in folders for name in EPISODE_FILES):
+    if any((folder / name).exists() for folder, name in product(folders, EPISODE_FILES)):
         return []
-    return [tub for folder in sorted(folders) for tub in find_tubs(folder, kinds_of(folder), deepest - 1)]
+    inside = (find_tubs(folder, kinds_of(folder), deepest - 1) for folder in sorted(folders))
+    return list(chain.from_iterable(inside))
 
 
 def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progress = silent) -> Recordings:
@@ -119,7 +120,7 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
             all_faults.counted |= faults.counted
     if not parts:
         raise all_faults.nothing_usable(f"none of its {len(tubs)} tubs can be used", COPY)
-    whole = [episode for _, own in parts for episode in own]
+    whole = list(chain.from_iterable(own for _, own in parts))
     note_one_sided(whole, all_faults)
     unique = set(map(id, leave_out_copies(whole, all_faults)))
     episodes = list[Episode]()

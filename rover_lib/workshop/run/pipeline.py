@@ -100,7 +100,7 @@ def export_policies(
     drives: by which those that a rover may drive by (DRIVEN) tell how unfamiliar a picture is.
     """
     described = {}
-    for mode in {*ARTIFACTS, "static_affine"} - policies.keys():  # which older versions made
+    for mode in set(ARTIFACTS) - policies.keys():
         (Path(folder) / f"policy_{mode}.pt").unlink(missing_ok=True)
     exporter = Exporter(checkpoint, samples)
     for name, policy in policies.items():
