@@ -149,9 +149,8 @@ def _open(
     if len(set(places)) < len(places):
         raise TrainingError("the same recordings are given twice", found=", ".join(places), remedy="leave one out")
     sync_s = params()["calibration"]["sync_s"]
-    read = tuple(
-        with_faults(load_recordings(source, parent.config.chunk, sync_s, progress), progress) for source in sources
-    )
+    loaded = (load_recordings(source, parent.config.chunk, sync_s, progress) for source in sources)
+    read = tuple(with_faults(recordings, progress) for recordings in loaded)
     policies = [parent.recorded_as(recordings.layout, recordings.samples) for recordings in read]
     if any(policy.config != policies[0].config for policy in policies):
         raise TrainingError("the recordings name, order or time states and actions differently", found=places)
@@ -245,13 +244,11 @@ class Finetuning(Work):
                 lessons = Lessons.open(folder, samples, parent.config, parent, self.rng(f"states, {kind}"))
                 lessons.ask(saved, parent, self.rng(kind))
             all_lessons.append((kind, lessons))
-        whole = {
-            "lessons": [[kind, own.frames.path.parent.name] for kind, own in all_lessons],
-            "recipe": asdict(recipe),
-        }
+        names = [[kind, own.frames.path.parent.name] for kind, own in all_lessons]
+        folder = cache_for("finetune", {"lessons": names, "recipe": asdict(recipe)})
         weights = np.concatenate([_weights(recipe, kind, own, 1 / self.ranges) for kind, own in all_lessons])
         pool = Pool([(own, kind != DEMONSTRATIONS) for kind, own in all_lessons], weights)
-        with Resumable(cache_for("finetune", whole), self.machine, self.progress) as saved:
+        with Resumable(folder, self.machine, self.progress) as saved:
             policy = self.machine.taking(BatchedPolicy(parent.config, parent.weights))
             policy.thaw()
             self.train_policy(saved, policy, pool, self.loss, seen="maps", slower=SLOWER)

@@ -96,7 +96,8 @@ class BatchedPolicy(nn.Module):
 @torch.inference_mode()
 def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
     """Return what a policy would drive on the samples, (n, C, A) float32, clipped to their car's limits."""
-    device, (size,) = policy.image_scale.device, policy.config.image_sizes
+    device = policy.image_scale.device
+    (size,) = policy.config.image_sizes
     plans = []
     firsts = range(0, len(samples), BLOCK)
     for first in progress(firsts, desc="judging", total=len(firsts)):
@@ -154,7 +155,7 @@ class Lessons:
     @property
     def blocks(self) -> list[np.ndarray]:
         """The numbers of all samples, in blocks of BLOCK, on which a policy plans at once."""
-        return [np.arange(first, min(first + BLOCK, len(self))) for first in range(0, len(self), BLOCK)]
+        return np.split(np.arange(len(self)), range(BLOCK, len(self), BLOCK))
 
     def pictures(self, rows: np.ndarray, views: np.ndarray) -> np.ndarray:
         """Return the pictures of these samples, (B, height, width, 3) uint8, mirrored where views, (B,), says so."""
@@ -188,7 +189,8 @@ class Lessons:
         blocks = self.blocks
         grid = (self.maps.shape[1], self.maps.shape[2])
         parts: dict[str, Any] = {"frames": self.frames, "maps": self.maps, "plans": self.plans}
-        (size,), device = teacher.config.image_sizes, saved.machine.device
+        (size,) = teacher.config.image_sizes
+        device = saved.machine.device
 
         def read(block: int) -> list[np.ndarray]:
             pictures = [self.data.samples[i].frame_bgr() for i in blocks[block]]
@@ -228,7 +230,7 @@ class Pool:
         self.lessons = lessons
         counts = [len(lessons_of) for lessons_of, _ in lessons]
         self._places = np.repeat(np.arange(len(lessons)), counts)
-        self._rows = np.concatenate([np.arange(count) for count in counts])
+        self._rows = np.concatenate(list(map(np.arange, counts)))
         self._shares = None if weights is None else weights / weights.sum()
 
     def batch(self, count: int, rng: np.random.Generator, device: torch.device, *shown: str) -> Batch:
@@ -250,9 +252,8 @@ class Pool:
             own = self._places[drawn] == place
             if own.any():
                 parts.append(lessons.show(self._rows[drawn][own], views[own], new, rng, *shown))
-        return training.on_device(
-            arrays | {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, device
-        )
+        arrays |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return training.on_device(arrays, device)
 
 
 def lit(batch: Batch) -> Tensor:

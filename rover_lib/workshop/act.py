@@ -425,10 +425,8 @@ class ACT(nn.Module):
         self.config = config
         w = Weights(weights)
         columns = for_int8 and fits_columns(config)
-        self.image_input = nn.ModuleList(
-            Columns(norm, *size) if columns else Pixels(norm)
-            for norm, size in zip(config.image_norm, config.image_sizes, strict=True)
-        )
+        cameras = zip(config.image_norm, config.image_sizes, strict=True)
+        self.image_input = nn.ModuleList(Columns(norm, *size) if columns else Pixels(norm) for norm, size in cameras)
         self.state_norm = Normalise(config.state_norm, (1, -1))
         self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
         self.backbone = Backbone(w.at("backbone"), config, columns)

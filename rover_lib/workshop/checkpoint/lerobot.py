@@ -112,8 +112,7 @@ def read_lerobot(folder: Path, facts: Facts) -> files.Contents:
             action_unnorm=norms.get(OUTER[0]) or outer.affine("action", "ACTION", actions.shape, inverse=True),
             **{ours: getattr(settings, theirs) for ours, theirs in LEROBOTS.items()},
         )
-        if config.state_norm is not None:
-            config, weights = _without_constants(config, weights, inner, facts)
+        config, weights = _without_constants(config, weights, inner, facts)
         _compare_statistics(config, inner, outer, facts)
     files.check_beside(folder, facts)
     report = {"optimizer_mb": 0.0, "written_here": bool(origin)}
@@ -128,10 +127,10 @@ def _without_constants(
     Its network learned nothing from them, and their scale of 1e8 would make anything of a car's last action.
     """
     norm = config.state_norm
-    constants = inner.constants("observation.state", config.state_norm)
-    if norm is None or not constants:
+    if norm is None or not (constants := inner.constants("observation.state", norm)):
         return config, weights
-    weights, dropped = dict(weights), list(constants)
+    weights = dict(weights)
+    dropped = list(constants)
     for stem in ("encoder_robot_state_input_proj", "vae_encoder_robot_state_input_proj"):
         if f"{stem}.weight" in weights:
             columns = weights[f"{stem}.weight"].clone()
@@ -156,10 +155,9 @@ def _compare_statistics(config: ActConfig, inner: "Normaliser", outer: "Normalis
     for name, (mean, std), (own_mean, own_std) in zip(config.state_names, state, action, strict=True):
         alike = abs(mean - own_mean) <= APART * own_std and own_std <= APART * std and std <= APART * own_std
         if min(std, own_std) > VARIES and not alike:
-            problem = f"mean {mean:.3g}, deviation {std:.3g}, and its action's {own_mean:.3g}, {own_std:.3g}"
-            facts.notes.append(
-                f"the state that it learned from was not its last action, which a car gives: {name} {problem}"
-            )
+            problem = "the state that it learned from was not its last action, which a car gives"
+            state_words = f"{name} mean {mean:.3g}, deviation {std:.3g}"
+            facts.notes.append(f"{problem}: {state_words}, and its action's {own_mean:.3g}, {own_std:.3g}")
             return
 
 
@@ -287,13 +285,11 @@ class Normaliser:
         parts = [stats[name].flatten().tolist() for part in ("mean", "std") if (name := f"{key}.{part}") in stats]
         return list(zip(*parts, strict=True)) if len(parts) == 2 else []
 
-    def constants(self, key: str, norm: Affine | None) -> dict[int, float]:
+    def constants(self, key: str, norm: Affine) -> dict[int, float]:
         """Return the numbers of an input that never varied in training, by their place, as the network saw them.
 
         Raises CheckpointError for those that varied, and whose quantiles were equal.
         """
-        if norm is None:
-            return {}
         fixed = [i for i, (a, b) in enumerate(zip(norm.scale, norm.shift, strict=True)) if VARIES * max(a, abs(b)) >= 1]
         mode = self.step.norm_map[self.step.features[key].type].value
         varied = [i for i in fixed if (pairs := self.statistics(key)) and pairs[i][1] > VARIES]

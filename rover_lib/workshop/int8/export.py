@@ -178,10 +178,9 @@ class Exporter:
                 raise ArtifactError(f"{path}: {name} of the written graph differs by {gap:.3g}; nothing was written")
         manifest = self._manifest(policy, calibration, form)
         # The gates judge what INT8 loses. A rover refuses a tolerance so large that another plan would pass.
-        tolerance = {
-            name: min(limit, artifact.largest_tolerance(manifest["mode"], name))
-            for name, limit in self._tolerance(policy, actions, np.arange(len(actions))).items()
-        }
+        tolerance = {}
+        for name, limit in self._tolerance(policy, actions, np.arange(len(actions))).items():
+            tolerance[name] = min(limit, artifact.largest_tolerance(manifest["mode"], name))
         manifest["parity"] = {"tolerance": tolerance, "reason": REASONS[isinstance(policy, QuantizedPolicy)]}
         states, *frames = zip(*(self.inputs[i] for i in self.stored), strict=True)
         vectors = {"state": np.concatenate(states), "chunk": actions[self.stored].numpy()}
@@ -218,20 +217,18 @@ class Exporter:
     def _manifest(self, policy: ACT | QuantizedPolicy, calibration: Calibration | None, form: Form) -> dict[str, Any]:
         """Return the manifest without its parity."""
         config = self.checkpoint.config
-        scheme = getattr(policy, "scheme", None)
+        scheme: Any = getattr(policy, "scheme", None)
         mode = scheme.mode if scheme else "fp32"
-        static = scheme if mode in ("static", "mixed") else None
         kind = {"fp32": "float", "dynamic": "dynamic"}.get(mode, "symmetric")
         calibrated = calibration and {
             "samples": calibration.samples,
-            "observer": static.observer if static else None,
+            "observer": None if kind == "dynamic" else scheme.observer,
             "channel_scales": calibration.smooth,
-            "float_blocks": list(scheme.float_blocks) if scheme else [],
+            "float_blocks": list(scheme.float_blocks),
         }
-        cameras = [
-            {"name": n, "height": h, "width": w} | self.recorded[n]
-            for n, (h, w) in zip(config.cameras, config.image_sizes, strict=True)
-        ]
+        cameras = []
+        for name, (height, width) in zip(config.cameras, config.image_sizes, strict=True):
+            cameras.append({"name": name, "height": height, "width": width} | self.recorded[name])
         names_car = not self.car.drives_like(Car()) and bool({*config.action_names} & {*ACTION_NAMES})
         return {
             "schema": artifact.SCHEMA,

@@ -220,8 +220,8 @@ def metrics(report: Fidelity, policies: Mapping[str, Any], trials: Mapping[str, 
     for mode in ("fp32", *report.chunks):
         trial = (trials or {}).get(mode)
         own[mode] = {
-            "hits": trial.hits if trial else None,
-            "trials": trial.trials if trial else None,
+            "hits": getattr(trial, "hits", None),
+            "trials": getattr(trial, "trials", None),
             "size_mb": policies[mode].path.stat().st_size / 1e6,
         }
     fp32 = own.pop("fp32")
@@ -287,14 +287,13 @@ def gates(compared: Mapping[str, Any], limits: Mapping[str, Any], mode: str = GA
     fp32 = compared["fp32"]
     scores = compared["modes"][mode]
     lost = worlds_lost(f"{mode} {WORLDS_LOST}", scores.get("pairs"), fp32.get("trials"), limits["worlds_lost_pct"])
+    hits = gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials")))
+    size = gate(f"{mode} size_mb", scores["size_mb"], "<=", limits["size_mb"][mode])
+    if lost["passed"] is not None:
+        return [hits, lost, size]
     if (ms := error_ms(compared, mode)) is not None:
         error = gate(f"{mode} error, ms of delay", ms, "<=", error_limit_ms(scores, limits))
     else:
         worst_pct = worst(scores[key] for key in scores if key.endswith("_mae_pct"))
         error = gate(f"{mode} error, % of the recorded range", worst_pct, "<=", limits["error_pct"])
-    return [
-        *([error] if lost["passed"] is None else []),
-        gate("fp32 hits", fp32["hits"], ">=", hits_needed(limits, fp32.get("trials"))),
-        lost,
-        gate(f"{mode} size_mb", scores["size_mb"], "<=", limits["size_mb"][mode]),
-    ]
+    return [error, hits, lost, size]

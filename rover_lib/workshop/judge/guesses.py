@@ -93,10 +93,9 @@ class Judged:
             return ["no action varies enough in these recordings to show whether the policy sees"]
         warnings = []
         for action, result in self.actions.items():
-            if lost := result.lost():
-                when = " in the later half of a plan" if lost[0] == LAST else ""
-                name = lost[0]
-                guess = result.guesses[lost[0]]
+            for name in result.lost()[:1]:
+                when = " in the later half of a plan" if name == LAST else ""
+                guess = result.guesses[name]
                 errors = f"{guess.error_pct - guess.better:.2f} % off the driver{when}, {name} {guess.error_pct:.2f} %"
                 lead = f"better by {guess.lead()} over {self.drawn}"
                 warnings.append(f"{action} is not clearly better than a guess without eyes: {errors}; {lead}")
@@ -107,12 +106,12 @@ class Judged:
 
     def notes(self) -> list[str]:
         """A sentence for each action that is held."""
-        constant = {action: result for action, result in self.actions.items() if result.held}
-        return [
-            f"{action} hardly varies in these recordings: held, not judged ({result.error_pct:.1f} % off, "
-            f"{CONSTANT} {result.guesses[CONSTANT].error_pct:.1f} %)"
-            for action, result in constant.items()
-        ]
+        notes = []
+        for action, result in self.actions.items():
+            if result.held:
+                errors = f"{result.error_pct:.1f} % off, {CONSTANT} {result.guesses[CONSTANT].error_pct:.1f} %"
+                notes.append(f"{action} hardly varies in these recordings: held, not judged ({errors})")
+        return notes
 
     def summary(self) -> dict[str, Any]:
         """The same as plain JSON types, for compare.json."""

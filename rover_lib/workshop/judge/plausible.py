@@ -52,24 +52,25 @@ class Fit:
         """A table for people: the ranges of the recorded actions, and of the policy's actions on the same frames."""
         rows = []
         for name, fit in self.actions.items():
-            rows.append((name, *("{:.3g} to {:.3g}".format(*ends) for ends in (self.recorded[name], fit["predicted"]))))
+            ranges = (self.recorded[name], fit["predicted"])
+            rows.append((name, *(f"{low:.3g} to {high:.3g}" for low, high in ranges)))
         return Table(("", "recorded", "predicted"), rows)
 
     def warnings(self) -> list[str]:
         """A sentence for each number that does not fit."""
         warnings = []
         for name, fit in self.actions.items():
+            problem = ""
             if fit["beyond_pct"] > MOST_BEYOND_PCT:
                 problem = f"{fit['beyond_pct']:.0f} % of its predictions are far outside of what was recorded"
-                warnings.append(f"{name}: {problem}; {self.remedy}")
             elif fit["spread"] < LEAST_SPREAD and not fit["held"]:
                 problem = f"its predictions vary {100 * fit['spread']:.0f} % as much as what was recorded"
+            if problem:
                 warnings.append(f"{name}: {problem}; {self.remedy}")
         for name, largest in self.largest_state.items():
             if not largest <= LARGEST_STATE:
-                warnings.append(
-                    f"state {name}: the policy is told up to {largest:.3g} standard deviations; {self.remedy}"
-                )
+                problem = f"the policy is told up to {largest:.3g} standard deviations"
+                warnings.append(f"state {name}: {problem}; {self.remedy}")
         for episode, found_hz in list(self.other_rates_hz.items())[:1]:
             problem = f"the policy plans {self.plans_hz:g} steps a second, and {episode} has {found_hz:.1f} frames"
             warnings.append(f"{problem}: the car would drive at another speed than the human did")

@@ -80,6 +80,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
     for mode, metrics in all_found.items():
         time = timed.get(mode, {})
         gate_rows = [] if mode == "fp32" else gates(compared, params["gates"], mode)
+        missed = [r for r in gate_rows if r["passed"] is False and mode in r["gate"]]
         rows[mode] = {
             "mode": mode,
             "size_mb": metrics["size_mb"],
@@ -96,11 +97,7 @@ def _rows(stages: Stages, params: Mapping[str, Any]) -> dict[str, dict[str, Any]
             "pairs": metrics.get("pairs"),
             "float_blocks": stages["quantize"]["modes"].get(mode, {}).get("float_blocks", []),
             "worlds_decide": any(r["gate"].endswith(WORLDS_LOST) and r["passed"] is not None for r in gate_rows),
-            "missed_gates": [
-                {**r, "words": gate_in_words(r["gate"])}
-                for r in gate_rows
-                if r["passed"] is False and mode in r["gate"]
-            ],
+            "missed_gates": [r | {"words": gate_in_words(r["gate"])} for r in missed],
         }
     static, mixed = rows.get("static"), rows.get("mixed")
     if static and mixed and static["time_ms"] and mixed["time_ms"] and mixed["time_ms"] < static["time_ms"]:
@@ -170,7 +167,7 @@ def _list_failures(
 def _list_unfit(stages: Stages, failed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say why no artifact of this policy should drive a car, and what helps; empty if nothing speaks against it."""
     compared = stages["compare"]
-    looking = stages["compare"].get("looking", {})
+    looking = compared.get("looking", {})
     guesses = compared.get("guesses", {})
     fit = stages["load"].get("fit", {}).get("warnings", [])
     constant = [action for action, guess in guesses.get("actions", {}).items() if guess["held"]]

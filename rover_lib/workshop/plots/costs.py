@@ -99,9 +99,8 @@ def students(judged: Sequence[Mapping[str, Any]]) -> Figure:
             share = s[f"{key}hits"] / s[f"{key}trials"]
             ends = 100 * np.clip([[share - s[f"{key}hits_wilson_low"]], [s[f"{key}hits_wilson_high"] - share]], 0, None)
             label = "pushed" if key else "left alone"
-            right.errorbar(
-                100 * share, row + aside, xerr=ends, fmt="o", color=colour, capsize=3, label=label if row == 0 else None
-            )
+            marks = {"fmt": "o", "color": colour, "capsize": 3, "label": label if row == 0 else None}
+            right.errorbar(100 * share, row + aside, xerr=ends, **marks)
     right.set_yticks(range(len(driven)), [s["name"] for s in driven])
     right.set(xlabel="balloons hit (%), 95 % intervals", ylim=(len(driven) - 0.4, -0.6))
     style.legend_below(fig, right, 2)

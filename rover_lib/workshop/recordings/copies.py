@@ -41,11 +41,10 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
         for run, k in runs.items():
             for other, there in having[run]:
                 shared[other].append((k, there))
-        suspects = [
-            (episodes[other], pairs)
-            for other, pairs in shared.items()
-            if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other])
-        ]
+        suspects = []
+        for other, pairs in shared.items():
+            if len(pairs) >= SHARED * len(runs) and not _follow(episodes[i], episodes[other]):
+                suspects.append((episodes[other], pairs))
         same = next((other for other, pairs in suspects if look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
             note = f"the same drive as {same.id}, as its actions and pictures show"
@@ -76,9 +75,8 @@ def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:
 def _follow(episode: Episode, other: Episode) -> bool:
     """Whether they are pieces of one session, one after the other."""
     first, second = sorted((episode, other), key=lambda e: e.begin_s)
-    return (
-        episode.session != "" and episode.session == other.session and first.begin_s + first.duration_s < second.begin_s
-    )
+    together = episode.session != "" and episode.session == other.session
+    return together and first.begin_s + first.duration_s < second.begin_s
 
 
 def look_alike(

@@ -164,9 +164,8 @@ class _Tub:
             first = records[run[0]]
             session = "/".join(filter(None, (self.place, first.session or "session")))
             began_s.setdefault(session, first.time_s)
-            samples = self._samples(
-                f"{session} from {first.index}", [(records[i], pictures[i]) for i in run], stands, chunk
-            )
+            part = [(records[i], pictures[i]) for i in run]
+            samples = self._samples(f"{session} from {first.index}", part, stands, chunk)
             found_hz = frame_rate_hz(samples)
             if len(samples) >= LEAST_RATED and is_another_rate(found_hz, 1 / usual_s):
                 note = f"{found_hz:.1f} Hz from record {first.index} on"

@@ -1,25 +1,18 @@
 """Copies of drives, and mirrored ones, are left out; other drives are not."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rover_lib.workshop.recordings.faults import Faults
-from rover_lib.workshop.recordings.samples import Episode, Sample
+from rover_lib.workshop.recordings.samples import Episode
 from rover_lib.workshop.recordings.twins import leave_out_copies
 from tests.helpers.policies import smooth_frame
+from tests.helpers.recorded import PictureSample
 
 FRAMES = 30
-
-
-@dataclass(frozen=True, eq=False)
-class Seen(Sample):
-    picture: np.ndarray | None = None
-
-    def frame_bgr(self, least=0):
-        return self.turned(self.picture)
 
 
 def drive(seed):
@@ -27,16 +20,17 @@ def drive(seed):
     for k in range(FRAMES):
         action = np.float32([[0.5 * np.sin(k / 5 + seed), 0.1 + 0.01 * seed]])
         picture = smooth_frame(rng, 36, 64)
-        samples.append(Seen(f"e{seed}", Path("x"), k / 20, action[0], action, np.zeros(1, bool), k, picture=picture))
+        samples.append(
+            PictureSample(f"e{seed}", Path("x"), k / 20, action[0], action, np.zeros(1, bool), k, picture=picture)
+        )
     return Episode(f"e{seed}", Path("r"), "", 1.5, FRAMES, FRAMES, tuple(samples), ())
 
 
 def mirrored(episode, name, noise=0):
     rng, samples = np.random.default_rng(1), []
     for s in episode.samples:
-        picture = np.clip(s.picture[:, ::-1] + rng.integers(-noise, noise + 1, s.picture.shape), 0, 255).astype(
-            np.uint8
-        )
+        noisy = s.picture[:, ::-1] + rng.integers(-noise, noise + 1, s.picture.shape)
+        picture = noisy.clip(0, 255).astype(np.uint8)
         samples.append(replace(s, episode=name, chunk=s.chunk * np.float32([-1, 1]), picture=picture))
     return replace(episode, id=name, samples=tuple(samples))
 
@@ -55,8 +49,7 @@ def test_a_mirrored_copy_of_each_drive_is_left_out(noise, frames):
 
 def test_mirrored_steering_before_other_pictures_is_another_drive():
     drives, faults = [drive(seed) for seed in range(3)], Faults(Path("r"))
-    other = [
-        replace(s, picture=p.picture) for s, p in zip(mirrored(drives[0], "t").samples, drives[1].samples, strict=True)
-    ]
+    pairs = zip(mirrored(drives[0], "t").samples, drives[1].samples, strict=True)
+    other = [replace(s, picture=p.picture) for s, p in pairs]
     drives.append(replace(drives[0], id="t", samples=tuple(other)))
     assert leave_out_copies(drives, faults) == tuple(drives) and not faults.listed()
