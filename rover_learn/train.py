@@ -120,17 +120,11 @@ def train(
             weights = {name.removeprefix("model."): v for name, v in content["model_state_dict"].items()}
             trained_by = {"trained_by": asdict(recipe), "device": device} | origin
             write_lerobot(folder / "pretrained_model", replace(config, rate_hz=rate_hz), weights, trained_by)
-            content["config"] = trainer_config(
-                config,
-                learning_rate=recipe.transformer_rate,
-                batch_size=recipe.batch,
-                device=device,
-                seed=seed,
-                data_dir="episodes",
-                output_dir="checkpoints",
-                pretrained_backbone=pretrained is not None,
-                rate_hz=int(rate_hz) if rate_hz.is_integer() else rate_hz,
-            )
+            settings = {"learning_rate": recipe.transformer_rate, "batch_size": recipe.batch, "device": device}
+            settings |= {"seed": seed, "data_dir": "episodes", "output_dir": "checkpoints"}
+            settings |= {"pretrained_backbone": pretrained is not None}
+            settings |= {"rate_hz": int(rate_hz) if rate_hz.is_integer() else rate_hz}
+            content["config"] = trainer_config(config, **settings)
             # It must be on the disk before the unfinished training, which it comes from, is removed.
             save_torch(folder / "best_model.pth", content)
 

@@ -29,7 +29,7 @@ Letters: B batch = 1, T tokens, D model width, H heads, S state size, A actions,
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,7 +40,7 @@ from torch import Tensor, nn
 from rover_lib.onboard.policy.preprocess import prepare_frame
 from rover_lib.workshop.act_config import ACTIVATIONS, BACKBONES, ActConfig, Affine
 from rover_lib.workshop.hooks import watched
-from rover_lib.workshop.recordings.samples import Sample
+from rover_lib.workshop.recordings.samples import Sample, by_camera
 
 Projection = nn.Linear | nn.Conv2d
 Pair = tuple[Tensor, Tensor]  # weight and bias
@@ -515,8 +515,7 @@ def example_inputs(config: ActConfig) -> tuple[Tensor, ...]:
 
 def inputs_of(sample: Sample, config: ActConfig) -> tuple[Tensor, ...]:
     """Return a sample as the graph's inputs: state (1, S) float32, then (height, width, 3) uint8 RGB of each camera."""
-    frame: Any = sample.frame_bgr()
-    frames = frame if isinstance(frame, Mapping) else {config.cameras[0]: frame}
+    frames = by_camera(sample.frame_bgr(), config.cameras[0])
     prepared = (prepare_frame(frames[n], *size) for n, size in zip(config.cameras, config.image_sizes, strict=True))
     state = torch.from_numpy(np.asarray(sample.state, np.float32))[None]
     return state, *map(torch.from_numpy, prepared)

@@ -29,7 +29,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.int8.familiar import Drives, fit
 from rover_lib.workshop.int8.observe import Calibration
 from rover_lib.workshop.int8.quantize import QuantizedPolicy, graph_of, int8_layers, with_embedding
-from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, car_of
+from rover_lib.workshop.recordings.samples import ACTION_NAMES, Sample, by_camera, car_of
 
 BATCH = 8
 KEPT = 2**28  # bytes of pictures that are prepared once for all modes; larger ones take far longer to plan from
@@ -127,7 +127,8 @@ class Exporter:
     def __init__(self, checkpoint: Checkpoint, samples: Sequence[Sample]):
         if not samples:
             raise ArtifactError("an artifact needs parity vectors", found="no samples", remedy="give at least one")
-        self.checkpoint, self.parity = checkpoint, params()["parity"]
+        self.checkpoint = checkpoint
+        self.parity = params()["parity"]
         self.car = car_of(samples)
         self.recorded = recorded_shapes(samples[0], checkpoint.config)
         self.float_policy = ACT(checkpoint.config, checkpoint.weights)
@@ -262,10 +263,10 @@ class Exporter:
 
 def recorded_shapes(sample: Sample, config: ActConfig) -> dict[str, dict[str, Any]]:
     """Return {"recorded": [height, width]} for each camera whose recorded pictures were squeezed for the policy."""
-    frame: Any = sample.frame_bgr()
+    frames = by_camera(sample.frame_bgr(), config.cameras[0])
     shapes = {}
     for name, (h, w) in zip(config.cameras, config.image_sizes, strict=True):
-        height, width = (frame[name] if isinstance(frame, Mapping) else frame).shape[:2]
+        height, width = frames[name].shape[:2]
         shapes[name] = {"recorded": [height, width]} if is_squeezed((width, height), (w, h)) else {}
     return shapes
 

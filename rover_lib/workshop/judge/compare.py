@@ -28,7 +28,7 @@ from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.judge.pairs import compare_pairs, loses
 from rover_lib.workshop.judge.recorded_range import not_judged, pct_of_range, worst
 from rover_lib.workshop.progress import Progress, silent
-from rover_lib.workshop.recordings.samples import stack_chunks
+from rover_lib.workshop.recordings.samples import by_camera, stack_chunks
 
 MODES = ("dynamic", "static", "mixed")  # what a run makes beside fp32
 ARTIFACTS = ("fp32", *MODES)
@@ -136,7 +136,7 @@ class LerobotEager:
     def predict_chunk(self, frame_bgr: np.ndarray | Mapping[str, np.ndarray], state: np.ndarray) -> np.ndarray:
         """As `Policy.predict_chunk`: (C, A) float32, clipped to what a pulse can express."""
         c = self.config
-        frames = frame_bgr if isinstance(frame_bgr, Mapping) else {c.cameras[0]: frame_bgr}
+        frames = by_camera(frame_bgr, c.cameras[0])
         batch = {"observation.state": _affine(np.asarray(state, np.float32), c.state_norm)[None]}
         for name, size, norm in zip(c.cameras, c.image_sizes, c.image_norm, strict=True):
             pixels = prepare_frame(frames[name], *size).astype(np.float32) / 255

@@ -32,7 +32,8 @@ def verdict(
     params: the content of params.yml. refusals: by mode, as `Expected.refusals`. "ready" in the result: whether the
     policy drives; "deploy" is None if no artifact of it should drive this car.
     """
-    limits, benchmark = params["verdict"], stages["benchmark"]
+    limits = params["verdict"]
+    benchmark = stages["benchmark"]
     rows = _rows(stages, params)
     failed = _list_failures(stages, params, names, rows)
     unfit = _list_unfit(stages, failed)

@@ -117,11 +117,11 @@ def sensitivity(table: Mapping[str, Mapping[str, float | None]]) -> Figure:
 
 def action_error(report: Fidelity, rate_hz: float = 30.0) -> Figure | Note:
     """Draw each mode's mean error against FP32 at each step of the plan, in % of the recorded range."""
-    actions, steps = report.action_names, report.reference.shape[1]
+    actions = report.action_names
     if all(report.pct(action) is None for action in actions):
         return Note("no action changes in these recordings: nothing is judged")
     fig, fields = style.figure_of(len(actions), min(max(len(actions), 2), MOST_ACTIONS), 3.6)
-    times_s = np.arange(steps) / rate_hz
+    times_s = np.arange(report.reference.shape[1]) / rate_hz
     for i, (ax, action) in enumerate(zip(fields, actions, strict=True)):
         ax.set_title(action)
         if report.pct(action) is None:

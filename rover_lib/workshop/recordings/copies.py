@@ -10,13 +10,12 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import chain
-from typing import Any
 
 import cv2
 import numpy as np
 
 from rover_lib.workshop.recordings.faults import Faults
-from rover_lib.workshop.recordings.samples import Episode, Sample, pick_evenly
+from rover_lib.workshop.recordings.samples import Episode, Sample, by_camera, pick_evenly
 
 RUN = 4  # consecutive actions that are compared at once
 STEPS = (1, 2, 3, 4, 5)  # a copy may have only every fifth row
@@ -106,6 +105,5 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
 
 def scaled_down(sample: Sample) -> np.ndarray:
     """The picture in few pixels; of several cameras, one beside the other."""
-    frame: Any = sample.frame_bgr(SEEN[0])
-    frames = frame.values() if isinstance(frame, dict) else (frame,)
+    frames = by_camera(sample.frame_bgr(SEEN[0]), "").values()
     return np.stack([cv2.resize(f, SEEN, interpolation=cv2.INTER_AREA).astype(np.float32) for f in frames])

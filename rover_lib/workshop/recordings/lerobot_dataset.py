@@ -92,7 +92,8 @@ class _Camera:
         if self.rows is None:
             for row in {path: row for row, path in enumerate(self.paths)}.values():
                 with _as_episode_error(f"{self.paths[row]}: cannot be decoded"):
-                    self.read_bgr(row) if row not in self.torn else None
+                    if row not in self.torn:
+                        self.read_bgr(row)
             if self.torn:
                 note = f"the picture of '{self.key}' in row {min(self.torn)} is torn, or one it needs: copy it again"
                 faults.add(self.paths[min(self.torn)], "broken_picture", note, len(self.torn))
@@ -156,7 +157,7 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     import lerobot.utils.utils  # noqa: F401  # torch, which it imports, takes more memory than a table may
 
     dataset = _Dataset(source)
-    faults, layout = dataset.faults, dataset.layout
+    faults = dataset.faults
     with _as_episode_error(f"{dataset.root}: cannot be read"):
         with limited_memory():
             files = dataset.read_meta()
@@ -166,10 +167,10 @@ def load_dataset(source: Source, chunk: int, progress: Progress = silent) -> Rec
     episodes = [episode for row in listed if (episode := dataset.episode(row, chunk)).samples]
     if not episodes:
         raise faults.nothing_usable("no usable sample", WRITE_ANEW)
-    if layout.action_names == CHANNELS:
+    if dataset.layout.action_names == CHANNELS:
         note_one_sided(episodes, faults)
     own, blocks = name_long_drives(leave_out_copies(episodes, faults))
-    return Recordings(dataset.root, own, faults.listed(), source, layout, blocks, "dataset")
+    return Recordings(dataset.root, own, faults.listed(), source, dataset.layout, blocks, "dataset")
 
 
 class _Dataset:
@@ -180,9 +181,11 @@ class _Dataset:
     """
 
     def __init__(self, source: Source):
-        self.root, self.faults = source.path, Faults(source.path)
+        self.root = source.path
+        self.faults = Faults(self.root)
         self.info = _read_info(self.root)
-        self.features, self.fps = self.info["features"], float(self.info["fps"])
+        self.features = self.info["features"]
+        self.fps = float(self.info["fps"])
         self.layout, self.keys = _layout(self.root, self.info, source)
         self.columns: dict[str, np.ndarray] = {}
 

@@ -93,14 +93,16 @@ class Sample:
         try:
             return self.turned(read_jpeg(self.frame_path, least))
         except OSError as e:
-            problem = f"cannot be read ({e.strerror})"
-            actual = None
-            remedy = "restore it or load again"
+            problem = f"{self.frame_path}: cannot be read ({e.strerror})"
+            raise EpisodeError(problem, remedy="restore it or load again") from None
         except CameraError as e:
-            problem = e.what
-            actual = e.found
             remedy = "delete it or record the episode again"
-        raise EpisodeError(f"{self.frame_path}: {problem}", found=actual, remedy=remedy)
+            raise EpisodeError(f"{self.frame_path}: {e.what}", found=e.found, remedy=remedy) from None
+
+
+def by_camera(frame: Any, name: str) -> Mapping[str, np.ndarray]:
+    """Return pictures by their cameras' names. frame: such pictures, or that of the only camera, called `name`."""
+    return frame if isinstance(frame, Mapping) else {name: frame}
 
 
 def block_of(sample: Any) -> str:

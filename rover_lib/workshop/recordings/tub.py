@@ -231,30 +231,32 @@ class _Tub:
 
     def _records(self, catalogs: Iterable[str], deleted: set[int]) -> Iterator["_Record"]:
         """Yield the records that count."""
-        tub, faults = self.path, self.faults
+        faults = self.faults
         for name in dict.fromkeys(catalogs):  # each once
-            if Path(name).name != name or not (tub / name).is_file():
-                faults.add(tub, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
+            if Path(name).name != name or not (self.path / name).is_file():
+                faults.add(self.path, "catalog_missing", f"{quote(name)} is in the manifest, and no file of the tub")
                 continue
-            lines = _read(tub / name).splitlines()
+            lines = _read(self.path / name).splitlines()
             if len(lines) > MOST_LINES:
-                faults.add(tub, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
+                faults.add(self.path, "broken_record", f"{name}: at most {MOST_LINES} lines are read", len(lines))
                 continue
             for number, line in enumerate(lines, 1):
                 place = f"{name}, line {number}"
                 try:
                     record = _parse(line)
                 except (ValueError, RecursionError, TypeError, KeyError, AttributeError) as e:
-                    faults.add(tub, "broken_record", f"{place}: {quote(str(e))}")
+                    faults.add(self.path, "broken_record", f"{place}: {quote(str(e))}")
                     continue
                 self.began[record.session] = min(record.index, self.began.get(record.session, record.index))
                 if record.index in deleted:
-                    faults.add(tub, "deleted_record", f"{place}: its manifest calls record {record.index} deleted")
+                    faults.add(
+                        self.path, "deleted_record", f"{place}: its manifest calls record {record.index} deleted"
+                    )
                 elif record.driver != "user":
-                    faults.add(tub, "a_pilot_drove", f"{place}: {quote(record.driver)}")
+                    faults.add(self.path, "a_pilot_drove", f"{place}: {quote(record.driver)}")
                 else:
                     note = f"records without a time: taken as {RATE_HZ:g} a second"
-                    faults.add(tub, "no_times", note, not record.timed)
+                    faults.add(self.path, "no_times", note, not record.timed)
                     yield record
 
 
