@@ -178,14 +178,19 @@ def _part_episodes(read: tuple[Recordings, ...], recipe: FinetuneRecipe) -> _Mat
         judging = (*parts.choosing, *parts.held_out)
         for name in dict.fromkeys(map(block_of, judging)):
             held_out.append((name, OLD, _driven_by_humans([s for s in judging if block_of(s) == name], old)))
-    count = max(round(len(corrected) * recipe.held_out_share), 1) if recipe.held_out_share and len(corrected) > 1 else 0
+    count = 0
+    if recipe.held_out_share and len(corrected) > 1:
+        count = max(round(len(corrected) * recipe.held_out_share), 1)
     judges = set(np.random.default_rng(recipe.seed).permutation(len(corrected))[:count].tolist())
-    held_out += [(f"{r.root.name}/{e.id}", NEW, human_samples(e)) for r, e in (corrected[i] for i in judges)]
+    for i in judges:
+        recordings, episode = corrected[i]
+        held_out.append((f"{recordings.root.name}/{episode.id}", NEW, human_samples(episode)))
     for recordings in read:
-        own = [e for i, (r, e) in enumerate(corrected) if r is recordings and i not in judges]
-        for kind, by_policy in ((ADDITIONS, False), (CORRECTIONS, True)):
-            of_kind = [human_samples(e) for e in own if e.by_policy == by_policy]
-            taught.append((kind, tuple(chain.from_iterable(of_kind))))
+        by_kind: dict[str, list[Sample]] = {ADDITIONS: [], CORRECTIONS: []}
+        for i, (source, episode) in enumerate(corrected):
+            if source is recordings and i not in judges:
+                by_kind[CORRECTIONS if episode.by_policy else ADDITIONS] += human_samples(episode)
+        taught += [(kind, tuple(samples)) for kind, samples in by_kind.items()]
     watched = chain.from_iterable(e.samples for e in (*old, *(e for _, e in new)))
     return _Material(
         read,
@@ -322,9 +327,11 @@ def change_points(row: Mapping[str, Any]) -> float:
     row: before_<action>_pct and after_<action>_pct, mean absolute errors in percent of the action's recorded range;
     None for an action that never changes.
     """
-    actions = [key.removeprefix("before_") for key in row if key.startswith("before_")]
-    pairs = [(row[f"before_{action}"], row[f"after_{action}"]) for action in actions]
-    changes = [after - before for before, after in pairs if before is not None and after is not None]
+    changes = []
+    for key, before in row.items():
+        after = row.get(key.replace("before_", "after_", 1))
+        if key.startswith("before_") and before is not None and after is not None:
+            changes.append(after - before)
     return float(np.mean(changes)) if changes else 0.0
 
 

@@ -14,7 +14,6 @@ from itertools import chain
 import cv2
 import numpy as np
 
-from rover_lib.workshop.recordings.faults import Faults
 from rover_lib.workshop.recordings.samples import Episode, Sample, by_camera, pick_evenly
 
 RUN = 4  # consecutive actions that are compared at once
@@ -29,11 +28,11 @@ CORRELATED = 0.98  # or so similar, whatever their brightness: a car that moved 
 MOST_ALIKE = 50  # episodes with the same run; it then tells nothing
 
 
-def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episode, ...]:
-    """Return the episodes without those that are the same drive as another, of which the longest is kept."""
+def find_copies(episodes: Sequence[Episode]) -> list[tuple[Episode, Episode]]:
+    """Return each episode that is the same drive as another, at least as long one, with that one."""
     scaled = lru_cache(1000)(scaled_down)
     having: defaultdict[bytes, list[tuple[int, int]]] = defaultdict(list)
-    unique = set()
+    copies = []
     for i in sorted(range(len(episodes)), key=lambda i: (-len(episodes[i].samples), i)):
         runs = _runs(episodes[i])
         shared: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -46,14 +45,12 @@ def leave_out_copies(episodes: Sequence[Episode], faults: Faults) -> tuple[Episo
                 suspects.append((episodes[other], pairs))
         same = next((other for other, pairs in suspects if look_alike(episodes[i], other, pairs, scaled)), None)
         if same is not None:
-            note = f"the same drive as {same.id}, as its actions and pictures show"
-            faults.add(episodes[i].place, "copy", note)
+            copies.append((episodes[i], same))
             continue
-        unique.add(i)
         for run, k in chain.from_iterable(_runs(episodes[i], step).items() for step in STEPS):
             if len(having[run]) < MOST_ALIKE:
                 having[run].append((i, k))
-    return tuple(episode for i, episode in enumerate(episodes) if i in unique)
+    return copies
 
 
 def _runs(episode: Episode, step: int = 1) -> dict[bytes, int]:

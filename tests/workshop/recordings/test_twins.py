@@ -23,7 +23,7 @@ def drive(seed):
         samples.append(
             PictureSample(f"e{seed}", Path("x"), k / 20, action[0], action, np.zeros(1, bool), k, picture=picture)
         )
-    return Episode(f"e{seed}", Path("r"), "", 1.5, FRAMES, FRAMES, tuple(samples), ())
+    return Episode(f"a/e{seed}", Path("r"), "", 1.5, FRAMES, FRAMES, tuple(samples), ())
 
 
 def mirrored(episode, name, noise=0):
@@ -39,12 +39,12 @@ def mirrored(episode, name, noise=0):
 @pytest.mark.parametrize("frames", [FRAMES, 20])
 def test_a_mirrored_copy_of_each_drive_is_left_out(noise, frames):
     drives, faults = [drive(seed) for seed in range(4)], Faults(Path("r"))
-    twins = [mirrored(each, f"t{number}", noise) for number, each in enumerate(drives)]
+    twins = [mirrored(each, f"b/t{number}", noise) for number, each in enumerate(drives)]
     twins = [replace(each, samples=each.samples[:frames]) for each in twins]
     kept = leave_out_copies([*drives, *twins, replace(drives[0], id="again")], faults)
-    assert [episode.id for episode in kept] == [f"e{seed}" for seed in range(4)]
+    assert [episode.id for episode in kept] == [f"a/e{seed}" for seed in range(4)]
     notes = {fault.file: fault.note for fault in faults.listed()}
-    assert "mirrored" in notes["t2"] and "e2" in notes["t2"] and "e0" in notes["again"]
+    assert "mirrored" in notes["b/t2"] and "a/e2" in notes["b/t2"] and "a/e0" in notes["again"]
 
 
 def test_mirrored_steering_before_other_pictures_is_another_drive():
