@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 
 from rover_lib.workshop.judge.compare import Fidelity
-from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies, usual_size
+from rover_lib.workshop.judge.recorded_range import HELD_OFF, hardly_varies
 from rover_lib.workshop.notebook_table import Table
-from rover_lib.workshop.recordings.blocks import group_by_block
-from rover_lib.workshop.recordings.samples import Sample, stack_chunks
+from rover_lib.workshop.recordings.samples import Sample, block_of, stack_chunks
 
 DRAWS = 2000
 LEAST_EPISODES = 4  # of fewer, pieces are drawn instead, each as long as a plan
@@ -187,7 +186,7 @@ def against_guesses(report: Fidelity, learned: Sequence[Sample]) -> Judged | Non
         acted = recorded[~is_pad][:, i]
         error = own[:, i].mean()
         is_constant = hardly_varies(action, acted)
-        size = usual_size(acted)
+        size = float(np.abs(acted).mean())
         actions[action] = ActionJudged(float(pct * error), guesses, is_constant, float(error / size) if size else 0.0)
     return Judged(actions, drawn)
 
@@ -205,14 +204,16 @@ def _guess(of_guess: np.ndarray, of_policy: np.ndarray, pieces: Sequence[np.ndar
 def _pieces(report: Fidelity) -> tuple[str, list[np.ndarray]]:
     """Return what is drawn from, in words, and for each piece the numbers of its frames."""
     samples = report.samples
-    blocks = [np.array(rows) for rows in group_by_block(samples)]
+    blocks = _runs([block_of(s) for s in samples])
     one_drive_each = all(len({samples[i].episode for i in rows}) == 1 for rows in blocks)
     unit = "episode" if one_drive_each and len({s.episode for s in samples}) == len(blocks) else "block"
     if len(blocks) >= LEAST_EPISODES:
         return f"{len(blocks)} {unit}s", blocks
     chunk = report.reference.shape[1]
-    pieces = []
-    for rows in blocks:
-        parts = [(samples[row].episode, samples[row].row // chunk) for row in rows]
-        pieces += [np.array(list(group)) for _, group in groupby(rows, key=dict(zip(rows, parts, strict=True)).get)]
+    pieces = _runs([(block_of(s), s.episode, s.row // chunk) for s in samples])
     return f"{len(pieces)} pieces of {len(blocks)} {unit}{'s' if len(blocks) > 1 else ''}", pieces
+
+
+def _runs(keys: Sequence[object]) -> list[np.ndarray]:
+    """Return the numbers of the keys, for each run of equal ones."""
+    return [np.array(list(numbers)) for _, numbers in groupby(range(len(keys)), key=keys.__getitem__)]
