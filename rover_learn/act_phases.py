@@ -55,9 +55,6 @@ class Overrides:
     minutes: float | None = None
 
 
-NO_OVERRIDES = Overrides()
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainingRecipe(Recipe):
     """How long and how fast each phase trains: an entry of params.yml's section `train`, which explains each number.
@@ -96,13 +93,14 @@ class TrainingRecipe(Recipe):
         return Augmentation(self.light, self.shift, self.blur, self.noise)
 
     @classmethod
-    def of(cls, size: str, device: str, overrides: Overrides = NO_OVERRIDES) -> Self:
+    def of(cls, size: str, device: str, overrides: Overrides | None = None) -> Self:
         """Return the recipe of params.yml for that size; with cuda's own values, if it has some."""
         recipes = params()["train"]
         values = recipes[size] | (recipes.get(f"{size}_{device}") or {})
         if values.get("at"):
             values |= {"at": tuple(values["at"])}
         recipe = cls.read(f"train: {size}", values)
+        overrides = overrides or Overrides()
         if overrides.steps is not None:
             recipe = recipe.of_few(overrides.steps)
         if overrides.minutes is not None:
@@ -144,6 +142,12 @@ class PolicyTraining:
         rows = self.rng.choice(len(self.data), min(count, len(self.data)), replace=False)
         recipe = self.recipe
         return loop.batch_of(self.data, rows, self.rng, self.weights.device, recipe.augmentation, recipe.mirrored)
+
+    def train(
+        self, phase: Phase, module: nn.Module, count: int, loss: Callable[[Batch], Tensor]
+    ) -> tuple[torch.optim.Optimizer, Any]:
+        """Train a module on batches of `count` frames; return its optimiser and scheduler."""
+        return self.saved.train(phase, module, self.rng, lambda _: self.batch(count), loss)
 
     def loss(self, batch: Batch) -> Tensor:
         """Return the policy's loss; pictures become its input, feature maps are that already."""
@@ -276,14 +280,9 @@ def _train_backbone(training: PolicyTraining, model: PlanFromFeatures) -> None:
         squared = float(np.square(errors * training.weights.cpu().numpy()).mean())
         return squared, 100 * np.abs(errors).mean(axis=0) / training.judges.ranges
 
-    def learn(phase: str, number: int) -> None:
-        saved.train(
-            Phase(phase, recipe.backbone_steps, recipe.backbone_rate / number**0.5),
-            model,
-            training.rng,
-            batch=lambda _: training.batch(recipe.batch),
-            loss=loss,
-        )
+    def learn(name: str, number: int) -> None:
+        phase = Phase(name, recipe.backbone_steps, recipe.backbone_rate / number**0.5)
+        training.train(phase, model, recipe.batch, loss)
 
     model.train()
     _in_rounds(training, model, "backbone", recipe.backbone_rounds, BACKBONE_SHARE, learn, judge)
@@ -418,27 +417,21 @@ def _train_together(
     before: the errors by action, (A,), until then, if they are known.
     """
     policy = training.policy
-    saved = training.saved
     last_round: tuple[torch.optim.Optimizer, Any] | None = None
 
     def judge() -> tuple[float, np.ndarray]:
         errors = training.judge()
         return training.judges.overall_pct(errors), errors
 
-    def learn(phase: str, _: int) -> None:
+    def learn(name: str, _: int) -> None:
         nonlocal last_round
         policy.train()
-        last_round = saved.train(
-            Phase(phase, steps, training.recipe.transformer_rate / 10),
-            policy,
-            training.rng,
-            batch=lambda _: training.batch(training.recipe.together_batch),
-            loss=training.loss,
-        )
+        phase = Phase(name, steps, training.recipe.transformer_rate / 10)
+        last_round = training.train(phase, policy, training.recipe.together_batch, training.loss)
 
     if before is None:
         before = training.judge()
     _in_rounds(training, policy, name, rounds, 1.0, learn, judge, training.judges.overall_pct(before))
-    saved.judged[name].insert(0, [0, *map(float, before)])
+    training.saved.judged[name].insert(0, [0, *map(float, before)])
     assert last_round is not None  # there is at least one
     return last_round

@@ -64,12 +64,8 @@ class Judges:
         """Return by action its error, the best guess's, whether it varies, and whether it was learned."""
         summary = {}
         for name, error, blind, varies in zip(self.names, errors_pct, self.blind_pct, self.varies, strict=True):
-            summary[name] = {
-                "error_pct": float(error),
-                "blind_pct": float(blind),
-                "varies": bool(varies),
-                "learned": bool(error < LEARNED * blind),
-            }
+            errors = {"error_pct": float(error), "blind_pct": float(blind)}
+            summary[name] = errors | {"varies": bool(varies), "learned": bool(error < LEARNED * blind)}
         return summary
 
 

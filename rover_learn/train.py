@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rover_exchange.export_dataset import lerobot_train
 from rover_learn import act_phases, augment, backbone, judges, training
-from rover_learn.act_phases import NO_OVERRIDES, Overrides, TrainingRecipe, train_in_phases
+from rover_learn.act_phases import Overrides, TrainingRecipe, train_in_phases
 from rover_learn.backbone import Pretrained
 from rover_learn.curves import leave_curves
 from rover_learn.phases import VERSIONS
@@ -63,7 +63,7 @@ def train(
     out_path: Path | str,
     size: str = "small",
     seed: int = 0,
-    overrides: Overrides = NO_OVERRIDES,
+    overrides: Overrides | None = None,
     *,
     backbone: Path | str | None = None,
     machine: Machine | None = None,
@@ -74,9 +74,9 @@ def train(
 
     episodes: our recordings of one car, or a LeRobotDataset of steering, throttle and one camera. Their calibration
     part trains the policy, the choosing part gives best_val_loss, and the held-out part is left for its judgement.
-    size: 'small' (72x128) or 'full' (the user's policy, 360x640). backbone: weights that it begins with, as
-    Pretrained.of takes them; None: random ones. machine: None takes the best that there is. say: is told what it trains
-    on, and how that goes.
+    size: 'small' (72x128) or 'full' (the user's policy, 360x640). overrides: of the size's recipe in params.yml.
+    backbone: weights that it begins with, as Pretrained.of takes them; None: random ones. machine: None takes the best
+    that there is. say: is told what it trains on, and how that goes.
 
     Returns out_path, which appears complete or not at all; beside it are its <name>_curves/, which say of each action
     how far it is off, and the same policy as LeRobot's folder, <name>_pretrained_model/. On one machine the same input
@@ -85,6 +85,7 @@ def train(
     Raises TrainingError for a size, device, steps or seed that it cannot use, EpisodeError for recordings.
     """
     machine = machine or Machine.of()
+    overrides = overrides or Overrides()
     say(f"training on {machine.words()}")
     if size not in SIZES:
         raise TrainingError(f"a policy's size must be one of {', '.join(SIZES)}", found=repr(size))

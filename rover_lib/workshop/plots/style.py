@@ -86,7 +86,7 @@ def show_picture(ax: Axes, sample: Any, title: str = "") -> None:
     """Draw what a sample saw, the pictures of several cameras side by side, without axes."""
     frames = by_camera(sample.frame_bgr(), "").values()
     height = max(len(frame) for frame in frames)
-    same = [cv2.resize(f, (round(f.shape[1] * height / len(f)), height)) if len(f) != height else f for f in frames]
+    same = [cv2.resize(frame, (round(frame.shape[1] * height / len(frame)), height)) for frame in frames]
     ax.imshow(np.concatenate(same, axis=1)[..., ::-1])
     ax.set_title(title, fontsize=9)
     ax.axis("off")

@@ -51,8 +51,10 @@ class Layout:
             return ", ".join(f"{n} (column {i})" if swapped else n for n, i in zip(names, order, strict=True))
 
         rate = f", {self.rate_hz:g} frames a second" if self.rate_hz else ""
-        state, action = columns(self.state_names, self.state_order), columns(self.action_names, self.action_order)
-        state = state if self.has_state else f"none recorded, taken as the last action, {state}"
+        action = columns(self.action_names, self.action_order)
+        state = columns(self.state_names, self.state_order)
+        if not self.has_state:
+            state = f"none recorded, taken as the last action, {state}"
         cameras = f"camera{'s' if len(self.cameras) > 1 else ''}: {', '.join(self.cameras)}"
         return f"{cameras}; state: {state}; action: {action}{rate}"
 
@@ -224,7 +226,11 @@ class Recordings:
         for fault in self.faults:
             if re.fullmatch(f"{SHOW_NOTHING}|other_state", fault.kind):
                 by_kind.setdefault(fault.kind, []).append(fault)
-        return [f"{f[0].file}{f' and {len(f) - 1} more' if f[1:] else ''}: {f[0].note}" for f in by_kind.values()]
+        sentences = []
+        for first, *others in by_kind.values():
+            more = f" and {len(others)} more" if others else ""
+            sentences.append(f"{first.file}{more}: {first.note}")
+        return sentences
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of every file of the samples, by its path relative to `root`. Raises EpisodeError if one is gone."""

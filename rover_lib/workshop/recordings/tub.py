@@ -129,7 +129,8 @@ def load_tubs(source: Source, tubs: Sequence[Path], chunk: int, progress: Progre
         if unique_here := [e for e in own if id(e) in unique]:
             named, names = name_blocks(unique_here, place)
             episodes += named
-            blocks += [names] if names else []
+            if names:
+                blocks.append(names)
     return Recordings(root, tuple(episodes), all_faults.listed(), source, blocks=tuple(blocks), kind="tub")
 
 

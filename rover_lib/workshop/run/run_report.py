@@ -125,7 +125,8 @@ def write_card(run_dir: Path | str, **given: str | None) -> Path:
     recordings = load["recordings"]
     metadata = {key: given.get(key) or load["checkpoint"].get(key) for key in ("license", "base_model")}
     hub = {key: value for key, value in metadata.items() if value}
-    hub |= {"base_model_relation": "quantized"} if "base_model" in hub else {}
+    if "base_model" in hub:
+        hub["base_model_relation"] = "quantized"
     values = {"name": folder.resolve().name, "judged": result, "header": header, "rows": rows, "recordings": recordings}
     values["hub"] = yaml.safe_dump(hub) if hub else ""
     with atomic_path(path) as temporary:
