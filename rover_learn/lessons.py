@@ -25,7 +25,8 @@ from rover_learn.augment import GAIN
 from rover_learn.training import ACTION, IMAGE, IS_PAD, STATE, Batch, FeatureInput, Frames, Resumable, RowFile
 from rover_lib.onboard.policy.load import action_limits
 from rover_lib.onboard.policy.preprocess import prepare_frame
-from rover_lib.workshop.act_config import ActConfig, Affine, lerobot_act
+from rover_lib.workshop.act import Normalise
+from rover_lib.workshop.act_config import ActConfig, lerobot_act
 from rover_lib.workshop.checkpoint.checkpoint import Checkpoint
 from rover_lib.workshop.progress import Progress, silent
 from rover_lib.workshop.recordings.samples import Sample, car_of
@@ -41,13 +42,6 @@ FADED = (0.1, 1.0)  # the state of a new recording keeps a share of its steering
 class BatchedPolicy(nn.Module):
     """LeRobot's own policy for many observations at once: raw states in, raw actions out, no dropout, latent zero."""
 
-    image_scale: Tensor
-    image_shift: Tensor
-    state_scale: Tensor
-    state_shift: Tensor
-    action_scale: Tensor
-    action_shift: Tensor
-
     def __init__(self, config: ActConfig, weights: dict[str, Tensor]):
         super().__init__()
         self.config = config
@@ -56,11 +50,9 @@ class BatchedPolicy(nn.Module):
         self.backbone = self.model.backbone
         self.model.backbone = FeatureInput()
         self.eval()
-        norms = {"image": config.image_norm[0], "state": config.state_norm, "action": config.action_unnorm}
-        for name, norm in norms.items():
-            norm = norm or Affine((1.0,), (0.0,))
-            self.register_buffer(f"{name}_scale", torch.tensor(norm.scale), persistent=False)
-            self.register_buffer(f"{name}_shift", torch.tensor(norm.shift), persistent=False)
+        self.image_norm = Normalise(config.image_norm[0], (1, 1, 1, -1))
+        self.state_norm = Normalise(config.state_norm, (1, -1))
+        self.action_unnorm = Normalise(config.action_unnorm, (1, 1, -1))
 
     def thaw(self) -> None:
         """Make the scale and shift of the batch norms trainable, which LeRobot freezes; the statistics stay frozen."""
@@ -80,14 +72,13 @@ class BatchedPolicy(nn.Module):
 
     def features(self, frames: Tensor) -> Tensor:
         """Return the feature maps, (B, D, h, w), of frames, (B, height, width, 3) uint8 RGB."""
-        x = frames.float() / 255 * self.image_scale + self.image_shift
+        x = self.image_norm(frames.float() / 255)
         return self.backbone(x.permute(0, 3, 1, 2))["feature_map"]
 
     def plan(self, features: Tensor, states: Tensor) -> Tensor:
         """Return raw actions, (B, C, A), for feature maps as `features` gives them and states, (B, 2) float32."""
-        states = states * self.state_scale + self.state_shift
-        actions, _ = self.model({"observation.images": [features], "observation.state": states})
-        return actions * self.action_scale + self.action_shift
+        actions, _ = self.model({"observation.images": [features], "observation.state": self.state_norm(states)})
+        return self.action_unnorm(actions)
 
     def forward(self, frames: Tensor, states: Tensor) -> Tensor:
         return self.plan(self.features(frames), states)
@@ -96,7 +87,7 @@ class BatchedPolicy(nn.Module):
 @torch.inference_mode()
 def plans_of(policy: BatchedPolicy, samples: Sequence[Sample], progress: Progress = silent) -> np.ndarray:
     """Return what a policy would drive on the samples, (n, C, A) float32, clipped to their car's limits."""
-    device = policy.image_scale.device
+    device = next(policy.parameters()).device
     (size,) = policy.config.image_sizes
     plans = []
     firsts = range(0, len(samples), BLOCK)
