@@ -150,10 +150,9 @@ def policies(tmp_path):
 
 
 def test_metrics_say_sizes_hits_and_pairs(report, policies):
-    trials = {
-        mode: SimpleNamespace(hits=39 + last, trials=40, hit=(*[True] * 39, last))
-        for mode, last in (("fp32", True), ("static", False))
-    }
+    trials = {}
+    for mode, last in (("fp32", True), ("static", False)):
+        trials[mode] = SimpleNamespace(hits=39 + last, trials=40, hit=(*[True] * 39, last))
     found = compare.metrics(report, policies, trials)
     static = found["modes"]["static"]
     assert (static["hits"], static["trials"], static["size_mb"]) == (39, 40, 1.0)

@@ -97,10 +97,10 @@ def test_a_car_that_stands_may_see_the_same():
     still = recordings(lambda pictures: pictures)
     episodes = []
     for episode in still.episodes:
-        samples = [
-            replace(s, chunk=s.chunk * (1, s.row > 30), picture=episode.samples[max(s.row, 30)].picture)
-            for s in episode.samples
-        ]
+        samples = []
+        for s in episode.samples:
+            picture = episode.samples[max(s.row, 30)].picture
+            samples.append(replace(s, chunk=s.chunk * (1, s.row > 30), picture=picture))
         episodes.append(replace(episode, samples=tuple(samples)))
     assert with_faults(replace(still, episodes=tuple(episodes))).faults == ()
 
